@@ -1,0 +1,1 @@
+"""What daemons, simulator and tools agree on: instants, topics, messages, sessions, logs."""

@@ -1,0 +1,53 @@
+"""The one table of topics: key, type, rate, whether logged, and when a value is too old to act on.
+
+Key building is here and nowhere else, so that another scheme (rmw_zenoh's) is a change of one file.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,63}")
+"""What a board, arm or reach may be called: one chunk of a key expression, no wildcard."""
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One stream. ``stale_after`` in s, None where age does not matter; ``rate`` in Hz, nominal."""
+
+    template: str
+    msgtype: str
+    rate: float
+    published: bool = True
+    logged: bool = True
+    stale_after: float | None = None
+
+    def key(self, name: str, prefix: str = "") -> str:
+        """Key expression for ``name``; ValueError when it is no single plain chunk."""
+        if not NAME.fullmatch(name):
+            raise ValueError(f"{name!r} is no name: letters, digits, _ and -, at most 64")
+        key = self.template.format(name=name)
+        return f"{prefix}/{key}" if prefix else key
+
+
+FEATURES = Topic("tactile/{name}/features", "tactile_msgs/msg/ContactFeatures", 100, stale_after=0.2)
+FORCES = Topic("tactile/{name}/forces", "tactile_msgs/msg/TaxelForces", 100, stale_after=0.2)
+FIELD = Topic("tactile/{name}/field", "tactile_msgs/msg/TaxelField", 100)
+AMBIENT = Topic("tactile/{name}/ambient", "tactile_msgs/msg/AmbientField", 100)
+GEOMETRY = Topic("tactile/{name}/geometry", "tactile_msgs/msg/SkinGeometry", 0)
+RAW = Topic("tactile/{name}/raw", "tactile_msgs/msg/RawChunk", 100, published=False)
+DIAGNOSTICS = Topic("tactile/{name}/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 1)
+LOG = Topic("tactile/{name}/log", "rcl_interfaces/msg/Log", 0)
+
+TOPICS = (FEATURES, FORCES, FIELD, AMBIENT, GEOMETRY, RAW, DIAGNOSTICS, LOG)
+
+
+def service_key(name: str, service: str) -> str:
+    """Key of a queryable of the board daemon: status, tare, set_rate, recalibrate."""
+    return Topic("tactile/{name}/srv/" + service, "", 0).key(name)
+
+
+def alive_key(name: str) -> str:
+    """Key of the liveliness token of whoever publishes for ``name``. Information only."""
+    return Topic("tactile/{name}/alive", "", 0).key(name)

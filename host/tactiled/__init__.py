@@ -1,0 +1,1 @@
+"""From taxel boards to contact features: decode, compensate, calibrate, publish, log."""

@@ -1,0 +1,128 @@
+"""What flows between the rooms of tactiled: chunks from a port, samples of an array, results."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntFlag
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sensor_proto.canseg import CanFrame
+from tactile_bus.geometry import Side
+from tactile_bus.instant import Instant
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """What one read of a port returned. ``received``: right after the read."""
+
+    received: Instant
+    payload: bytes | tuple[CanFrame, ...]
+
+
+class TaxelHealth(IntFlag):
+    """Why a taxel is not to be trusted; the low bits are those of `sensor_proto.TaxelStatus`."""
+
+    OK = 0
+    SATURATED = 1
+    STALE = 2
+    READ_FAILED = 4
+    FROZEN = 8
+    OUT_OF_RANGE = 16
+    MISSING = 32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SampleBlock:
+    """One conversion of one array, in physical units and on host time.
+
+    ``field_ut``: (n, 3) float µT in chip axes. ``temperature_c``: (1,) or (n,) °C.
+    ``status``: (n,) uint8 of `TaxelHealth`. ``captured``: start of the conversion, mapped from
+    board ticks (or from arrivals where the board has no clock); ``uncertainty`` in s.
+    """
+
+    array: int
+    sequence: int
+    captured: Instant
+    received: Instant
+    uncertainty: float
+    field_ut: Float
+    temperature_c: Float
+    status: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ambient:
+    """What compensation took off in one cycle, per array (A of them).
+
+    ``plane``: (A, 3, 3) µT; [a, c] = value at the array's centre, slope per m along its surface x,
+    along its y, for component c of the field in ``ee``. ``support``: (A,) fraction of healthy
+    taxels that agree. ``residual_ut``: (A,) rms of those about the fit. ``age``: (A,) s since the
+    last valid fit. ``valid``: (A,) bool.
+    """
+
+    method: str
+    plane: Float
+    support: Float
+    residual_ut: Float
+    age: Float
+    valid: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patch:
+    """Neighbouring taxels in contact; see ``ContactPatch.msg``. Vectors (3,) in ``ee``."""
+
+    array: int
+    side: Side
+    taxels: int
+    normal_force: float
+    peak_force: float
+    force: Float
+    centroid: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """Contact features; see ``ContactFeatures.msg``. Positions (3,) m and forces (3,) N in ``ee``.
+
+    ``wrench``: (6,) fx, fy, fz in N, mx, my, mz in N·m about the origin of ``ee``.
+    """
+
+    valid: bool
+    reasons: tuple[str, ...]
+    peak_force: float
+    peak_side: Side
+    peak_position: Float
+    normal_force: float
+    wrench: Float
+    tip_force: float
+    tip_contact_time: float
+    taxels_in_contact: int
+    taxels_masked: int
+    patches: tuple[Patch, ...] = field(default=())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cycle:
+    """Everything known of one sampling cycle of a board, all N taxels one array after another.
+
+    ``force``: (N, 3) N in taxel axes, NaN where the taxel is not healthy. ``field_ut``: (N, 3) µT
+    in taxel axes after rest field and temperature, before compensation. ``health``: (N,) uint8 of
+    `TaxelHealth`.
+    """
+
+    sequence: int
+    captured: Instant
+    received: Instant
+    uncertainty: float
+    temperature_c: Float
+    field_ut: Float
+    force: Float
+    health: NDArray[np.uint8]
+    ambient: Ambient
+    features: Features
+    calibrated: bool

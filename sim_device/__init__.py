@@ -1,0 +1,1 @@
+"""Taxel boards without hardware: field model, firmware, faults, and the ports they appear on."""
