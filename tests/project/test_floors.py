@@ -1,0 +1,86 @@
+"""Imports point only downward, and the command line starts without the slow libraries."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+ROOMS = {
+    "sensor_proto": ROOT / "sensor_proto",
+    "tactile_bus": ROOT / "host" / "tactile_bus",
+    "tactiled": ROOT / "host" / "tactiled",
+    "sim_device": ROOT / "sim_device",
+    "tactile_tools": ROOT / "tools" / "tactile_tools",
+}
+MAY_IMPORT = {
+    "sensor_proto": set(),
+    "tactile_bus": {"sensor_proto"},
+    "tactiled": {"sensor_proto", "tactile_bus"},
+    "sim_device": {"sensor_proto", "tactile_bus"},
+    "tactile_tools": {"sensor_proto", "tactile_bus", "tactiled", "sim_device"},
+}
+IO_MODULES = {"serial", "can", "zenoh", "mcap", "threading", "socket", "logging", "time", "os"}
+
+
+def imported(path: Path) -> set[str]:
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names.add(node.module.split(".")[0])
+        elif isinstance(node, ast.ImportFrom) and node.level > 0:
+            names.add(path.parent.name)
+    return names
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_imports_point_downward(room: str) -> None:
+    files = sorted(ROOMS[room].rglob("*.py"))
+    assert files, f"{room} has no files"
+    for path in files:
+        upward = imported(path) & set(ROOMS) - MAY_IMPORT[room] - {room}
+        assert not upward, f"{path.relative_to(ROOT)} imports {sorted(upward)}"
+
+
+def test_the_protocol_does_no_io() -> None:
+    allowed = set(sys.stdlib_module_names) | {"numpy", "sensor_proto"}
+    for path in sorted(ROOMS["sensor_proto"].rglob("*.py")):
+        names = imported(path)
+        assert names <= allowed, f"{path.name} imports {sorted(names - allowed)}"
+        assert not names & IO_MODULES, f"{path.name} imports {sorted(names & IO_MODULES)}"
+
+
+def test_the_pure_rooms_of_tactiled_own_no_thread_file_or_clock() -> None:
+    pure = (
+        "clock", "link", "calibrate", "compensate", "consensus", "features", "health", "pipeline"
+    )  # fmt: skip
+    for name in pure:
+        path = ROOMS["tactiled"] / f"{name}.py"
+        if path.exists():
+            assert not imported(path) & IO_MODULES, name
+
+
+@pytest.mark.parametrize("module", ["tactiled.cli", "sim_device.cli", "tactile_tools.log"])
+def test_start_up_waits_for_no_slow_library(module: str) -> None:
+    code = (
+        f"import {module}, sys; "
+        "print([m for m in ('sklearn', 'matplotlib', 'scipy') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_every_file_is_of_a_readable_length() -> None:
+    long = {
+        str(path.relative_to(ROOT)): lines
+        for room in ROOMS.values()
+        for path in room.rglob("*.py")
+        if (lines := len(path.read_text(encoding="utf-8").splitlines())) > 400
+    }
+    assert not long

@@ -1,0 +1,49 @@
+"""The umbrella command ``tactile``: one subcommand a tool."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from importlib.metadata import version
+
+TOOLS = ("log", "plot", "bench", "demo", "fuzz", "crash")
+"""Modules of this package that add a subcommand; each defines ``add_parser(subparsers)``."""
+
+
+def build_parser(tools: Sequence[str] = TOOLS) -> argparse.ArgumentParser:
+    """Return the parser with the subcommands of ``tools``."""
+    parser = argparse.ArgumentParser(
+        prog="tactile",
+        description="Inspect, recover and plot logs, run the demo, the benchmarks and the fuzzer.",
+    )
+    parser.add_argument(
+        "--version", action="version", version=f"tactile-reach {version('tactile-reach')}"
+    )
+    subparsers = parser.add_subparsers(dest="tool", metavar="TOOL", required=True)
+    for tool in tools:
+        import_module(f"tactile_tools.{tool}").add_parser(subparsers)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one tool; its exit code is 0 only when the job was done, 2 for a bad argument."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    # Only the tool that was named is imported, so that `tactile log` does not wait for matplotlib.
+    named = tuple(tool for tool in TOOLS if words and words[0] == tool)
+    options = build_parser(named or TOOLS).parse_args(words)
+    run: Callable[[argparse.Namespace], int] = options.func
+    try:
+        return run(options)
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The reader of our output (head, less) has gone: nothing more to say, and no traceback.
+        sys.stderr.close()
+        return 141
+
+
+if __name__ == "__main__":
+    sys.exit(main())
