@@ -1,0 +1,64 @@
+"""Ways to a board: serial ports, CAN buses and recorded logs behind one interface."""
+
+from __future__ import annotations
+
+from tactiled.transports.base import (
+    BusState,
+    EndOfLog,
+    Medium,
+    PortBusy,
+    PortClosed,
+    PortDenied,
+    PortGone,
+    PortMissing,
+    PortUnsuitable,
+    Transport,
+    TransportError,
+)
+from tactiled.transports.listing import PortInfo, find_by_serial, list_ports
+
+__all__ = [
+    "BusState",
+    "EndOfLog",
+    "Medium",
+    "PortBusy",
+    "PortClosed",
+    "PortDenied",
+    "PortGone",
+    "PortInfo",
+    "PortMissing",
+    "PortUnsuitable",
+    "Transport",
+    "TransportError",
+    "find_by_serial",
+    "list_ports",
+    "make_transport",
+    "open_spec",
+]
+
+
+def make_transport(spec: str, baud: int = 115_200, speed: float = 1.0) -> Transport:
+    """Transport, not yet open, for a port, a CAN bus or a log, told apart by how it is written.
+
+    ``/dev/ttyACM0``, ``./board0`` or ``usb:SERIAL``: serial; ``INTERFACE:CHANNEL[@BITRATE][+fd]``:
+    CAN; a name that ends in ``.mcap``: replay at ``speed`` times real time. ValueError otherwise.
+    """
+    if spec.endswith(".mcap"):
+        from tactiled.transports.mcap_file import McapTransport
+
+        return McapTransport(spec, speed=speed)
+    head, colon, _ = spec.partition(":")
+    if colon and "/" not in head and head != "usb":
+        from tactiled.transports.can_bus import CanTransport
+
+        return CanTransport(spec)
+    from tactiled.transports.serial_port import SerialTransport
+
+    return SerialTransport(spec, baud)
+
+
+def open_spec(spec: str, baud: int = 115_200, speed: float = 1.0) -> Transport:
+    """`make_transport`, opened; raises `TransportError` with the remedy."""
+    transport = make_transport(spec, baud, speed)
+    transport.open()
+    return transport

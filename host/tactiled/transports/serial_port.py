@@ -1,0 +1,261 @@
+"""A serial port: exclusive, low latency, gone within milliseconds of being unplugged."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import select
+import stat
+import termios
+import threading
+import time
+from fcntl import ioctl
+
+import serial
+
+from sensor_proto.canseg import CanFrame
+from tactile_bus.instant import monotonic_now
+from tactiled.blocks import Chunk
+from tactiled.transports import listing
+from tactiled.transports.base import (
+    READ_LIMIT,
+    WRITE_TIMEOUT,
+    BusState,
+    Losses,
+    Medium,
+    PortBusy,
+    PortClosed,
+    PortDenied,
+    PortGone,
+    PortMissing,
+    PortUnsuitable,
+    TransportError,
+    Waker,
+)
+
+log = logging.getLogger(__name__)
+
+USB_PREFIX = "usb:"
+PTY_MAJORS = range(136, 144)  # Linux devices.txt: UNIX98 pseudo-terminal slaves
+LOST_SLAVE = select.POLLHUP | select.POLLERR | select.POLLNVAL
+
+
+class SerialTransport:
+    """A serial port by its path, or by the serial number of its USB device (``usb:SERIAL``).
+
+    Opened once, it is found again by that USB serial number when it was plugged in elsewhere.
+    ``baud`` in bit/s; USB devices ignore it. POSIX only.
+    """
+
+    def __init__(self, port: str, baud: int = 115_200) -> None:
+        if not port or port == USB_PREFIX:
+            raise ValueError("no serial port given; allowed: a path or usb:SERIAL_NUMBER")
+        if baud <= 0:
+            raise ValueError(f"baud rate {baud} given; allowed: a positive number of bit/s")
+        self._name = port
+        self.baud = baud
+        self.usb_serial: str | None = None
+        if port.startswith(USB_PREFIX):
+            self.usb_serial = port.removeprefix(USB_PREFIX)
+        self._serial: serial.Serial | None = None
+        self._losses = Losses()
+        self._reading = threading.Lock()
+        self._writing = threading.Lock()
+        self._waker: Waker | None = None
+        self._poll = select.poll()
+
+    @property
+    def name(self) -> str:
+        """The port as given."""
+        return self._name
+
+    @property
+    def medium(self) -> Medium:
+        """Bytes."""
+        return Medium.SERIAL
+
+    @property
+    def state(self) -> BusState:
+        """Always active: a serial line knows no other state."""
+        return BusState.ACTIVE
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """Bytes that could not be written, by reason."""
+        return self._losses.snapshot()
+
+    @property
+    def device(self) -> str | None:
+        """Path of the open port; None while closed."""
+        return None if self._serial is None else self._serial.port
+
+    def open(self) -> None:
+        """Open for this process alone; raises `TransportError`, its message holds the remedy."""
+        self.close()
+        device = self._locate()
+        port = _open_exclusively(device, self.baud)
+        try:
+            port.set_low_latency_mode(True)
+        except ValueError:
+            log.debug("%s has no low latency mode", device)  # USB CDC and ptys need none
+        if self.usb_serial is None:
+            self.usb_serial = listing.usb_serial_of(device)
+        waker = Waker()
+        poll = select.poll()
+        poll.register(port.fileno(), select.POLLIN)
+        poll.register(waker.read_end, select.POLLIN)
+        self._serial, self._waker, self._poll = port, waker, poll
+
+    def read(self, timeout: float) -> Chunk | None:
+        """Bytes that have come, at most `READ_LIMIT`; see `Transport.read`."""
+        with self._reading:
+            port, waker = self._serial, self._waker
+            if port is None or waker is None:
+                raise PortClosed(f"{self._name} is closed")
+            fd = port.fileno()
+            events = dict(self._poll.poll(max(0.0, timeout) * 1000))
+            if waker.read_end in events:
+                raise PortClosed(f"{self._name} was closed")
+            if fd not in events:
+                return None
+            try:
+                data = os.read(fd, READ_LIMIT)
+                received = monotonic_now()
+            except BlockingIOError:
+                data, received = b"", monotonic_now()
+                if not events[fd] & LOST_SLAVE:
+                    return None
+            except OSError as error:
+                raise self._gone(error.strerror or str(error)) from error
+            if not data:
+                raise self._gone("end of file")
+            return Chunk(received, data)
+
+    def write(self, data: bytes | tuple[CanFrame, ...]) -> None:
+        """Send bytes within `WRITE_TIMEOUT`, count those that could not be; see `Transport.write`."""
+        if not isinstance(data, bytes):
+            raise TypeError(f"a serial port takes bytes, not {type(data).__name__}")
+        with self._writing:
+            port = self._serial
+            if port is None:
+                self._losses.add("write_closed_bytes", len(data))
+                return
+            fd = port.fileno()
+            deadline = time.monotonic() + WRITE_TIMEOUT
+            rest = memoryview(data)
+            while rest:
+                try:
+                    rest = rest[os.write(fd, rest) :]
+                except BlockingIOError:
+                    left = deadline - time.monotonic()
+                    if left <= 0 or not select.select([], [fd], [], left)[1]:
+                        self._losses.add("write_timeout_bytes", len(rest))
+                        return
+                except OSError:
+                    # The reader sees the same unplugging and raises `PortGone`.
+                    self._losses.add("write_gone_bytes", len(rest))
+                    return
+
+    def close(self) -> None:
+        """Wake a waiting reader, then give the port back; more than once is fine."""
+        waker = self._waker
+        if waker is not None:
+            waker.wake()
+        with self._reading, self._writing:
+            # Only now is nobody waiting on the descriptors, which the system may reuse at once.
+            port, self._serial = self._serial, None
+            if self._waker is not None:
+                self._waker.close()
+                self._waker = None
+            if port is not None:
+                try:
+                    port.close()
+                except OSError as error:
+                    log.debug("closing %s: %s", self._name, error)  # unplugged: nothing to release
+
+    def _gone(self, why: str) -> PortGone:
+        return PortGone(f"{self._name} is gone ({why})", "plug it in again")
+
+    def _locate(self) -> str:
+        """Path to open: where the remembered USB device is now, else the path as given."""
+        if self.usb_serial is not None:
+            found = listing.find_by_serial(self.usb_serial)
+            if found is not None:
+                return found.device
+            if self._name.startswith(USB_PREFIX) or os.path.exists(self._name):
+                raise PortMissing(
+                    f"no USB serial port has the serial number {self.usb_serial}",
+                    f"plug it in; {listing.known_ports()}",
+                )
+        return self._name
+
+
+def _open_exclusively(device: str, baud: int) -> serial.Serial:
+    """Open ``device`` so that no second process reads it, or say why not and what to do."""
+    _check_is_port(device)
+    try:
+        port = serial.Serial(device, baud, timeout=0, exclusive=True)
+    except serial.SerialException as error:
+        raise _explain(device, error.errno, error) from error
+    except (OSError, termios.error) as error:
+        raise _explain(device, error.args[0], error) from error
+    except ValueError as error:
+        raise PortUnsuitable(
+            f"{device} refuses {baud} bit/s: {error}", "give a baud rate that the port supports"
+        ) from error
+    if os.major(os.fstat(port.fileno()).st_rdev) in PTY_MAJORS:
+        return port  # its other end holds it open rightly, and TIOCEXCL would outlive our death
+    others = [who for who in listing.holders(device) if f"pid {os.getpid()}" not in who]
+    if others:
+        port.close()
+        raise _busy(device, others)
+    # flock stops only programs that ask for it; this also stops those that do not.
+    ioctl(port.fileno(), termios.TIOCEXCL)
+    return port
+
+
+def _check_is_port(device: str) -> None:
+    try:
+        mode = os.stat(device).st_mode
+    except FileNotFoundError as error:
+        raise PortMissing(f"there is no port {device}", listing.known_ports()) from error
+    except OSError as error:
+        raise _explain(device, error.errno, error) from error
+    if not stat.S_ISCHR(mode):
+        kind = "a folder" if stat.S_ISDIR(mode) else "no character device"
+        raise PortUnsuitable(f"{device} is {kind}, not a serial port", listing.known_ports())
+
+
+def _explain(device: str, number: object, error: BaseException) -> TransportError:
+    if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
+        return PortMissing(f"there is no port {device}", listing.known_ports())
+    if number in (errno.EACCES, errno.EPERM):
+        return PortDenied(f"no permission to open {device}", permission_remedy(device))
+    if number in (errno.EBUSY, errno.EAGAIN):
+        return _busy(device, listing.holders(device))
+    if number in (errno.ENOTTY, errno.EINVAL) or "configure port" in str(error):
+        return PortUnsuitable(f"{device} is not a serial port", listing.known_ports())
+    return PortUnsuitable(f"cannot open {device}: {error}", "plug it out and in again")
+
+
+def _busy(device: str, who: list[str]) -> PortBusy:
+    by = f" by {', '.join(who)}" if who else " by another process"
+    return PortBusy(f"{device} is held{by}", "end that process, or give another port")
+
+
+def permission_remedy(device: str) -> str:
+    """What lets a user open ``device``: its group, or a udev rule."""
+    import grp
+
+    try:
+        group = grp.getgrgid(os.stat(device).st_gid).gr_name
+    except (OSError, KeyError):
+        group = "dialout"
+    if group == "root":
+        group = "dialout"
+    rule = 'SUBSYSTEM=="tty", ATTRS{idVendor}=="VID", ATTRS{idProduct}=="PID", MODE="0660"'
+    return (
+        f"run `sudo usermod -aG {group} $USER` and log in again, or add the udev rule "
+        f'{rule}, GROUP="{group}" in /etc/udev/rules.d/70-tactile.rules'
+    )
