@@ -1,0 +1,97 @@
+"""Boards without a clock: numbering and stamps from arrivals alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tactile_bus.instant import NS_PER_S, Instant
+from tactiled.arrival_clock import Arrival, ArrivalClock
+
+START = 7_200 * NS_PER_S
+
+
+def at(host: float) -> Instant:
+    return Instant(START + round(host * NS_PER_S))
+
+
+def run(departures: list[float], delays: list[float]) -> tuple[ArrivalClock, list[Arrival]]:
+    """Arrivals in order: a frame cannot overtake the one before it."""
+    clock, out, latest = ArrivalClock(), [], 0.0
+    for departure, delay in zip(departures, delays, strict=True):
+        latest = max(latest, departure + delay)
+        out.append(clock.arrived(at(latest)))
+    return clock, out
+
+
+@given(
+    period=st.floats(0.002, 0.05),
+    jitter=st.floats(0.0, 0.4),
+    seed=st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=20, deadline=None)
+def test_measured_instant_is_within_uncertainty(period: float, jitter: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    sent = [k * period for k in range(600)]
+    _, out = run(sent, list(rng.exponential(jitter * period, 600)))
+    previous = 0
+    for departure, arrival in zip(sent, out, strict=True):
+        stamp = arrival.stamp
+        assert stamp.captured >= previous
+        previous = stamp.captured
+    for departure, arrival in zip(sent[100:], out[100:], strict=True):
+        middle = departure - period / 2
+        error = abs(arrival.stamp.captured - at(middle)) / NS_PER_S
+        assert error <= arrival.stamp.uncertainty
+
+
+def test_jitter_is_rejected() -> None:
+    rng = np.random.default_rng(3)
+    sent = [k * 0.01 for k in range(2000)]
+    clock, out = run(sent, list(rng.exponential(0.002, 2000)))
+    steps = np.diff([a.stamp.captured for a in out[200:]]) / NS_PER_S
+    assert steps.std() < 0.0005
+    assert clock.period == pytest.approx(0.01, rel=1e-3)
+    assert [a.sequence for a in out] == list(range(2000))
+
+
+def test_a_host_stall_that_ends_in_a_burst_loses_nothing() -> None:
+    sent = [k * 0.01 for k in range(400)]
+    delays = [0.0] * 400
+    for k in range(300, 306):
+        delays[k] = sent[306] - sent[k]
+    clock, out = run(sent, delays)
+    assert out[-1].sequence == 399
+    assert clock.counters["lost"] == 0
+    stalled = out[301].stamp
+    assert abs(stalled.captured - at(sent[301] - 0.005)) / NS_PER_S <= stalled.uncertainty
+
+
+def test_lost_frames_leave_a_gap_in_the_numbers() -> None:
+    sent = [k * 0.01 for k in range(400) if not 300 <= k < 305]
+    clock, out = run(sent, [0.0] * len(sent))
+    assert clock.counters["lost"] == 5
+    assert out[-1].sequence == 399
+    error = abs(out[-1].stamp.captured - at(sent[-1] - 0.005)) / NS_PER_S
+    assert error <= out[-1].stamp.uncertainty < 0.006
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_changed_rate_is_followed(factor: float) -> None:
+    sent = [k * 0.01 for k in range(400)]
+    sent += [sent[-1] + (k + 1) * 0.01 * factor for k in range(600)]
+    clock, out = run(sent, [0.0] * len(sent))
+    assert clock.period == pytest.approx(0.01 * factor, rel=1e-2)
+    error = abs(out[-1].stamp.captured - at(sent[-1] - 0.005 * factor)) / NS_PER_S
+    assert error <= out[-1].stamp.uncertainty
+
+
+def test_frames_read_in_one_chunk_keep_their_order() -> None:
+    sent = [k * 0.01 for k in range(600)]
+    delays = [(3 - k % 4) * 0.01 for k in range(600)]
+    clock, out = run(sent, delays)
+    assert [a.sequence for a in out] == list(range(600))
+    steps = np.diff([a.stamp.captured for a in out[200:]]) / NS_PER_S
+    assert steps.min() > 0.005
+    assert clock.counters["lost"] == 0
