@@ -22,6 +22,7 @@ class Topic:
     published: bool = True
     logged: bool = True
     stale_after: float | None = None
+    latched: bool = False  # the last value holds until the next: repeated in every log file
 
     def key(self, name: str, prefix: str = "") -> str:
         """Key expression for ``name``; ValueError when it is no single plain chunk."""
@@ -31,16 +32,34 @@ class Topic:
         return f"{prefix}/{key}" if prefix else key
 
 
-FEATURES = Topic("tactile/{name}/features", "tactile_msgs/msg/ContactFeatures", 100, stale_after=0.2)
-FORCES = Topic("tactile/{name}/forces", "tactile_msgs/msg/TaxelForces", 100, stale_after=0.2)
-FIELD = Topic("tactile/{name}/field", "tactile_msgs/msg/TaxelField", 100)
-AMBIENT = Topic("tactile/{name}/ambient", "tactile_msgs/msg/AmbientField", 100)
-GEOMETRY = Topic("tactile/{name}/geometry", "tactile_msgs/msg/SkinGeometry", 0)
-RAW = Topic("tactile/{name}/raw", "tactile_msgs/msg/RawChunk", 100, published=False)
+_OWN = "tactile_msgs/msg"
+
+FEATURES = Topic("tactile/{name}/features", f"{_OWN}/ContactFeatures", 100, stale_after=0.2)
+FORCES = Topic("tactile/{name}/forces", f"{_OWN}/TaxelForces", 100, stale_after=0.2)
+FIELD = Topic("tactile/{name}/field", f"{_OWN}/TaxelField", 100)
+AMBIENT = Topic("tactile/{name}/ambient", f"{_OWN}/AmbientField", 100)
+GEOMETRY = Topic("tactile/{name}/geometry", f"{_OWN}/SkinGeometry", 0, latched=True)
+RAW = Topic("tactile/{name}/raw", f"{_OWN}/RawChunk", 100, published=False)
 DIAGNOSTICS = Topic("tactile/{name}/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 1)
 LOG = Topic("tactile/{name}/log", "rcl_interfaces/msg/Log", 0)
 
 TOPICS = (FEATURES, FORCES, FIELD, AMBIENT, GEOMETRY, RAW, DIAGNOSTICS, LOG)
+
+
+def find_topic(key: str) -> tuple[Topic, str] | None:
+    """Topic and name that ``key`` (a key expression, or a channel of a log) was built from.
+
+    A leading slash (channels of a log have one) and a replay prefix are passed over.
+    """
+    parts = key.strip("/").split("/")
+    for topic in TOPICS:
+        template = topic.template.split("/")
+        tail = parts[-len(template) :]
+        if len(tail) == len(template) and all(
+            a == b or b == "{name}" for a, b in zip(tail, template, strict=True)
+        ):
+            return topic, tail[template.index("{name}")]
+    return None
 
 
 def service_key(name: str, service: str) -> str:
