@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from sensor_proto.can_errors import BusState
 from tactiled.transports.base import (
-    BusState,
     EndOfLog,
     Medium,
     PortBusy,

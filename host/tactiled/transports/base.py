@@ -7,6 +7,7 @@ from collections import Counter
 from enum import StrEnum
 from typing import Protocol
 
+from sensor_proto.can_errors import BusState
 from sensor_proto.canseg import CanFrame
 from tactiled.blocks import Chunk
 
@@ -16,15 +17,6 @@ class Medium(StrEnum):
 
     SERIAL = "serial"
     CAN = "can"
-
-
-class BusState(StrEnum):
-    """Fault confinement of ISO 11898-1, as the adapter tells; a serial line is always ACTIVE."""
-
-    ACTIVE = "active"
-    WARNING = "error-warning"
-    PASSIVE = "error-passive"
-    BUS_OFF = "bus-off"
 
 
 class TransportError(Exception):
@@ -109,8 +101,8 @@ class Transport(Protocol):
 WRITE_TIMEOUT = 0.02
 """s. Commands are some thirty bytes and a tty takes 4 KiB at once: who waits longer is stuck."""
 
-READ_LIMIT = 65_536
-"""Bytes one read may return: more than a tty's 4 KiB buffer, less than the log's message limit."""
+READ_LIMIT = 16_384
+"""Bytes one read may return: more than a tty's 4 KiB buffer, less than a log message may have."""
 
 
 class Losses:

@@ -14,6 +14,7 @@ from fcntl import ioctl
 
 import serial
 
+from sensor_proto.can_errors import BusState
 from sensor_proto.canseg import CanFrame
 from tactile_bus.instant import monotonic_now
 from tactiled.blocks import Chunk
@@ -21,7 +22,6 @@ from tactiled.transports import listing
 from tactiled.transports.base import (
     READ_LIMIT,
     WRITE_TIMEOUT,
-    BusState,
     Losses,
     Medium,
     PortBusy,
@@ -133,7 +133,7 @@ class SerialTransport:
             return Chunk(received, data)
 
     def write(self, data: bytes | tuple[CanFrame, ...]) -> None:
-        """Send bytes within `WRITE_TIMEOUT`, count those that could not be; see `Transport.write`."""
+        """Send bytes within `WRITE_TIMEOUT`; those that did not go are counted."""
         if not isinstance(data, bytes):
             raise TypeError(f"a serial port takes bytes, not {type(data).__name__}")
         with self._writing:

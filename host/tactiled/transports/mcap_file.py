@@ -1,0 +1,176 @@
+"""A recorded log as a port: its raw chunks again, at the pace at which they came."""
+
+from __future__ import annotations
+
+import logging
+import math
+import struct
+import threading
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import zstandard
+from mcap.exceptions import EndOfFile, McapError
+from mcap.records import Channel, Message, Schema
+from mcap.stream_reader import StreamReader
+
+from sensor_proto.can_errors import BusState
+from sensor_proto.canseg import CanFrame
+from tactile_bus.instant import Instant, after, monotonic_now, seconds_between
+from tactile_bus.messages import DecodeError, codec
+from tactile_bus.topics import RAW
+from tactiled.blocks import Chunk
+from tactiled.transports.base import (
+    EndOfLog,
+    Losses,
+    Medium,
+    PortClosed,
+    PortDenied,
+    PortMissing,
+    PortUnsuitable,
+)
+from tactiled.transports.raw_chunk import from_raw
+
+log = logging.getLogger(__name__)
+
+RECORD_LIMIT = 64 << 20
+"""Bytes of the largest record believed: chunks are flushed every half second, far below this."""
+
+BROKEN = (McapError, ValueError, struct.error, zlib.error, zstandard.ZstdError, EOFError)
+"""What the reader raises where a file was cut off or damaged."""
+
+
+class McapTransport:
+    """Raw chunks of one board of a log (`RawChunk` on ``tactile/<board>/raw``), in file order.
+
+    ``board`` None: the log's only board. ``speed``: times real time, `math.inf` for as fast as it
+    is read. Chunks keep the spacing of their stamps, divided by a finite ``speed``, from the
+    moment of opening; at `math.inf` the spacing is the recorded one. Files cut off by a kill are
+    replayed up to the break. `read` raises `EndOfLog` behind the last chunk.
+    """
+
+    def __init__(self, path: str | Path, board: str | None = None, speed: float = 1.0) -> None:
+        if not speed > 0:
+            raise ValueError(f"speed {speed} given; allowed: a positive number, or inf")
+        self._path = Path(path)
+        self._board = board
+        self._speed = speed
+        self._losses = Losses()
+        self._closed = threading.Event()
+        self._closed.set()
+        self._reading = threading.Lock()
+        self._chunks: Iterator[Chunk] = iter(())
+        self._next: Chunk | None = None
+        self._first = self._start = Instant(0)
+        self._medium = Medium.SERIAL
+
+    @property
+    def name(self) -> str:
+        """Path of the log."""
+        return str(self._path)
+
+    @property
+    def medium(self) -> Medium:
+        """Medium of the recorded board; known once open."""
+        return self._medium
+
+    @property
+    def state(self) -> BusState:
+        """Always active."""
+        return BusState.ACTIVE
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """Broken records, and writes (a recording answers nobody)."""
+        return self._losses.snapshot()
+
+    def open(self) -> None:
+        """Find the first chunk; raises `TransportError` for no such file, no log, no raw chunks."""
+        try:
+            self._path.open("rb").close()
+        except FileNotFoundError as error:
+            raise PortMissing(f"there is no log {self._path}", "give the path of a log") from error
+        except PermissionError as error:
+            raise PortDenied(f"no permission to read {self._path}", "see its mode") from error
+        except OSError as error:
+            raise PortUnsuitable(f"cannot read {self._path}: {error}", "give a log") from error
+        self._closed.clear()
+        self._chunks = self._read_chunks()
+        self._next = next(self._chunks, None)
+        if self._next is None:
+            of = "" if self._board is None else f" of board {self._board!r}"
+            raise PortUnsuitable(
+                f"{self._path} holds no raw chunks{of}",
+                "give a log that was written with raw chunks (see `tactile log info`)",
+            )
+        self._medium = Medium.SERIAL if isinstance(self._next.payload, bytes) else Medium.CAN
+        self._first = self._next.received
+        self._start = monotonic_now()
+
+    def read(self, timeout: float) -> Chunk | None:
+        """Next chunk when it is due; see `Transport.read`."""
+        with self._reading:
+            if self._closed.is_set():
+                raise PortClosed(f"{self._path} is closed")
+            chunk = self._next
+            if chunk is None:
+                raise EndOfLog(f"{self._path} is at its end")
+            spacing = seconds_between(self._first, chunk.received)
+            due = self._start
+            if math.isinf(self._speed):
+                stamp = after(self._start, spacing)
+            else:
+                stamp = due = after(self._start, spacing / self._speed)
+            wait = seconds_between(monotonic_now(), due)
+            if self._closed.wait(max(0.0, min(wait, timeout))):
+                raise PortClosed(f"{self._path} was closed")
+            if wait > timeout:
+                return None
+            self._next = next(self._chunks, None)
+            return Chunk(stamp, chunk.payload)
+
+    def write(self, data: bytes | tuple[CanFrame, ...]) -> None:
+        """Counted and dropped: a recording answers nobody."""
+        self._losses.add("write_to_recording", len(data))
+
+    def close(self) -> None:
+        """Close; a waiting reader wakes at once."""
+        self._closed.set()
+        with self._reading:
+            self._chunks, self._next = iter(()), None
+
+    def _read_chunks(self) -> Iterator[Chunk]:
+        with self._path.open("rb") as file:
+            wanted: set[int] = set()
+            schemas: dict[int, str] = {}
+            reader = StreamReader(file, validate_crcs=True, record_size_limit=RECORD_LIMIT)
+            records = reader.records
+            while True:
+                try:
+                    record = next(records)
+                except StopIteration:
+                    return
+                except EndOfFile:
+                    log.warning("%s is cut off; replayed to the break", self._path)
+                    return
+                except BROKEN as error:
+                    self._losses.add("broken_record")
+                    log.warning("%s is damaged (%s); replayed to there", self._path, error)
+                    return
+                if isinstance(record, Schema):
+                    schemas[record.id] = record.name
+                elif isinstance(record, Channel):
+                    if schemas.get(record.schema_id) == RAW.msgtype and self._wants(record.topic):
+                        wanted.add(record.id)
+                elif isinstance(record, Message) and record.channel_id in wanted:
+                    try:
+                        yield from_raw(codec().decode(RAW, record.data))
+                    except DecodeError:
+                        self._losses.add("broken_message")
+
+    def _wants(self, topic: str) -> bool:
+        if self._board is not None:
+            return topic.endswith(RAW.key(self._board))
+        self._board = topic.removesuffix("/raw").rpartition("/")[2]
+        return True
