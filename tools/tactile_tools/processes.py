@@ -1,0 +1,58 @@
+"""Starting our own commands from a tool, and ending them in order."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+PORT_WAIT_S = 20.0  # a loaded machine needs a few seconds to import numpy twice
+
+
+def free_port() -> int:
+    """Return a TCP port of this machine that is free now, so that a running tactiled is left be."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def command(name: str) -> str:
+    """Path of one of our commands, from the environment this one runs in."""
+    beside = Path(sys.executable).with_name(name)
+    found = str(beside) if beside.exists() else shutil.which(name)
+    if found is None:
+        raise RuntimeError(f"the command {name} is not installed beside {sys.executable}")
+    return found
+
+
+@contextlib.contextmanager
+def running(words: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a command in the background and end it in order when the block is left."""
+    with log.open("wb") as output:
+        process = subprocess.Popen(words, stdout=output, stderr=subprocess.STDOUT)
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(timeout=5)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def wait_for(path: Path, process: subprocess.Popen[bytes], log: Path) -> None:
+    """Wait until ``path`` exists; RuntimeError with the program's own words when it ends first."""
+    deadline = time.monotonic() + PORT_WAIT_S
+    while not path.exists():
+        if process.poll() is not None or time.monotonic() > deadline:
+            said = log.read_text(errors="replace").strip()
+            raise RuntimeError(f"there is no {path.name} yet: {said or 'nothing was said'}")
+        time.sleep(0.05)
