@@ -1,0 +1,119 @@
+"""The rubber between a contact and the magnets: spreading, compliance, creep, hysteresis."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_device.parameters import ElastomerParameters
+
+Float = NDArray[np.float64]
+
+_HERTZ_VARIANCE = 0.2
+"""Variance per axis of Hertz's pressure sqrt(1 - r²/a²) over a²."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contact:
+    """``position`` (3,) m and ``force`` (3,) N in ``ee``; the force is what the environment exerts
+    on the skin. ``radius``: m, of the patch of contact.
+    """  # noqa: D205 - one contract, too long for one line
+
+    position: Float
+    force: Float
+    radius: float = 4e-3
+
+
+class Spreader:
+    """Shares contacts out over taxels at ``position`` (N, 3) m in ``ee``."""
+
+    def __init__(self, position: Float, parameters: ElastomerParameters) -> None:
+        self._position = position
+        self._parameters = parameters
+
+    def weights(self, contacts: Sequence[Contact]) -> Float:
+        """Share (C, N) of each contact that each taxel bears.
+
+        Rows sum to one within ``full_reach`` of a taxel, to zero beyond ``no_reach``: there the
+        rigid body bears the contact and no taxel feels it.
+        """
+        p = self._parameters
+        points = np.array([c.position for c in contacts])
+        radius = np.array([c.radius for c in contacts])
+        difference = points[:, None] - self._position
+        squared = np.einsum("cni,cni->cn", difference, difference)
+        nearest = squared.min(axis=1)
+        width = p.spread**2 + _HERTZ_VARIANCE * radius**2
+        # Measured from the nearest taxel so that far contacts do not underflow to 0/0.
+        share = np.exp((nearest[:, None] - squared) / (2.0 * width[:, None]))
+        borne = (p.no_reach - np.sqrt(nearest)) / (p.no_reach - p.full_reach)
+        share *= (np.clip(borne, 0.0, 1.0) / share.sum(axis=1))[:, None]
+        return share
+
+    def force(self, contacts: Sequence[Contact]) -> Float:
+        """Force (N, 3) N in ``ee`` on each taxel."""
+        if not contacts:
+            return np.zeros_like(self._position)
+        force: Float = self.weights(contacts).T @ np.array([c.force for c in contacts])
+        return force
+
+
+class Elastomer:
+    """Displacement of each magnet under the force on its taxel, both in taxel axes.
+
+    Prompt compliance, one Kelvin-Voigt branch for creep, and for hysteresis a play operator whose
+    half-width is a fixed share of the greatest recent load: the loop is the same share of its
+    peak whatever the peak, and fades as the rubber forgets it.
+    """
+
+    def __init__(
+        self, parameters: ElastomerParameters, stiffness_factor: Float, travel: Float
+    ) -> None:
+        """``stiffness_factor`` (N,) of each taxel; ``travel`` (N,) m its magnet can sink."""
+        p = self._parameters = parameters
+        n = len(stiffness_factor)
+        nominal = np.array([p.shear_stiffness, p.shear_stiffness, p.normal_stiffness])
+        self._compliance = 1.0 / (nominal * stiffness_factor[:, None])
+        self._travel = travel
+        loop = np.array([p.hysteresis_shear, p.hysteresis_shear, p.hysteresis_normal])
+        # The play lags by knee · peak each way: weighted so that the loop is loop · peak wide.
+        self._play_weight = loop / (2.0 * p.hysteresis_knee)
+        self._force = np.zeros((n, 3))
+        self._creep = np.zeros((n, 3))
+        self._play = np.zeros((n, 3))
+        self._peak = np.zeros((n, 3))
+
+    def reset(self) -> None:
+        """Fully recovered rubber."""
+        for state in (self._force, self._creep, self._play, self._peak):
+            state[:] = 0.0
+
+    def load(self, force: Float, dt: float) -> Float:
+        """Displacement (N, 3) m after ``dt`` s in which the force went to ``force`` (N, 3) N."""
+        if not dt >= 0:
+            raise ValueError(f"time went back by {-dt} s")
+        p = self._parameters
+        mean = 0.5 * (self._force + force)
+        self._creep += (mean - self._creep) * -math.expm1(-dt / p.creep_time)
+        self._force = force
+        self._peak = np.maximum(np.abs(force), self._peak * math.exp(-dt / p.hysteresis_time))
+        slack = p.hysteresis_knee * self._peak
+        self._play = np.minimum(np.maximum(self._play, force - slack), force + slack)
+        effective = force + p.creep * self._creep + self._play_weight * (self._play - force)
+        return self._displace(effective)
+
+    def settled(self, force: Float) -> Float:
+        """Displacement (N, 3) m on the centre line of the loop, with half of the creep done.
+
+        Changes no state: what a calibration rig sees on average.
+        """
+        return self._displace(force * (1.0 + 0.5 * self._parameters.creep))
+
+    def _displace(self, effective: Float) -> Float:
+        displacement: Float = effective * self._compliance
+        np.maximum(displacement[:, 2], -self._travel, out=displacement[:, 2])
+        return displacement

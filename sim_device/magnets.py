@@ -1,0 +1,61 @@
+"""Field of point dipoles at the chips of a skin, own magnets and neighbours."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+MU0_OVER_4PI = 1e-7
+"""T·m/A."""
+
+UT_PER_T = 1e6
+
+
+def dipole_field_ut(offset: Float, moment: Float) -> Float:
+    """Field in µT at ``offset`` (..., 3) m from point dipoles ``moment`` (..., 3) A·m².
+
+    B = µ0/4π · (3 (m·r̂) r̂ − m) / r³ (Jackson, Classical Electrodynamics, eq. 5.56).
+    """
+    r2 = np.einsum("...i,...i->...", offset, offset)
+    along = np.einsum("...i,...i->...", moment, offset)
+    scale = (MU0_OVER_4PI * UT_PER_T) / (r2 * np.sqrt(r2))
+    field: Float = (3.0 * along / r2 * scale)[..., None] * offset - scale[..., None] * moment
+    return field
+
+
+class MagnetArray:
+    """Magnets over chips: ``chips`` (N, 3) m, ``rest`` (N, 3) m and ``moment`` (N, 3) A·m² in ee.
+
+    Each chip sees the magnets within ``radius`` m of it at rest; the others are left out.
+    """
+
+    def __init__(self, chips: Float, rest: Float, moment: Float, radius: float) -> None:
+        self._rest = rest
+        distance = np.linalg.norm(chips[:, None] - rest[None], axis=2)
+        seen = distance <= radius
+        np.fill_diagonal(seen, True)
+        pairs = np.argwhere(seen)
+        chip, self._magnet = pairs[:, 0], pairs[:, 1]
+        # Every chip has at least its own magnet, so each has a run of pairs, in order.
+        self._starts = np.searchsorted(chip, np.arange(len(chips)))
+        # Components apart: numpy is several times faster on long rows than on triples.
+        self._offset = np.ascontiguousarray((chips[chip] - rest[self._magnet]).T)
+        self._moment = np.ascontiguousarray(moment[self._magnet].T)
+
+    def field_ut(self, displacement: Float, strength: float = 1.0) -> Float:
+        """Field (N, 3) µT in ee at the chips, the magnets moved by ``displacement`` (N, 3) m in ee.
+
+        ``strength``: factor on every moment.
+        """
+        offset = self._offset - displacement.T[:, self._magnet]
+        x, y, z = offset
+        mx, my, mz = self._moment
+        r2 = x * x + y * y + z * z
+        along = mx * x + my * y + mz * z
+        scale = (MU0_OVER_4PI * UT_PER_T * strength) / (r2 * np.sqrt(r2))
+        along *= 3.0 * scale / r2
+        pairs = along * offset - scale * self._moment
+        total: Float = np.add.reduceat(pairs, self._starts, axis=1).T
+        return total
