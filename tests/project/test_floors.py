@@ -14,6 +14,7 @@ ROOMS = {
     "sensor_proto": ROOT / "sensor_proto",
     "tactile_bus": ROOT / "host" / "tactile_bus",
     "tactiled": ROOT / "host" / "tactiled",
+    "reachd": ROOT / "host" / "reachd",
     "sim_device": ROOT / "sim_device",
     "tactile_tools": ROOT / "tools" / "tactile_tools",
 }
@@ -21,8 +22,9 @@ MAY_IMPORT = {
     "sensor_proto": set(),
     "tactile_bus": {"sensor_proto"},
     "tactiled": {"sensor_proto", "tactile_bus"},
+    "reachd": {"sensor_proto", "tactile_bus"},
     "sim_device": {"sensor_proto", "tactile_bus"},
-    "tactile_tools": {"sensor_proto", "tactile_bus", "tactiled", "sim_device"},
+    "tactile_tools": {"sensor_proto", "tactile_bus", "tactiled", "reachd", "sim_device"},
 }
 IO_MODULES = {"serial", "can", "zenoh", "mcap", "threading", "socket", "logging", "time", "os"}
 

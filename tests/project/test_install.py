@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = ("tactiled", "simdevice", "tactile")
-TOP_LEVEL = {"sensor_proto", "sim_device", "tactile_bus", "tactiled", "tactile_tools"}
+TOP_LEVEL = {"sensor_proto", "sim_device", "tactile_bus", "tactiled", "reachd", "tactile_tools"}
 
 
 def run(*words: str | Path, **kwargs: object) -> subprocess.CompletedProcess[str]:

@@ -1,0 +1,1 @@
+"""From contact features to velocity commands: primitives, strategies and the safety gate."""

@@ -1,0 +1,97 @@
+"""What a strategy sees and says: the seam between touch, arm, strategy and safety gate.
+
+Planar quantities are in the cupboard's frame ``cupboard``: origin at the middle of its front
+edge, x into the cupboard, y left, angles counter-clockwise from x. (The paper's axes are x right,
+y forward, angles from y: x_here = y_paper, y_here = −x_paper.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from tactile_bus.geometry import Side
+from tactile_bus.instant import Instant
+
+
+@dataclass(frozen=True, slots=True)
+class Twist:
+    """Planar velocity of the wrist pivot. m/s in ``cupboard``, rad/s counter-clockwise."""
+
+    vx: float
+    vy: float
+    omega: float
+
+
+ZERO = Twist(0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class ArmState:
+    """What the arm reports of itself at its own rate.
+
+    Pose of the wrist pivot (m, rad) and its twist; wrench that the environment exerts on the
+    end-effector about the pivot (N, N, N·m), all in ``cupboard``. ``mode`` is "ready", "moving",
+    "stopped", "fault" or "estop". The limits are those the arm confirms: m/s, rad/s, N, N·m.
+    """
+
+    captured: Instant
+    received: Instant
+    x: float
+    y: float
+    heading: float
+    twist: Twist
+    fx: float
+    fy: float
+    mz: float
+    mode: str
+    v_max: float
+    omega_max: float
+    f_max: float
+    m_max: float
+
+
+@dataclass(frozen=True, slots=True)
+class Touch:
+    """The contact features a strategy may use; see ``ContactFeatures.msg``.
+
+    Forces in N, ``peak_x``/``peak_y`` in m in ``ee``. ``total_force``: sum of normal forces over
+    the skin. ``tip_force``: sum of normal forces at the tip.
+    """
+
+    captured: Instant
+    received: Instant
+    valid: bool
+    peak_force: float
+    peak_side: Side
+    peak_x: float
+    peak_y: float
+    total_force: float
+    tip_force: float
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """Where the tip is to go (m, ``cupboard``), how near (m), and how long it may take (s)."""
+
+    x: float
+    y: float
+    radius: float
+    time_limit: float
+
+
+class Strategy(Protocol):
+    """A reaching strategy: pure, its randomness from the generator it was made with."""
+
+    def start(self, goal: Goal, now: Instant) -> None:
+        """Begin a reach; forget any earlier one."""
+        ...
+
+    def step(self, touch: Touch, arm: ArmState, goal: Goal, now: Instant) -> Twist:
+        """Twist of the pivot wanted now, before the safety gate."""
+        ...
+
+    @property
+    def activity(self) -> str:
+        """What it is doing: "straight", "burrow", "excavate_cw", "excavate_ccw", or its own word."""
+        ...
