@@ -111,8 +111,9 @@ class Cycle:
     """Everything known of one sampling cycle of a board, all N taxels one array after another.
 
     ``force``: (N, 3) N in taxel axes, NaN where the taxel is not healthy. ``field_ut``: (N, 3) µT
-    in taxel axes after rest field and temperature, before compensation. ``health``: (N,) uint8 of
-    `TaxelHealth`.
+    in taxel axes after rest field and temperature, before compensation; NaN likewise. ``health``:
+    (N,) uint8 of `TaxelHealth`. ``features_due``: by the feature rate, these features are to be
+    sent; they are computed in every cycle.
     """
 
     sequence: int
@@ -126,3 +127,4 @@ class Cycle:
     ambient: Ambient
     features: Features
     calibrated: bool
+    features_due: bool = True

@@ -1,0 +1,156 @@
+"""Calibrations made of typical figures, for boards nobody has calibrated yet.
+
+They give positions that are right for a known model and forces that are right to a factor of
+about two; their rest field is unknown and must be tared.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sensor_proto.packets import ArrayDescriptor, Descriptor
+from tactile_bus.calibration_types import ArrayCalibration, BoardCalibration
+from tactile_bus.geometry import (
+    ArrayGeometry,
+    Side,
+    SkinGeometry,
+    anyskin,
+    finger,
+    grid_on_plane,
+)
+
+Float = NDArray[np.float64]
+
+NORMAL_UT_PER_N = 115.0
+"""µT/N of a press on the nearest magnetometer (eFlesh recordings, 34 N → 3.9 mT)."""
+
+SHEAR_UT_PER_N = NORMAL_UT_PER_N * 3 * 3.8 / 8.0
+"""µT/N of a shear force: the field of a magnet 4 mm away changes 3.8 mT/mm sideways and
+8.0 mT/mm towards the chip, and a rubber pad (incompressible, E = 3 G) gives way three times as
+far in shear."""
+
+REFERENCE_C = 25.0
+ANYSKIN_PITCH = 0.008
+"""m between neighbouring magnetometers of an AnySkin board."""
+ANYSKIN_BOARD_PITCH = 0.030
+"""m between the centres of AnySkin boards on one controller, until a file says how they lie."""
+MAX_ANYSKIN_MAGNETOMETERS = 20
+"""One controller reads four boards of five."""
+
+NOMINAL_MODELS = ("finger", "anyskin")
+
+
+def nominal_newton_per_ut(
+    taxels: int, normal: float = NORMAL_UT_PER_N, shear: float = SHEAR_UT_PER_N
+) -> Float:
+    """(3n, 3n) N/µT without coupling between taxels.
+
+    Magnets point away from the chips: a press (negative z) brings them nearer and raises B_z,
+    a force along +x carries them towards +x and raises B_x.
+    """
+    return np.diag(np.tile([1 / shear, 1 / shear, -1 / normal], taxels))
+
+
+def nominal(model: str, serial_number: str, magnetometers: int | None = None) -> BoardCalibration:
+    """Typical figures for ``model``, one of `NOMINAL_MODELS`; ValueError for any other.
+
+    ``magnetometers``: of an ``anyskin`` controller, 1 to 20 (five to a board), numbered as on its
+    bus; all of them are taxels of one array.
+    """
+    if model == "finger":
+        if magnetometers is not None:
+            raise ValueError("magnetometers is a property of anyskin boards alone")
+        return _typical(finger(), serial_number, "finger of the default end-effector")
+    if model == "anyskin":
+        return _typical(_anyskin_controller(magnetometers or 5), serial_number, "AnySkin")
+    raise ValueError(f"no nominal figures for model {model!r}; there are {NOMINAL_MODELS}")
+
+
+def nominal_from_descriptor(descriptor: Descriptor) -> BoardCalibration:
+    """Typical figures for the board that sent ``descriptor``.
+
+    A known model whose arrays have the same shapes gets that model's geometry; any other gets
+    flat grids of the descriptor's rows, columns and pitch, all at the tip.
+    """
+    shapes = [(a.rows, a.columns) for a in descriptor.arrays]
+    if descriptor.model == "finger":
+        geometry = finger()
+        if shapes == [(a.rows, a.columns) for a in geometry.arrays]:
+            return _typical(geometry, descriptor.serial_number, "finger, by its descriptor")
+    geometry = SkinGeometry(
+        descriptor.model, "ee", tuple(_flat(array) for array in descriptor.arrays)
+    )
+    return _typical(
+        geometry, descriptor.serial_number, "flat grids from the descriptor, place unknown"
+    )
+
+
+def _typical(geometry: SkinGeometry, serial_number: str, what: str) -> BoardCalibration:
+    return BoardCalibration(
+        serial_number=serial_number,
+        model=geometry.model,
+        frame=geometry.frame,
+        created="1970-01-01T00:00:00Z",  # typical figures have no date of measurement
+        provenance=f"nominal figures, not measured: {what}",
+        nominal=True,
+        arrays=tuple(
+            ArrayCalibration(
+                geometry=array,
+                rest_ut=np.zeros((array.taxels, 3)),
+                drift_ut_per_k=np.zeros((array.taxels, 3)),
+                reference_c=REFERENCE_C,
+                newton_per_ut=nominal_newton_per_ut(array.taxels),
+            )
+            for array in geometry.arrays
+        ),
+    )
+
+
+def _anyskin_controller(magnetometers: int) -> SkinGeometry:
+    """One board of five, several of them side by side, or a plain row of any other number."""
+    if not 1 <= magnetometers <= MAX_ANYSKIN_MAGNETOMETERS:
+        raise ValueError(
+            f"{magnetometers} magnetometers: an AnySkin controller reads 1 to "
+            f"{MAX_ANYSKIN_MAGNETOMETERS}"
+        )
+    board = anyskin()
+    if magnetometers == board.taxels:
+        return board
+    five = board.arrays[0]
+    axes, centre = five.rotation[0], five.position[0]
+    boards, rest = divmod(magnetometers, five.taxels)
+    if rest:
+        surface = np.zeros((magnetometers, 2))
+        surface[:, 0] = (np.arange(magnetometers) - (magnetometers - 1) / 2) * ANYSKIN_PITCH
+        yaw = np.zeros(magnetometers)
+    else:
+        along = (np.arange(boards) - (boards - 1) / 2) * ANYSKIN_BOARD_PITCH
+        surface = np.tile(five.surface, (boards, 1))
+        surface[:, 0] += np.repeat(along, five.taxels)
+        yaw = np.tile(five.chip_yaw, boards)
+    array = ArrayGeometry(
+        name=five.name,
+        side=five.side,
+        rows=1,
+        columns=magnetometers,
+        position=centre + surface @ axes[:, :2].T,
+        rotation=np.broadcast_to(axes, (magnetometers, 3, 3)).copy(),
+        surface=surface,
+        chip_yaw=yaw,
+    )
+    return SkinGeometry(board.model, board.frame, (array,))
+
+
+def _flat(array: ArrayDescriptor) -> ArrayGeometry:
+    tip = finger().arrays[-1]
+    axes = np.column_stack([(0, 1.0, 0), (0, 0, 1.0), (1.0, 0, 0)])
+    pitch = array.pitch_um * 1e-6
+    return grid_on_plane(
+        array.name or f"array{array.array}",
+        Side.TIP,
+        (array.rows, array.columns),
+        (pitch, pitch),
+        (float(tip.position[:, 0].max()), 0.0, 0.0),
+        axes,
+    )

@@ -1,0 +1,292 @@
+"""The sensing core of one board: sample blocks in, cycles with forces and features out."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bus.calibration_types import BoardCalibration
+from tactile_bus.instant import NS_PER_S, Instant
+from tactiled.blocks import Cycle, SampleBlock, TaxelHealth
+from tactiled.compensate import Compensator, Estimate
+from tactiled.features import FeatureExtractor
+from tactiled.force_model import ForceModel
+from tactiled.grouping import CycleCounters, Group, Grouper, gather_temperature
+from tactiled.health import HealthMonitor
+from tactiled.layout import Layout
+from tactiled.methods import make_compensator
+from tactiled.pipeline_settings import PipelineSettings
+from tactiled.tare import Tare, TareReport
+
+__all__ = ["BoardPipeline", "CycleCounters", "PipelineSettings", "TareReport"]
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+
+class BoardPipeline:
+    """Pure and deterministic: the same blocks give the same cycles to the bit.
+
+    Memory and time of a cycle do not depend on how many came before.
+    """
+
+    def __init__(
+        self, calibration: BoardCalibration, settings: PipelineSettings | None = None
+    ) -> None:
+        self.calibration = calibration
+        self.settings = settings = settings or PipelineSettings()
+        geometry = calibration.geometry
+        self._layout = layout = Layout(geometry)
+        self._model = ForceModel(calibration, layout)
+        self._grouper = Grouper(tuple(a.taxels for a in geometry.arrays))
+        self._monitor = HealthMonitor(layout, settings.frozen_after_s, settings.range_limit_ut)
+        self._compensator: Compensator = make_compensator(settings, layout, self._model)
+        self._features = FeatureExtractor(geometry, settings)
+        self._names = tuple(a.name for a in geometry.arrays)
+        self._tip_arrays = [i for i, a in enumerate(geometry.arrays) if a.side.name == "TIP"]
+        self._theta = np.zeros((layout.arrays, 3, 3))
+        self._tare: Tare | None = None
+        self._tare_initial = False
+        self._tare_report: TareReport | None = None
+        self._feature_due: Instant | None = None
+        self._health: NDArray[np.uint8] = np.full(layout.taxels, TaxelHealth.MISSING, np.uint8)
+        self._noise = np.array(settings.noise_ut)
+        self._track = None if settings.rest_tracking_s is None else settings.rest_tracking_s
+        self._last_captured: Instant | None = None
+        self._apply_noise(self._noise)
+        automatic = settings.auto_tare
+        self._rest_known = not (calibration.nominal if automatic is None else automatic)
+        if not self._rest_known:
+            self._begin_tare(initial=True)
+
+    @property
+    def counters(self) -> CycleCounters:
+        """What became of every block and cycle so far."""
+        return self._grouper.counters
+
+    @property
+    def health(self) -> NDArray[np.uint8]:
+        """(N,) uint8 of `TaxelHealth` in the last cycle; all missing before the first."""
+        return self._health
+
+    @property
+    def taring(self) -> bool:
+        """Whether a tare is under way."""
+        return self._tare is not None
+
+    @property
+    def tare_report(self) -> TareReport | None:
+        """What the last tare that ended did; None before the first."""
+        return self._tare_report
+
+    def tare(self) -> None:
+        """Begin a tare: the mean field of the next cycles becomes the rest field.
+
+        It ends by itself within ten times ``tare_s``; `tare_report` then says what it did. It is
+        refused, and nothing changed, when the skin is touched or moves.
+        """
+        self._begin_tare(initial=not self._rest_known)
+
+    def reset(self) -> None:
+        """The board began anew: forget sequence, contacts and fits, keep the rest field."""
+        self._grouper.reset()
+        self._monitor.reset()
+        self._compensator.reset()
+        self._features.reset()
+        self._theta = np.zeros_like(self._theta)
+        self._last_captured = None
+        if self._tare is not None:
+            self._begin_tare(initial=not self._rest_known)
+
+    def feed(self, block: SampleBlock) -> list[Cycle]:
+        """Cycles that ``block`` ends: none, one, or two when it also ends an incomplete one."""
+        return [self._cycle(group) for group in self._grouper.feed(block)]
+
+    def flush(self) -> list[Cycle]:
+        """The cycle under way, as it stands; for the end of a stream."""
+        return [self._cycle(group) for group in self._grouper.flush()]
+
+    def _cycle(self, group: Group) -> Cycle:
+        layout, model = self._layout, self._model
+        raw, temperature, status, present = self._collect(group)
+        blocks = [block for block in group.blocks if block is not None]
+        captured = min(block.captured for block in blocks)
+        health = self._monitor.update(raw, temperature, status, present, captured)
+        healthy = (health == 0) & layout.real
+        field = model.taxel_field(raw, temperature)
+        whole = bool(healthy.sum() == layout.taxels)
+        if not whole:
+            # what an unhealthy taxel reads must not leak into its neighbours' forces
+            np.copyto(field, model.plane_field(self._theta), where=~healthy[..., None])
+        if self._tare is not None:
+            field = self._advance_tare(field, healthy, bool(present.all()), captured, group)
+        forces = model.forces(field)
+        estimate = self._compensator.update(model.field_in_ee(field), forces, healthy, captured)
+        self._theta = estimate.theta
+        if estimate.ambient.method != "off":
+            forces = forces - model.plane_forces(estimate.theta)
+        if not whole:
+            forces[~healthy] = np.nan
+        force = layout.flat(forces)
+        self._health = flat_health = layout.flat(health)
+        reasons, valid = self._reasons(estimate, healthy, present)
+        tip_usable = self._tip_usable(estimate, present)
+        features = self._features.update(
+            force, layout.taxels - int(healthy.sum()), reasons, valid, tip_usable, captured
+        )
+        if self._track is not None and valid and not reasons:
+            self._follow_rest(field, estimate, healthy, captured)
+        self._last_captured = captured
+        shown = field if whole else np.where(healthy[..., None], field, np.nan)
+        return Cycle(
+            sequence=group.sequence,
+            captured=captured,
+            received=max(block.received for block in blocks),
+            uncertainty=max(block.uncertainty for block in blocks),
+            temperature_c=gather_temperature(group),
+            field_ut=layout.flat(shown),
+            force=force,
+            health=flat_health,
+            ambient=estimate.ambient,
+            features=features,
+            calibrated=not self.calibration.nominal,
+            features_due=self._due(captured),
+        )
+
+    def _collect(self, group: Group) -> tuple[Float, Float, NDArray[np.uint8], Bool]:
+        """Blocks of a cycle in padded arrays; missing ones are zero and marked by ``present``."""
+        shape = (self._layout.arrays, self._layout.width)
+        raw = np.zeros((*shape, 3))
+        temperature = np.full(shape, 25.0)  # in the padding, so that it is never out of range
+        status = np.zeros(shape, np.uint8)
+        present = np.ones(shape[0], dtype=bool)
+        for a, block in enumerate(group.blocks):
+            if block is None:
+                present[a] = False
+                continue
+            n = len(block.status)
+            raw[a, :n] = block.field_ut
+            temperature[a, :n] = block.temperature_c
+            status[a, :n] = block.status
+        return raw, temperature, status, present
+
+    def _reasons(
+        self, estimate: Estimate, healthy: Bool, present: Bool
+    ) -> tuple[tuple[str, ...], bool]:
+        """Why features are degraded, and whether they are valid all the same."""
+        reasons: list[str] = []
+        valid = True
+        if not self._rest_known:
+            reasons.append("taring")
+            valid = False
+        if not present.all():
+            reasons += [f"array {self._names[a]} missing" for a in np.flatnonzero(~present)]
+            valid = False
+        masked = 1.0 - healthy.sum(axis=1) / self._layout.counts
+        for a in np.flatnonzero((masked > self.settings.masked_limit) & present):
+            reasons.append(f"taxels masked: {self._names[a]} {masked[a]:.0%}")
+            valid = False
+        ambient = estimate.ambient
+        if not ambient.valid.all():
+            for a in np.flatnonzero(~ambient.valid & present):
+                name = self._names[a]
+                if estimate.borrowed[a]:
+                    reasons.append(f"compensation borrowed: {name}")
+                elif ambient.age[a] <= self.settings.hold_s:
+                    reasons.append(f"compensation held: {name}")
+                else:
+                    reasons.append(f"compensation invalid: {name}")
+                    valid = False
+        return tuple(reasons), valid
+
+    def _tip_usable(self, estimate: Estimate, present: Bool) -> bool:
+        ambient = estimate.ambient
+        return self._rest_known and all(
+            present[a]
+            and (ambient.valid[a] or estimate.borrowed[a] or ambient.age[a] <= self.settings.hold_s)
+            for a in self._tip_arrays
+        )
+
+    def _begin_tare(self, initial: bool) -> None:
+        shape = (self._layout.arrays, self._layout.width, 3)
+        self._tare = Tare(shape, self.settings.tare_s, self._noise)
+        self._tare_initial = initial
+
+    def _advance_tare(
+        self, field: Float, healthy: Bool, whole: bool, captured: Instant, group: Group
+    ) -> Float:
+        """Take one cycle into the tare; its field over the rest field now in force."""
+        tare = self._tare
+        if tare is None or not tare.add(field, healthy, whole, captured):
+            return field
+        trouble = tare.trouble()
+        if trouble is None and not self._tare_initial and self._features.contact.any():
+            trouble = "the skin is touched: lift it off everything"
+        if trouble is not None:
+            self._end_tare(False, f"tare refused: {trouble}", 0.0, self._noise, group.sequence)
+            if not self._rest_known:
+                self._begin_tare(initial=True)
+            return field
+        shift = np.where(tare.healthy[..., None], tare.mean, 0.0)
+        self._model.rest += shift
+        noise = tare.noise()
+        largest = float(np.abs(shift).max())
+        left = self._layout.taxels - int(tare.healthy.sum())
+        kept = f"; {left} unhealthy taxels keep theirs" if left else ""
+        self._end_tare(
+            True,
+            f"tared over {tare.cycles} cycles: rest fields moved by up to {largest:.1f} µT{kept}",
+            largest,
+            noise,
+            group.sequence,
+        )
+        self._rest_known = True
+        self._compensator.reset()
+        self._features.reset()
+        self._theta = np.zeros_like(self._theta)
+        self._apply_noise(noise)
+        return field - shift
+
+    def _end_tare(
+        self, accepted: bool, message: str, shift: float, noise: Float, sequence: int
+    ) -> None:
+        cycles = 0 if self._tare is None else self._tare.cycles
+        self._tare_report = TareReport(accepted, message, cycles, shift, noise, sequence)
+        self._tare = None
+
+    def _apply_noise(self, noise: Float) -> None:
+        """Noise of one sample, (3,) µT in chip axes, sets the thresholds of contact and fit."""
+        self._noise = np.maximum(noise, MIN_NOISE_UT)
+        spread = np.broadcast_to(self._noise, self._model.rest.shape)
+        self._features.set_noise(self._layout.flat(self._model.normal_sigma(spread)))
+        self._compensator.set_noise(self._noise)
+
+    def _follow_rest(
+        self, field: Float, estimate: Estimate, healthy: Bool, captured: Instant
+    ) -> None:
+        """Let the rest of untouched taxels follow what compensation left over."""
+        if self._track is None or self._last_captured is None:
+            return
+        share = min(1.0, (captured - self._last_captured) / NS_PER_S / self._track)
+        free = healthy & ~self._layout.padded(self._features.contact.astype(float)).astype(bool)
+        left = field - self._model.plane_field(estimate.theta)
+        self._model.rest += np.where(free[..., None], share * left, 0.0)
+
+    def _due(self, captured: Instant) -> bool:
+        """Whether this cycle's features are to be sent, at ``feature_rate_hz``."""
+        rate = self.settings.feature_rate_hz
+        if rate is None:
+            return True
+        period = round(NS_PER_S / rate)
+        if self._feature_due is None or captured < self._feature_due - 2 * period:
+            self._feature_due = captured
+        if captured < self._feature_due:
+            return False
+        behind = (captured - self._feature_due) // period
+        self._feature_due = Instant(self._feature_due + (behind + 1) * period)
+        return True
+
+
+MIN_NOISE_UT = 0.3
+"""µT below which noise is not believed: an int16 of the finest scale alone makes 0.04, but chips
+differ by 3 % in a field of tens of µT and that looks like noise to a fit."""
