@@ -10,45 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from tactile_bus.arm_types import ZERO, ArmState, Twist
 from tactile_bus.geometry import Side
 from tactile_bus.instant import Instant
 
 
-@dataclass(frozen=True, slots=True)
-class Twist:
-    """Planar velocity of the wrist pivot. m/s in ``cupboard``, rad/s counter-clockwise."""
-
-    vx: float
-    vy: float
-    omega: float
-
-
-ZERO = Twist(0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True, slots=True)
-class ArmState:
-    """What the arm reports of itself at its own rate.
-
-    Pose of the wrist pivot (m, rad) and its twist; wrench that the environment exerts on the
-    end-effector about the pivot (N, N, N·m), all in ``cupboard``. ``mode`` is "ready", "moving",
-    "stopped", "fault" or "estop". The limits are those the arm confirms: m/s, rad/s, N, N·m.
-    """
-
-    captured: Instant
-    received: Instant
-    x: float
-    y: float
-    heading: float
-    twist: Twist
-    fx: float
-    fy: float
-    mz: float
-    mode: str
-    v_max: float
-    omega_max: float
-    f_max: float
-    m_max: float
+__all__ = ["ZERO", "ArmState", "Goal", "Strategy", "Touch", "Twist"]
 
 
 @dataclass(frozen=True, slots=True)
