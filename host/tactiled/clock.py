@@ -106,6 +106,7 @@ class ClockMap:
             raise ValueError(f"tick_hz is {tick_hz}: it must be above 0")
         self._tick_hz = tick_hz
         self.counters: Counter[str] = Counter()
+        self._last = Instant(0)
         self.restart()
 
     def restart(self) -> None:
@@ -119,7 +120,6 @@ class ClockMap:
         self._doubts: list[_Pair] = []
         self._arrivals = LowerEnvelope(BUCKET_S, WINDOW, slope=1.0, tolerance=RATE_LIMIT)
         self._last_ticks: int | None = None
-        self._last = Instant(0)
 
     @property
     def synchronised(self) -> bool:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from tactile_bus.instant import NS_PER_S, Instant
 from tactiled.arrival_clock import Arrival, ArrivalClock
 
@@ -36,7 +37,7 @@ def test_measured_instant_is_within_uncertainty(period: float, jitter: float, se
     sent = [k * period for k in range(600)]
     _, out = run(sent, list(rng.exponential(jitter * period, 600)))
     previous = 0
-    for departure, arrival in zip(sent, out, strict=True):
+    for arrival in out:
         stamp = arrival.stamp
         assert stamp.captured >= previous
         previous = stamp.captured

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from sensor_proto.packets import ClockReply
 from tactile_bus.instant import NS_PER_S, Instant
 from tactiled.clock import CONTRADICTIONS, ClockMap, TickUnwrapper

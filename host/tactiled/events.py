@@ -1,0 +1,135 @@
+"""What the links tell the daemon: a few frozen events, each one thing that happened."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sensor_proto.packets import Ack, Descriptor, Status
+from tactile_bus.instant import Instant
+from tactiled.blocks import SampleBlock
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What is known of a board. ``serial_number`` is empty where neither board nor port has one.
+
+    ``shapes``: rows and columns of each array. ``max_rate``: Hz, None where the board does not
+    say. ``descriptor``: the board's own words, None where it has none.
+    """
+
+    serial_number: str
+    model: str
+    firmware: str
+    shapes: tuple[tuple[int, int], ...]
+    max_rate: float | None
+    descriptor: Descriptor | None = None
+
+    def __str__(self) -> str:
+        """As messages name it."""
+        number = f" {self.serial_number}" if self.serial_number else " without a serial number"
+        return f"{self.model} board{number}"
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a board is not used, and what to do about it."""
+
+    problem: str
+    remedy: str
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """The board answered and was admitted. ``rebooted``: its clock and sequence start anew."""
+
+    identity: Identity
+    rebooted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Streaming:
+    """The board took the order to stream; ``rate`` in Hz as it was set, None: the board's own."""
+
+    rate: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """The board is not used."""
+
+    refusal: Refusal
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sampled:
+    """One array's samples in physical units, on host time."""
+
+    block: SampleBlock
+
+
+@dataclass(frozen=True, slots=True)
+class FellSilent:
+    """No samples for ``seconds``."""
+
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Resumed:
+    """Samples came again after ``seconds`` of silence."""
+
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Reset:
+    """The board restarted by itself, or its sequence shows that it must have."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class BoardLog:
+    """A line of text from the firmware, levels as in `sensor_proto.packets.Log`."""
+
+    level: int
+    captured: Instant
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Reported:
+    """The board's own account of its health."""
+
+    status: Status
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """A command was answered, or given up (``ack`` None)."""
+
+    request: int
+    ack: Ack | None
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosed:
+    """The port carries something, or nothing, but no board: what seems to be wrong."""
+
+    problem: str
+    remedy: str
+
+
+Event = (
+    Identified
+    | Streaming
+    | Refused
+    | Sampled
+    | FellSilent
+    | Resumed
+    | Reset
+    | BoardLog
+    | Reported
+    | Answered
+    | Diagnosed
+)

@@ -1,0 +1,316 @@
+"""A link and a scripted board in lockstep on virtual time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sensor_proto.packets import (
+    Ack,
+    AckResult,
+    Descriptor,
+    Identify,
+    Log,
+    SetRate,
+    Start,
+    Stop,
+)
+from tactile_bus.instant import NS_PER_S, Instant
+from tactiled.events import (
+    Answered,
+    BoardLog,
+    FellSilent,
+    Identified,
+    Identity,
+    Refusal,
+    Refused,
+    Reset,
+    Resumed,
+    Sampled,
+    Streaming,
+)
+from tactiled.link import BoardLink, State
+
+STEP = 0.001
+
+
+@dataclass
+class Rig:
+    """Link and board joined by a wire that takes no time but may lose what the host says."""
+
+    link: BoardLink
+    board: Any
+    at: Callable[[float], Instant]
+    now: float = 0.0
+    lose: Iterator[bool] | None = None
+    events: list[tuple[float, Any]] = field(default_factory=list)
+
+    def run(self, seconds: float) -> list[Any]:
+        first = len(self.events)
+        for _ in range(round(seconds / STEP)):
+            self.now += STEP
+            self.step()
+        return [event for _, event in self.events[first:]]
+
+    def step(self) -> None:
+        now = self.at(self.now)
+        out = list(self.board.speak(self.now))
+        happened = self.link.tick(now)
+        for message in self.link.outgoing():
+            if self.lose is None or not next(self.lose):
+                out += self.board.hear(message, self.now)
+        for message in out:
+            happened += self.link.receive(message, now)
+        self.events += [(self.now, event) for event in happened]
+
+    def of(self, kind: type) -> list[Any]:
+        return [event for _, event in self.events if isinstance(event, kind)]
+
+
+@pytest.fixture
+def rig(board: Any, instant: Callable[[float], Instant]) -> Rig:
+    link = BoardLink(lambda identity: None)
+    link.connect(instant(0.0))
+    return Rig(link, board, instant)
+
+
+def test_identifies_starts_and_streams(rig: Rig) -> None:
+    rig.run(1.0)
+    assert rig.link.state is State.STREAMING
+    identity = rig.of(Identified)[0].identity
+    assert (identity.serial_number, identity.model) == ("00000000000000aa", "pad")
+    assert identity.shapes == ((2, 2), (1, 3))
+    assert rig.of(Streaming) == [Streaming(None)]
+    blocks = [e.block for e in rig.of(Sampled)]
+    assert len(blocks) >= 190
+    np.testing.assert_allclose(blocks[0].field_ut[0], [15.0, -30.0, 72.6])
+    assert blocks[0].temperature_c == pytest.approx([25.12])
+
+
+def test_stamps_are_on_host_time_and_within_their_uncertainty(
+    make_board: Callable[..., Any], instant: Callable[[float], Instant]
+) -> None:
+    link = BoardLink(lambda identity: None)
+    rig = Rig(link, make_board(error=0.04), instant)
+    link.connect(instant(0.0))
+    rig.run(5.0)
+    for when, event in rig.events[-50:]:
+        if isinstance(event, Sampled):
+            age = abs(event.block.captured - instant(when)) / NS_PER_S
+            assert age <= event.block.uncertainty + STEP
+            assert event.block.uncertainty < 0.01
+
+
+def test_lost_commands_are_repeated_until_answered(rig: Rig) -> None:
+    rng = np.random.default_rng(5)
+    rig.lose = iter(lambda: bool(rng.random() < 0.5), None)
+    rig.run(6.0)
+    assert rig.link.state is State.STREAMING
+
+
+def test_a_deaf_board_is_asked_ever_more_slowly(rig: Rig) -> None:
+    rig.board.mute = True
+    rig.run(10.0)
+    asked = [m for m in rig.board.heard if isinstance(m, Identify)]
+    assert 10 <= len(asked) <= 15
+    assert not rig.of(Sampled)
+
+
+def test_rate_is_set_before_the_start(
+    make_board: Callable[..., Any], instant: Callable[[float], Instant]
+) -> None:
+    link = BoardLink(lambda identity: None, rate=25.0)
+    rig = Rig(link, make_board(), instant)
+    link.connect(instant(0.0))
+    rig.run(1.0)
+    said = [type(m) for m in rig.board.heard if isinstance(m, SetRate | Start)]
+    assert said == [SetRate, Start]
+    assert rig.board.rate_mhz == 25_000
+    assert rig.of(Streaming) == [Streaming(25.0)]
+
+
+def test_a_rate_above_the_boards_is_refused(
+    board: Any, instant: Callable[[float], Instant]
+) -> None:
+    link = BoardLink(lambda identity: None, rate=600.0)
+    rig = Rig(link, board, instant)
+    link.connect(instant(0.0))
+    rig.run(3.0)
+    (refused,) = rig.of(Refused)
+    assert "493" in refused.refusal.problem
+    assert "600" in refused.refusal.problem
+    assert not board.streaming
+
+
+def test_another_major_version_is_refused_by_name(rig: Rig, descriptor: Descriptor) -> None:
+    rig.board.descriptor = replace(descriptor, major=2)
+    rig.run(3.0)
+    (refused,) = rig.of(Refused)
+    assert "2.0" in refused.refusal.problem
+    assert "1.0" in refused.refusal.problem
+    assert rig.link.state is State.REFUSED
+
+
+def test_an_unwelcome_board_is_refused_until_it_is_welcome(
+    board: Any, instant: Callable[[float], Instant]
+) -> None:
+    seen: list[Identity] = []
+    verdicts: list[Refusal | None] = [Refusal("no calibration", "give one")]
+
+    def admit(identity: Identity) -> Refusal | None:
+        seen.append(identity)
+        return verdicts[0]
+
+    link = BoardLink(admit)
+    rig = Rig(link, board, instant)
+    link.connect(instant(0.0))
+    rig.run(5.0)
+    assert len(rig.of(Refused)) == 1
+    assert not rig.of(Sampled)
+    assert len(seen) >= 2
+    verdicts[0] = None
+    rig.run(3.0)
+    assert rig.link.state is State.STREAMING
+
+
+def test_another_board_on_the_same_port_is_refused_and_both_are_named(
+    rig: Rig, make_board: Callable[..., Any]
+) -> None:
+    first = rig.board
+    rig.run(1.0)
+    rig.link.disconnect()
+    rig.board = make_board("00000000000000bb")
+    rig.board.streaming = True
+    rig.link.connect(rig.at(rig.now))
+    events = rig.run(3.0)
+    (refused,) = [e for e in events if isinstance(e, Refused)]
+    assert "00000000000000aa" in refused.refusal.problem
+    assert "00000000000000bb" in refused.refusal.problem
+    assert not [e for e in events if isinstance(e, Sampled)]
+    rig.board = first
+    events = rig.run(3.0)
+    assert [e for e in events if isinstance(e, Sampled)]
+
+
+def test_silence_is_told_and_so_is_its_end(rig: Rig) -> None:
+    rig.run(2.0)
+    rig.board.mute = True
+    events = rig.run(0.5)
+    assert [type(e) for e in events if not isinstance(e, Sampled)] == [FellSilent]
+    rig.board.mute = False
+    events = rig.run(0.5)
+    resumed = [e for e in events if isinstance(e, Resumed)]
+    assert len(resumed) == 1
+    assert resumed[0].seconds >= 0.4
+    assert not [e for e in events if isinstance(e, Identified)]
+
+
+def test_nothing_is_used_after_a_long_silence_before_the_board_has_said_who_it_is(
+    rig: Rig, make_board: Callable[..., Any]
+) -> None:
+    rig.run(2.0)
+    rig.board.mute = True
+    rig.run(1.5)
+    assert rig.link.state is State.IDENTIFYING
+    rig.board = make_board("00000000000000cc")
+    rig.board.streaming = True
+    events = rig.run(2.0)
+    assert not [e for e in events if isinstance(e, Sampled)]
+    assert [e for e in events if isinstance(e, Refused)]
+
+
+def test_a_rebooted_board_streams_again_within_a_second(rig: Rig) -> None:
+    rig.run(3.0)
+    rig.board.reboot(rig.now)
+    events = rig.run(1.0)
+    assert [e for e in events if isinstance(e, Reset)]
+    blocks = [e.block for e in events if isinstance(e, Sampled)]
+    assert blocks
+    assert rig.link.clock is not None
+    rig.run(1.0)
+    last = rig.of(Sampled)[-1].block
+    assert abs(last.captured - rig.at(rig.now)) / NS_PER_S <= last.uncertainty + 0.011
+    assert sum(t.missing for t in rig.link.trackers.values()) == 0
+
+
+def test_stamps_never_run_backwards_through_a_reboot(rig: Rig) -> None:
+    rig.run(2.0)
+    rig.board.reboot(rig.now)
+    rig.run(2.0)
+    for array in (0, 1):
+        captured = [e.block.captured for e in rig.of(Sampled) if e.block.array == array]
+        assert captured == sorted(captured)
+
+
+def test_a_reboot_that_goes_on_streaming_is_seen_by_its_uptime_or_sequence(rig: Rig) -> None:
+    rig.run(3.0)
+    rig.board.reboot(rig.now)
+    rig.board.streaming = True
+    events = rig.run(1.5)
+    assert [e for e in events if isinstance(e, Reset)]
+    assert rig.link.state is State.STREAMING
+
+
+def test_commands_from_outside_are_answered(rig: Rig) -> None:
+    rig.run(1.0)
+    number = rig.link.request(lambda n: SetRate(n, 50_000), rig.at(rig.now))
+    rig.run(0.5)
+    assert rig.of(Answered) == [Answered(number, Ack(0x84, number, AckResult.OK))]
+    assert rig.link.rate == 50.0
+
+
+def test_commands_that_are_not_answered_are_given_up(rig: Rig) -> None:
+    rig.run(1.0)
+    rig.board.deaf = True
+    number = rig.link.request(lambda n: SetRate(n, 50_000), rig.at(rig.now))
+    rig.run(2.0)
+    assert rig.of(Answered) == [Answered(number, None)]
+    rig.link.request(lambda n: SetRate(n, 50_000), rig.at(rig.now))
+    events = rig.link.disconnect()
+    assert [type(e) for e in events] == [Answered]
+
+
+def test_commands_to_a_board_not_in_service_are_refused(rig: Rig) -> None:
+    with pytest.raises(ValueError, match="not in service"):
+        rig.link.request(Start, rig.at(0.0))
+
+
+def test_a_board_that_will_not_take_the_rate_is_refused(
+    make_board: Callable[..., Any], instant: Callable[[float], Instant]
+) -> None:
+    board = make_board(results={SetRate: AckResult.BAD_ARGUMENT})
+    link = BoardLink(lambda identity: None, rate=7.0)
+    rig = Rig(link, board, instant)
+    link.connect(instant(0.0))
+    rig.run(3.0)
+    (refused,) = rig.of(Refused)
+    assert "SetRate" in refused.refusal.problem
+
+
+def test_farewell_stops_the_board(rig: Rig) -> None:
+    rig.run(1.0)
+    rig.link.farewell()
+    rig.run(0.01)
+    assert any(isinstance(m, Stop) for m in rig.board.heard)
+    assert not rig.board.streaming
+
+
+def test_firmware_text_is_passed_on(rig: Rig) -> None:
+    rig.run(1.0)
+    (event,) = rig.link.receive(Log(30, rig.board.ticks(rig.now), "hot"), rig.at(rig.now))
+    assert isinstance(event, BoardLog)
+    assert (event.level, event.text) == (30, "hot")
+
+
+def test_samples_of_another_shape_are_counted_not_used(rig: Rig) -> None:
+    rig.run(1.0)
+    odd = replace(rig.board.sample(0, rig.now), array=7)
+    assert rig.link.receive(odd, rig.at(rig.now)) == []
+    short = rig.board.sample(0, rig.now)
+    short = replace(short, field=short.field[:2], status=short.status[:2])
+    assert rig.link.receive(short, rig.at(rig.now)) == []
+    assert rig.link.counters["wrong_shape"] == 2
