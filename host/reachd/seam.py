@@ -14,7 +14,6 @@ from tactile_bus.arm_types import ZERO, ArmState, Twist
 from tactile_bus.geometry import Side
 from tactile_bus.instant import Instant
 
-
 __all__ = ["ZERO", "ArmState", "Goal", "Strategy", "Touch", "Twist"]
 
 
@@ -60,5 +59,5 @@ class Strategy(Protocol):
 
     @property
     def activity(self) -> str:
-        """What it is doing: "straight", "burrow", "excavate_cw", "excavate_ccw", or its own word."""
+        """What it does: "straight", "burrow", "excavate_cw", "excavate_ccw", or a word of its own."""
         ...
