@@ -59,5 +59,5 @@ class Strategy(Protocol):
 
     @property
     def activity(self) -> str:
-        """What it does: "straight", "burrow", "excavate_cw", "excavate_ccw", or a word of its own."""
+        """What it does: "straight", "burrow", "excavate_cw", "excavate_ccw" or its own word."""
         ...
