@@ -46,7 +46,7 @@ MAX_ANSWERS = 64
 """Answers kept for whoever asked; each command brings one, and few are asked at once."""
 
 _TIMESTAMP_DIGITS = 4  # Z1 puts milliseconds behind every frame
-_SPLIT = re.compile(rb"[^\r\a]*[\r\a]")
+_ENDS = re.compile(rb"([\r\a])")
 _STATES = {
     ord("a"): BusState.ACTIVE,
     ord("w"): BusState.WARNING,
@@ -125,21 +125,18 @@ class SlcanDecoder:
 
     def feed(self, data: bytes) -> list[CanFrame]:
         """Frames completed by ``data``, in order; errors and states as SocketCAN error frames."""
-        self._buffer += data
+        parts = _ENDS.split(bytes(self._buffer) + data)
         frames: list[CanFrame] = []
-        end = 0
-        for match in _SPLIT.finditer(self._buffer):
-            end = match.end()
-            self._line(match.group(), frames)
-        del self._buffer[:end]
+        for line, end in zip(parts[:-1:2], parts[1::2], strict=True):
+            self._line(line, end, frames)
+        self._buffer = bytearray(parts[-1])
         if len(self._buffer) > MAX_LINE:
             self._counts[Rejected.MALFORMED] += 1
             self._buffer.clear()
         return frames
 
-    def _line(self, ended: bytes, frames: list[CanFrame]) -> None:
-        line = ended[:-1]
-        if ended.endswith(BEL):
+    def _line(self, line: bytes, end: bytes, frames: list[CanFrame]) -> None:
+        if end == BEL:
             self.answers.append(BEL)
         elif line and line[0] in _FRAME_LETTERS:
             frame = decode_frame(line)
@@ -154,7 +151,7 @@ class SlcanDecoder:
         elif line in (b"z", b"Z"):
             pass  # "sent", of adapters with automatic polling
         elif not line or line[:1] in b"VvNF":
-            self.answers.append(bytes(line))
+            self.answers.append(line)
         else:
             self._counts[Rejected.MALFORMED] += 1
 

@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from sensor_proto.canseg import CanFrame
+from sim_device.ports import PtyPort, SlcanPort
+from tactile_bus.instant import monotonic_now
+from tactiled.blocks import Chunk
+from tactiled.transports.base import Transport
+
+
+@pytest.fixture
+def pty(tmp_path: Path) -> Iterator[PtyPort]:
+    port = PtyPort(tmp_path / "board0")
+    port.open()
+    yield port
+    port.close()
+
+
+class AdapterThread:
+    """A simulated slcan adapter that serves its port until it is stopped."""
+
+    def __init__(self, port: SlcanPort) -> None:
+        self.port = port
+        self.received: list[CanFrame] = []
+        self._to_send: list[tuple[CanFrame, ...]] = []
+        self._bus_off: bool | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        port.open()
+        self._thread.start()
+
+    def send(self, *frames: CanFrame) -> None:
+        self._to_send.append(frames)
+
+    def set_bus_off(self, fault: bool) -> None:
+        self._bus_off = fault
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.port.close()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            self.received += self.port.receive()
+            fault, self._bus_off = self._bus_off, None
+            if fault is not None:
+                self.port.set_bus_off(fault)
+            while self._to_send and self.port.adapter.is_open:
+                self.port.send(self._to_send.pop(0), monotonic_now())
+            self.port.flush(monotonic_now())
+            time.sleep(0.001)
+
+
+@pytest.fixture
+def adapter(tmp_path: Path) -> Iterator[AdapterThread]:
+    thread = AdapterThread(SlcanPort(tmp_path / "can0"))
+    yield thread
+    thread.stop()
+
+
+def read_payload(transport: Transport, wanted: int, seconds: float = 5.0) -> bytes:
+    """``wanted`` bytes, or what came in ``seconds``."""
+    data = b""
+    end = time.monotonic() + seconds
+    while len(data) < wanted and time.monotonic() < end:
+        chunk = transport.read(0.1)
+        if chunk is not None:
+            assert isinstance(chunk.payload, bytes)
+            data += chunk.payload
+    return data
+
+
+def read_frames(transport: Transport, wanted: int, seconds: float = 5.0) -> list[CanFrame]:
+    """``wanted`` frames, or what came in ``seconds``."""
+    frames: list[CanFrame] = []
+    end = time.monotonic() + seconds
+    while len(frames) < wanted and time.monotonic() < end:
+        chunk = transport.read(0.1)
+        if chunk is not None:
+            assert isinstance(chunk.payload, tuple)
+            frames += chunk.payload
+    return frames
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 5.0) -> bool:
+    """Whether ``condition`` came true within ``seconds``."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.005)
+    return condition()
+
+
+@pytest.fixture
+def read_bytes() -> Callable[..., bytes]:
+    return read_payload
+
+
+@pytest.fixture
+def read_can() -> Callable[..., list[CanFrame]]:
+    return read_frames
+
+
+@pytest.fixture
+def eventually() -> Callable[..., bool]:
+    return wait_for
+
+
+@pytest.fixture
+def run_in_background() -> Iterator[Callable[[Callable[[], object]], Outcome]]:
+    started: list[Outcome] = []
+
+    def run(function: Callable[[], object]) -> Outcome:
+        outcome = Outcome(function)
+        started.append(outcome)
+        return outcome
+
+    yield run
+    for outcome in started:
+        outcome.join()
+
+
+class Outcome:
+    """What a function in another thread returned or raised, and when."""
+
+    def __init__(self, function: Callable[[], object]) -> None:
+        self._function = function
+        self.value: object = None
+        self.error: Exception | None = None
+        self.at = 0.0
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.value = self._function()
+        except Exception as error:  # noqa: BLE001 - kept for the test to judge
+            self.error = error
+        self.at = time.monotonic()
+
+    def join(self) -> None:
+        self._thread.join(10)
+        assert not self._thread.is_alive()
+
+
+__all__ = ["AdapterThread", "Chunk", "Outcome"]

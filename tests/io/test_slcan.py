@@ -1,0 +1,299 @@
+"""slcan text against lines written by hand from the LAWICEL manual and the Linux slcan driver."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sensor_proto import can_errors, slcan
+from sensor_proto.can_errors import BusState
+from sensor_proto.canseg import CanFrame
+from sim_device.can_wire import MAX_QUEUED, CanWire, frame_seconds
+from sim_device.slcan import MAX_OUTPUT, SlcanAdapter
+from tactile_bus.instant import Instant
+
+FRAME = CanFrame(0x1ABCDEF0, b"\x01\x23\xfe")
+LINE = b"T1ABCDEF030123FE"  # T, 8 digits of identifier, length, data
+FD_FRAME = CanFrame(0x00000100, bytes(range(12)), fd=True)
+FD_LINE = b"B000001009000102030405060708090A0B"  # length code 9 stands for 12 bytes
+NOW = Instant(1_000_000_000)
+
+
+def opened(**options: bool) -> SlcanAdapter:
+    adapter = SlcanAdapter(**options)
+    adapter.feed(b"S8\rO\r")
+    adapter.take_output()
+    return adapter
+
+
+@pytest.mark.parametrize(("frame", "line"), [(FRAME, LINE), (FD_FRAME, FD_LINE)])
+def test_frames_are_written_and_read_as_the_manual_has_them(frame: CanFrame, line: bytes) -> None:
+    assert slcan.encode_frame(frame) == line + b"\r"
+    assert slcan.decode_frame(line) == frame
+    assert slcan.decode_frame(line.lower().replace(line[:1].lower(), line[:1], 1)) == frame
+    assert slcan.decode_frame(line + b"1F40") == frame  # with a time stamp behind it
+
+
+def test_an_empty_frame_has_no_data_digits() -> None:
+    assert slcan.encode_frame(CanFrame(5, b"")) == b"T000000050\r"
+    assert slcan.decode_frame(b"T000000050") == CanFrame(5, b"")
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        (b"t10021133", slcan.Rejected.STANDARD_ID),
+        (b"d1009" + b"00" * 12, slcan.Rejected.STANDARD_ID),
+        (b"r1002", slcan.Rejected.REMOTE),
+        (b"R000001002", slcan.Rejected.REMOTE),
+        (b"", slcan.Rejected.MALFORMED),
+        (b"T", slcan.Rejected.MALFORMED),
+        (b"T1ABCDEF030123", slcan.Rejected.MALFORMED),  # a byte short
+        (b"T1ABCDEF030123FE0", slcan.Rejected.MALFORMED),  # half a byte too much
+        (b"T2000000000", slcan.Rejected.MALFORMED),  # identifier of 30 bits
+        (b"T1ABCDEFG0", slcan.Rejected.MALFORMED),
+        (b"T000000009" + b"00" * 12, slcan.Rejected.MALFORMED),  # FD length, classic frame
+        (b"T00000000A", slcan.Rejected.MALFORMED),
+        (b"T1ABCDEF03 1 2 3", slcan.Rejected.MALFORMED),
+        (b"T\xff0000000\xff", slcan.Rejected.MALFORMED),
+    ],
+)
+def test_lines_that_carry_no_frame_of_ours_say_why(line: bytes, reason: slcan.Rejected) -> None:
+    assert slcan.decode_frame(line) is reason
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        CanFrame(1 << 29, b""),
+        CanFrame(-1, b""),
+        CanFrame(1, bytes(9)),
+        CanFrame(1, bytes(9), fd=True),
+        CanFrame(1, bytes(12)),
+        CanFrame(1, b"", error=True),
+    ],
+)
+def test_frames_no_bus_can_carry_are_refused(frame: CanFrame) -> None:
+    with pytest.raises(ValueError, match=r"can be sent|data bytes"):
+        slcan.encode_frame(frame)
+
+
+STREAM = b"\rS8\r"[:1] + LINE + b"\r\a" + FD_LINE + b"\rt10020102\rF84\rsb128256\re2aB\rz\rxyz\r"
+
+
+@given(st.lists(st.integers(0, len(STREAM)), max_size=8))
+@settings(max_examples=60, deadline=None)
+def test_any_chunking_of_the_adapters_bytes_gives_the_same(cuts: list[int]) -> None:
+    decoder = slcan.SlcanDecoder()
+    frames = []
+    edges = [0, *sorted(cuts), len(STREAM)]
+    for start, end in pairwise(edges):
+        frames += decoder.feed(STREAM[start:end])
+    assert frames[:2] == [FRAME, FD_FRAME]
+    assert can_errors.told_state(frames[2]) is BusState.BUS_OFF
+    assert can_errors.names(frames[3]) == (
+        "protocol-violation",
+        "no-acknowledgement",
+        "bus-error",
+    )
+    assert len(frames) == 4
+    assert list(decoder.answers) == [b"", b"\a", b"F84"]
+    assert decoder.counters == {"standard_id": 1, "malformed_line": 1}
+
+
+@given(st.binary(max_size=2000))
+@settings(max_examples=100, deadline=None)
+def test_noise_neither_raises_nor_piles_up(noise: bytes) -> None:
+    decoder = slcan.SlcanDecoder()
+    for _ in range(3):
+        for frame in decoder.feed(noise):
+            assert 0 <= frame.identifier < 1 << 29
+    assert len(decoder.answers) <= slcan.MAX_ANSWERS
+    adapter = opened()
+    adapter.feed(noise * 3)
+    assert len(adapter.take_output()) <= MAX_OUTPUT
+    # After noise, empty lines bring both ends back, as a host does it on opening.
+    adapter.feed(b"\r\rC\r")
+    adapter.feed(b"C\r" if adapter.is_open else b"")
+    adapter.take_output()
+    adapter.feed(b"V\r")
+    assert adapter.take_output() == b"V1013\r"
+    decoder.feed(b"\r")
+    assert decoder.feed(LINE + b"\r") == [FRAME]
+
+
+def test_an_endless_line_is_dropped() -> None:
+    decoder = slcan.SlcanDecoder()
+    for _ in range(100):
+        decoder.feed(b"T" * 1000)
+    assert decoder.counters["malformed_line"] == 100
+    adapter = SlcanAdapter()
+    assert adapter.feed(b"T" * 5000 + b"\r") == []
+    assert adapter.take_output() == b"\a"
+
+
+@pytest.mark.parametrize(
+    ("answer", "state"),
+    [
+        (b"F00", BusState.ACTIVE),
+        (b"F04", BusState.WARNING),
+        (b"F24", BusState.PASSIVE),
+        (b"FA4", BusState.BUS_OFF),
+        (b"F", None),
+        (b"Fxy", None),
+        (b"V1013", None),
+    ],
+)
+def test_status_flags_tell_the_state(answer: bytes, state: BusState | None) -> None:
+    assert slcan.state_of_flags(answer) is state
+
+
+@pytest.mark.parametrize(
+    ("line", "names", "state"),
+    [
+        (b"sa057033", ("error-active",), BusState.ACTIVE),
+        (b"sw096096", ("error-warning",), BusState.WARNING),
+        (b"sp128000", ("error-passive",), BusState.PASSIVE),
+        (b"sb256256", ("bus-off",), BusState.BUS_OFF),
+        (b"e1a", ("no-acknowledgement",), None),
+        (b"e3bcO", ("protocol-violation", "bus-error", "tx-overflow"), None),
+    ],
+)
+def test_state_and_error_lines_become_named_error_frames(
+    line: bytes, names: tuple[str, ...], state: BusState | None
+) -> None:
+    (frame,) = slcan.SlcanDecoder().feed(line + b"\r")
+    assert frame.error
+    assert can_errors.names(frame) == names
+    assert can_errors.told_state(frame) is state
+
+
+def test_socketcan_error_frames_have_their_kernel_names() -> None:
+    # Classes and controller bits of linux/can/error.h.
+    assert can_errors.names(CanFrame(0x040, bytes(8), error=True)) == ("bus-off",)
+    assert can_errors.told_state(CanFrame(0x100, bytes(8), error=True)) is BusState.ACTIVE
+    passive = CanFrame(0x004, b"\0\x20\0\0\0\0\0\0", error=True)
+    assert can_errors.names(passive) == ("error-passive",)
+    assert can_errors.told_state(passive) is BusState.PASSIVE
+    assert can_errors.told_state(CanFrame(0x020, b"", error=True)) is None
+    assert can_errors.names(CanFrame(0, b"", error=True)) == ("unspecified",)
+
+
+@pytest.mark.parametrize(
+    ("command", "answer"),
+    [
+        (b"\r", b"\r"),
+        (b"C\r", b"\a"),  # it is not open
+        (b"O\r", b"\a"),  # no bit rate yet
+        (b"S9\r", b"\a"),
+        (b"S6\r", b"\r"),
+        (b"s031C\r", b"\r"),
+        (b"F\r", b"\a"),  # only while open
+        (b"V\r", b"V1013\r"),
+        (b"N\r", b"NA123\r"),
+        (b"T000000010\r", b"\a"),
+        (b"Q1\r", b"\a"),
+        (b"S6\rO\rS6\r", b"\r\r\a"),  # no bit rate while open
+        (b"S6\rO\rF\rC\rC\r", b"\r\rF00\r\r\a"),
+        (b"S6\rL\rT000000010\r", b"\r\r\a"),  # listening only
+        (b"S6\rO\rT000000010\rt1000\r", b"\r\rZ\rz\r"),
+        (b"S6\rO\rT00000001\r", b"\r\r\a"),
+    ],
+)
+def test_the_adapter_answers_as_the_manual_says(command: bytes, answer: bytes) -> None:
+    adapter = SlcanAdapter()
+    adapter.feed(command)
+    assert adapter.take_output() == answer
+
+
+def test_bit_rates_are_those_of_the_manual() -> None:
+    adapter = SlcanAdapter()
+    for command, bitrate in ((b"S0", 10_000), (b"S4", 125_000), (b"S7", 800_000), (b"S8", 10**6)):
+        adapter.feed(command + b"\r")
+        assert adapter.bitrate == bitrate
+    adapter.feed(b"s031C\r")  # SJA1000 at 16 MHz: prescaler 4, 1 + 13 + 2 quanta
+    assert adapter.bitrate == 125_000
+    adapter.feed(b"Y5\r")
+    assert adapter.data_bitrate == 5_000_000
+
+
+def test_frames_pass_only_while_the_channel_is_open() -> None:
+    adapter = SlcanAdapter()
+    adapter.deliver((FRAME,), NOW)
+    assert adapter.take_output() == b""
+    assert adapter.losses == {"rx_channel_closed": 1}
+    adapter = opened()
+    adapter.deliver((FRAME, FD_FRAME), NOW)
+    assert adapter.take_output() == LINE + b"\r" + FD_LINE + b"\r"
+    assert adapter.feed(LINE + b"\r" + FD_LINE + b"\r") == [FRAME, FD_FRAME]
+
+
+def test_an_adapter_without_fd_refuses_fd_frames() -> None:
+    adapter = opened(fd=False)
+    assert adapter.feed(FD_LINE + b"\r") == []
+    assert adapter.take_output() == b"\a"
+
+
+def test_time_stamps_are_milliseconds_in_four_digits() -> None:
+    adapter = SlcanAdapter()
+    adapter.feed(b"S8\rZ1\rO\r")
+    adapter.take_output()
+    adapter.deliver((FRAME,), Instant(61_234_000_000))
+    assert adapter.take_output() == LINE + b"04D2\r"  # 61,234 mod 60,000
+
+
+def test_bus_off_lasts_until_the_channel_is_opened_again() -> None:
+    adapter = opened()
+    adapter.set_bus_off(True)
+    assert adapter.take_output() == b"sb128256\r"
+    assert adapter.feed(LINE + b"\r") == []
+    adapter.deliver((FRAME,), NOW)
+    assert adapter.feed(b"F\r") == []
+    assert adapter.take_output() == b"\aFA4\r"
+    adapter.feed(b"C\rO\r")  # the fault is still there
+    assert adapter.take_output() == b"\r\rsb128256\r"
+    adapter.set_bus_off(False)
+    assert adapter.state is BusState.BUS_OFF
+    adapter.feed(b"C\rO\r")
+    assert adapter.state is BusState.ACTIVE
+    assert adapter.losses == {"tx_refused": 1, "rx_bus_off": 1}
+
+
+def test_errors_are_told_in_the_words_of_newer_firmware() -> None:
+    adapter = opened()
+    adapter.report_error("aB")
+    adapter.set_state(BusState.PASSIVE)
+    assert adapter.take_output() == b"e2aB\rsp128128\r"
+
+
+def test_frame_times_are_those_of_the_literature() -> None:
+    # Davis et al. 2007: a classic 29-bit frame of 8 bytes takes at most 160 bit times, of 0 80.
+    assert frame_seconds(CanFrame(1, bytes(8)), 1_000_000, 1) == pytest.approx(160e-6)
+    assert frame_seconds(CanFrame(1, b""), 500_000, 1) == pytest.approx(160e-6)
+    # 64 bytes in one FD frame take far less than in eight classic ones.
+    fd = frame_seconds(CanFrame(1, bytes(64), fd=True), 1_000_000, 5_000_000)
+    assert fd < 0.2 * 8 * 160e-6
+
+
+def test_the_bus_carries_one_frame_at_a_time_lowest_identifier_first() -> None:
+    wire = CanWire()
+    low, high = CanFrame(1, bytes(8)), CanFrame(9, bytes(8))
+    wire.push([high, high, low], Instant(0))
+    assert wire.pop(Instant(159_000), 1_000_000, 1) == ()
+    assert wire.pop(Instant(161_000), 1_000_000, 1) == (low,)
+    assert wire.pop(Instant(1_000_000), 1_000_000, 1) == (high, high)
+    assert wire.load(Instant(1_000_000)) == pytest.approx(0.48)
+    assert wire.load(Instant(2_000_000)) == 0
+
+
+def test_a_bus_that_is_too_slow_drops_whole_batches_and_counts_them() -> None:
+    wire = CanWire()
+    batch = [CanFrame(1, bytes(8))] * 100
+    for _ in range(10):
+        wire.push(batch, Instant(0))
+    assert wire.waiting <= MAX_QUEUED + len(batch)
+    assert wire.dropped_frames == 1000 - wire.waiting
+    assert wire.waiting % 100 == 0
