@@ -120,6 +120,14 @@ class Diagnosed:
     remedy: str
 
 
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Boards on a bus, by node. ``late``: they came after the others had been gathered."""
+
+    nodes: tuple[int, ...]
+    late: bool
+
+
 Event = (
     Identified
     | Streaming
@@ -132,4 +140,5 @@ Event = (
     | Reported
     | Answered
     | Diagnosed
+    | Found
 )

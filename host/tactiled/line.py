@@ -10,18 +10,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from sensor_proto.anyskin import AnySkinDecoder
-from sensor_proto.canseg import BROADCAST, CanDecoder, CanEncoder, CanFrame
+from sensor_proto.canseg import CanFrame
 from sensor_proto.framing import SerialDecoder, encode_serial
-from sensor_proto.packets import (
-    FloatSamples,
-    HostMessage,
-    Identify,
-    Received,
-)
+from sensor_proto.packets import FloatSamples, Received
 from tactile_bus.instant import NS_PER_S, Instant, after
 from tactiled.blocks import Chunk
-from tactiled.diagnosis import NOTHING_AFTER, Diagnosis
-from tactiled.events import Diagnosed, Event, Identity, Refusal
+from tactiled.diagnosis import Diagnosis
+from tactiled.events import Event, Identity, Refusal
 from tactiled.float_link import FloatLink
 from tactiled.link import BoardLink, State
 
@@ -33,13 +28,6 @@ FLOAT_MODEL = "anyskin"
 
 REPEAT_DIAGNOSIS = 30.0
 """s between repetitions of a diagnosis that still holds."""
-
-DISCOVER_EVERY = 1.0
-"""s between broadcast questions on a CAN bus while no board has answered. Boards plugged in later
-show themselves by their status, once a second."""
-
-MAX_NODES = 16
-"""Boards used on one bus; more would not leave 25 Hz of samples each on CAN 2.0B."""
 
 Admit = Callable[[int, Identity], Refusal | None]
 """Judges the board with a node number (0 on a serial line)."""
@@ -93,13 +81,14 @@ class SerialLine:
         kind: str = "auto",
         rate: float | None = None,
         baud: int = 115_200,
+        listen_only: bool = False,
     ) -> None:
         if kind not in KINDS:
             raise ValueError(f"board kind {kind!r}; allowed: {', '.join(KINDS)}")
         self._kind = kind
         self._own = SerialDecoder()
         self._floats = AnySkinDecoder()
-        self._board = BoardLink(lambda identity: admit(0, identity), rate)
+        self._board = BoardLink(lambda identity: admit(0, identity), rate, listen_only)
         self._float = FloatLink(lambda identity: admit(0, identity), FLOAT_MODEL)
         self._link: Link | None = None
         self._diagnosis = Diagnosis(port, baud, kind)
@@ -194,121 +183,3 @@ class SerialLine:
                 self._board.disconnect()
                 return found
         return []
-
-
-class CanLine:
-    """A CAN bus: any number of boards, each found by its answer to a broadcast question."""
-
-    def __init__(
-        self,
-        port: str,
-        admit: Admit,
-        fd: bool = False,
-        rate: float | None = None,
-        nodes: frozenset[int] | None = None,
-    ) -> None:
-        self._port = port
-        self._admit = admit
-        self._fd = fd
-        self._rate = rate
-        self._nodes = nodes
-        self._decoder = CanDecoder()
-        self._everyone = CanEncoder(BROADCAST, fd)
-        self._encoders: dict[int, CanEncoder] = {}
-        self._links: dict[int, BoardLink] = {}
-        self._up = False
-        self._frames = 0
-        self._since = self._discover_due = self._diagnose_from = Instant(0)
-        self._questions: list[Payload] = []
-        self.strangers = 0
-        """Messages of boards beyond `MAX_NODES` or not asked for."""
-
-    @property
-    def links(self) -> dict[int, Link]:
-        """Boards found so far, by node."""
-        return dict(self._links)
-
-    @property
-    def rejects(self) -> dict[str, int]:
-        """Refusals of the decoder, for the whole bus."""
-        counts = {reason: n for reason, n in self._decoder.counters.items() if reason != "accepted"}
-        return counts | {"strangers": self.strangers}
-
-    def connect(self, now: Instant, usb_serial: str = "", byte_time: float = 0.0) -> None:  # noqa: ARG002 - properties of a serial line
-        """The bus is open."""
-        self._up = True
-        self._decoder.reset()
-        self._frames = 0
-        self._since = self._discover_due = self._diagnose_from = now
-        for link in self._links.values():
-            link.connect(now)
-
-    def disconnect(self) -> list[LineEvent]:
-        """The bus is closed or gone; see `Line.disconnect`."""
-        self._up = False
-        self._questions.clear()
-        return [
-            LineEvent(node, event)
-            for node, link in self._links.items()
-            for event in link.disconnect()
-        ]
-
-    def receive(self, chunk: Chunk) -> list[LineEvent]:
-        """Take frames; TypeError for bytes."""
-        if isinstance(chunk.payload, bytes):
-            raise TypeError("a CAN line takes frames")
-        self._frames += len(chunk.payload)
-        out: list[LineEvent] = []
-        for received in self._decoder.feed(chunk.payload):
-            message, node = received.message, received.board
-            if isinstance(message, FloatSamples | HostMessage):
-                continue  # another host's question
-            link = self._links.get(node) or self._meet(node, chunk.received)
-            if link is None:
-                self.strangers += 1
-                continue
-            out += [LineEvent(node, event) for event in link.receive(message, chunk.received)]
-        return out
-
-    def tick(self, now: Instant) -> list[LineEvent]:
-        """Look for boards, drive their links."""
-        if not self._up:
-            return []
-        if not self._links and now >= self._discover_due:
-            self._discover_due = after(now, DISCOVER_EVERY)
-            self._questions = [self._everyone.encode(Identify(0))]
-        out = []
-        for node, link in self._links.items():
-            out += [LineEvent(node, event) for event in link.tick(now)]
-        if not self._links and now >= max(after(self._since, NOTHING_AFTER), self._diagnose_from):
-            self._diagnose_from = after(now, REPEAT_DIAGNOSIS)
-            out.append(LineEvent(None, self._diagnose()))
-        return out
-
-    def outgoing(self) -> list[Payload]:
-        """Transfers to write now."""
-        out, self._questions = self._questions, []
-        for node, link in self._links.items():
-            out += [self._encoders[node].encode(message) for message in link.outgoing()]
-        return out
-
-    def _meet(self, node: int, now: Instant) -> BoardLink | None:
-        if len(self._links) == MAX_NODES or (self._nodes is not None and node not in self._nodes):
-            return None
-        link = BoardLink(lambda identity: self._admit(node, identity), self._rate)
-        self._encoders[node] = CanEncoder(node, self._fd)
-        self._links[node] = link
-        link.connect(now)
-        return link
-
-    def _diagnose(self) -> Diagnosed:
-        if not self._frames:
-            return Diagnosed(
-                f"{self._port} is silent: no frame at all, and no answer to Identify",
-                "check the bit rate (…@1000000), termination (60 Ω across the bus), power and "
-                "that the adapter is the right one",
-            )
-        return Diagnosed(
-            f"{self._port} carries {self._frames} frames, but no taxel board answers Identify",
-            "check the board's firmware and, for CAN FD, that the bus was given with +fd",
-        )

@@ -107,12 +107,17 @@ class _Array:
 class BoardLink:
     """State machine of one board; ``rate`` in Hz, None leaves the board's own.
 
+    ``listen_only``: for recordings, which answer nobody; a descriptor alone brings the board into
+    service, and arrivals alone place its clock.
     ``counters``: samples dropped here, by reason. ``trackers``: per array.
     """
 
-    def __init__(self, admit: Admission, rate: float | None = None) -> None:
+    def __init__(
+        self, admit: Admission, rate: float | None = None, listen_only: bool = False
+    ) -> None:
         self._admit = admit
-        self.rate = rate
+        self.rate = None if listen_only else rate
+        self._listen_only = listen_only
         self.state = State.DOWN
         self.identity: Identity | None = None
         self.descriptor: Descriptor | None = None
@@ -203,6 +208,8 @@ class BoardLink:
         """Do what time demands: repeat questions and commands, poll the clock, notice silence."""
         if self.state is State.DOWN:
             return []
+        if self._listen_only:
+            return self._watch_silence(now) if self.state is State.STREAMING else []
         if now >= self._identify_due:
             self._ask(now)
         if self.state not in (State.CONFIGURING, State.STREAMING):
@@ -227,6 +234,8 @@ class BoardLink:
         return self._drop_commands()
 
     def _ask(self, now: Instant) -> None:
+        if self._listen_only:
+            return
         self._out.append(Identify(self._commands.next_request()))
         if self.state is State.IDENTIFYING:
             wait = self._identify_wait
@@ -244,10 +253,14 @@ class BoardLink:
         if in_service:
             if message == self.descriptor and not self._silent:
                 return []  # answer to the keepalive, or to another host's question
-            events = [Reset("it answers, but has ceased to stream"), *self._drop_commands()]
-        self._take_on(message, now, rebooted=in_service)
-        assert self.identity is not None
-        events.append(Identified(self.identity, rebooted=in_service))
+            same = message == self.descriptor
+            why = "it answers, but has ceased to stream" if same else "it describes itself anew"
+            events = [Reset(why), *self._drop_commands()]
+        identity = self._take_on(message, now, rebooted=in_service)
+        events.append(Identified(identity, rebooted=in_service))
+        if self._listen_only:
+            self.state, self._refusal, self._started = State.STREAMING, None, now
+            events.append(Streaming(None))
         return events
 
     def _judge(self, message: Descriptor) -> Refusal | None:
@@ -275,8 +288,9 @@ class BoardLink:
             )
         return self._admit(identity)
 
-    def _take_on(self, message: Descriptor, now: Instant, rebooted: bool) -> None:
-        self.descriptor, self.identity = message, _identity(message)
+    def _take_on(self, message: Descriptor, now: Instant, rebooted: bool) -> Identity:
+        identity = _identity(message)
+        self.descriptor, self.identity = message, identity
         if self.clock is None:
             self.clock = ClockMap(message.tick_hz)
         else:
@@ -294,10 +308,13 @@ class BoardLink:
         self.state, self._silent = State.CONFIGURING, False
         self._identify_due = after(now, KEEPALIVE)
         self._poll_due, self._poll_fast_until = now, after(now, POLL_FAST_FOR)
+        if self._listen_only:
+            return identity
         if self.rate is not None:
             mhz = round(self.rate * 1000)
             self._commands.push(lambda n: SetRate(n, mhz), now, own=True)
         self._commands.push(Start, now, own=True)
+        return identity
 
     # Commands
 

@@ -1,0 +1,89 @@
+"""Between a port's reader and the pipeline: bounded, the oldest dropped first and counted."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+from tactiled.blocks import Chunk
+
+CHUNKS = 256
+"""Chunks that may wait for the pipeline: 2.5 s at 100 Hz. Older data is of no use to anyone."""
+
+
+@dataclass(frozen=True, slots=True)
+class PortOpened:
+    """The port is open. ``usb_serial``: of its USB device; ``byte_time``: s per byte on a UART."""
+
+    usb_serial: str = ""
+    byte_time: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class PortLost:
+    """The port is gone; ``reason`` for people."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class PortEnded:
+    """A replay is over."""
+
+
+Item = Chunk | PortOpened | PortLost | PortEnded
+
+
+class Wake:
+    """Rouses the pipeline; shared by all ports."""
+
+    def __init__(self) -> None:
+        self._event = threading.Event()
+
+    def ring(self) -> None:
+        """There is something to do."""
+        self._event.set()
+
+    def wait(self, timeout: float) -> None:
+        """Wait until rung, at most ``timeout`` s."""
+        if self._event.wait(timeout):
+            self._event.clear()
+
+
+class Inbox:
+    """What one port's reader hands over; drops chunks, never news of the port itself."""
+
+    def __init__(self, wake: Wake, limit: int = CHUNKS) -> None:
+        self._wake = wake
+        self._limit = limit
+        self._items: deque[Item] = deque()
+        self._lock = threading.Lock()
+        self._chunks = 0
+        self.dropped = 0
+        """Chunks dropped since the start."""
+
+    def put(self, item: Item) -> None:
+        """Hand over one item; never waits."""
+        with self._lock:
+            if isinstance(item, Chunk):
+                if self._chunks >= self._limit:
+                    self._drop_oldest()
+                self._chunks += 1
+            self._items.append(item)
+        self._wake.ring()
+
+    def take(self) -> Item | None:
+        """Oldest item, None when there is none."""
+        with self._lock:
+            if not self._items:
+                return None
+            item = self._items.popleft()
+            self._chunks -= isinstance(item, Chunk)
+            return item
+
+    def _drop_oldest(self) -> None:
+        at = next(i for i, item in enumerate(self._items) if isinstance(item, Chunk))
+        del self._items[at]
+        self._chunks -= 1
+        self.dropped += 1

@@ -1,0 +1,140 @@
+"""Cycles and events as ROS 2 messages: pure translation, no bus and no log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from tactile_bus.calibration import BoardCalibration
+from tactile_bus.instant import WallClock
+from tactile_bus.messages import MSG, header
+from tactiled.blocks import Chunk, Cycle, Patch
+
+RAW_PART = 32_768
+"""Bytes of serial data in one RawChunk: with its header below the 64 KiB a message may have."""
+
+
+class MessageMaker:
+    """Messages of one board; what does not change from cycle to cycle is kept."""
+
+    def __init__(self, calibration: BoardCalibration, wall: WallClock) -> None:
+        self._wall = wall
+        self._calibration = calibration
+        self._frame = calibration.frame
+        taxels = [a.geometry.taxels for a in calibration.arrays]
+        self._array_taxels = np.array(taxels, np.uint16)
+
+    def features(self, cycle: Cycle) -> Any:
+        """``ContactFeatures``."""
+        f = cycle.features
+        force, moment = f.wrench[:3].tolist(), f.wrench[3:].tolist()
+        return MSG.ContactFeatures(
+            header=self._header(cycle),
+            captured_ns=cycle.captured,
+            received_ns=cycle.received,
+            uncertainty=cycle.uncertainty,
+            sequence=cycle.sequence,
+            valid=f.valid,
+            reasons=list(f.reasons),
+            calibrated=cycle.calibrated,
+            peak_force=f.peak_force,
+            peak_side=int(f.peak_side),
+            peak_position=MSG.Point(*f.peak_position.tolist()),
+            normal_force=f.normal_force,
+            wrench=MSG.Wrench(MSG.Vector3(*force), MSG.Vector3(*moment)),
+            tip_force=f.tip_force,
+            tip_contact_time=f.tip_contact_time,
+            taxels_in_contact=f.taxels_in_contact,
+            taxels_masked=f.taxels_masked,
+            patches=[_patch(p) for p in f.patches],
+        )
+
+    def forces(self, cycle: Cycle) -> Any:
+        """``TaxelForces``."""
+        ambient = cycle.ambient
+        return MSG.TaxelForces(
+            header=self._header(cycle),
+            captured_ns=cycle.captured,
+            received_ns=cycle.received,
+            uncertainty=cycle.uncertainty,
+            sequence=cycle.sequence,
+            array_taxels=self._array_taxels,
+            force=_flat(cycle.force),
+            status=cycle.health,
+            compensated=ambient.method != "off" and bool(ambient.valid.all()),
+            calibrated=cycle.calibrated,
+        )
+
+    def field(self, cycle: Cycle) -> Any:
+        """``TaxelField``."""
+        return MSG.TaxelField(
+            header=self._header(cycle),
+            captured_ns=cycle.captured,
+            received_ns=cycle.received,
+            sequence=cycle.sequence,
+            array_taxels=self._array_taxels,
+            field_ut=_flat(cycle.field_ut),
+            temperature_c=_flat(cycle.temperature_c),
+        )
+
+    def ambient(self, cycle: Cycle) -> Any:
+        """``AmbientField``."""
+        a = cycle.ambient
+        return MSG.AmbientField(
+            header=self._header(cycle),
+            captured_ns=cycle.captured,
+            sequence=cycle.sequence,
+            method=a.method,
+            plane=_flat(a.plane),
+            support=_flat(a.support),
+            residual_ut=_flat(a.residual_ut),
+            age=_flat(a.age),
+            valid=np.asarray(a.valid, np.bool_),
+        )
+
+    def geometry(self, wall_ns: int) -> Any:
+        """``SkinGeometry``."""
+        c = self._calibration
+        arrays = [a.geometry for a in c.arrays]
+        return MSG.SkinGeometry(
+            header=header(wall_ns, self._frame),
+            serial_number=c.serial_number,
+            model=c.model,
+            array_name=[a.name for a in arrays],
+            array_side=np.array([int(a.side) for a in arrays], np.uint8),
+            array_rows=np.array([a.rows for a in arrays], np.uint16),
+            array_columns=np.array([a.columns for a in arrays], np.uint16),
+            position=_flat(np.concatenate([a.position for a in arrays])),
+            normal=_flat(np.concatenate([a.rotation[:, :, 2] for a in arrays])),
+            surface=_flat(np.concatenate([a.surface for a in arrays])),
+        )
+
+    def _header(self, cycle: Cycle) -> Any:
+        return header(self._wall.wall_ns(cycle.captured), self._frame)
+
+
+def split(chunk: Chunk) -> Iterable[Chunk]:
+    """Parts of a chunk that each fit into one message."""
+    payload = chunk.payload
+    if not isinstance(payload, bytes) or len(payload) <= RAW_PART:
+        return (chunk,)
+    cuts = range(0, len(payload), RAW_PART)
+    return tuple(Chunk(chunk.received, payload[at : at + RAW_PART]) for at in cuts)
+
+
+def _patch(patch: Patch) -> Any:
+    return MSG.ContactPatch(
+        array=patch.array,
+        side=int(patch.side),
+        taxels=patch.taxels,
+        normal_force=patch.normal_force,
+        peak_force=patch.peak_force,
+        force=MSG.Vector3(*patch.force.tolist()),
+        centroid=MSG.Point(*patch.centroid.tolist()),
+    )
+
+
+def _flat(values: Any) -> Any:
+    return np.ascontiguousarray(values, np.float32).ravel()
