@@ -88,7 +88,7 @@ class Magnetometers:
     @property
     def lsb_ut(self) -> Float:
         """µT per count (N, 3), read-only."""
-        view = self._lsb.view()
+        view: Float = self._lsb.view()
         view.flags.writeable = False
         return view
 
@@ -105,7 +105,7 @@ class Magnetometers:
     def sense(self, field_ut: Float, temperature_c: float) -> Float:
         """Noiseless, unrounded field (N, 3) µT in chip axes of ``field_ut`` (N, 3) in ``ee``."""
         warmer = temperature_c - self.parameters.reference_c
-        seen = np.matmul(self._view, field_ut[:, :, None])[:, :, 0]
+        seen: Float = np.matmul(self._view, field_ut[:, :, None])[:, :, 0]
         seen *= 1.0 + self._sensitivity_drift * warmer
         seen += self._offset_drift * warmer
         return seen
@@ -115,7 +115,8 @@ class Magnetometers:
 
         ``now``: at the end of the conversion of z; ``before``: ``elapsed`` s earlier.
         """
-        return now + (before - now) * np.minimum(self._lag / elapsed, 1.0)
+        seen: Float = now + (before - now) * np.minimum(self._lag / elapsed, 1.0)
+        return seen
 
     def convert(self, field_ut: Float, temperature_c: float, rng: np.random.Generator) -> Reading:
         """Add noise, saturate, round to counts and wrap to 16 bits as the chip does.

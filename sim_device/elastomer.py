@@ -19,9 +19,10 @@ _HERTZ_VARIANCE = 0.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """``position`` (3,) m and ``force`` (3,) N in ``ee``; the force is what the environment exerts
-    on the skin. ``radius``: m, of the patch of contact.
-    """  # noqa: D205 - one contract, too long for one line
+    """What presses on a skin, in ``ee``: ``position`` (3,) m, ``force`` (3,) N, ``radius`` m.
+
+    The force is what the environment exerts on the skin; the radius is that of the patch.
+    """
 
     position: Float
     force: Float
@@ -49,7 +50,7 @@ class Spreader:
         nearest = squared.min(axis=1)
         width = p.spread**2 + _HERTZ_VARIANCE * radius**2
         # Measured from the nearest taxel so that far contacts do not underflow to 0/0.
-        share = np.exp((nearest[:, None] - squared) / (2.0 * width[:, None]))
+        share: Float = np.exp((nearest[:, None] - squared) / (2.0 * width[:, None]))
         borne = (p.no_reach - np.sqrt(nearest)) / (p.no_reach - p.full_reach)
         share *= (np.clip(borne, 0.0, 1.0) / share.sum(axis=1))[:, None]
         return share

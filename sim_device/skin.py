@@ -173,7 +173,8 @@ def _fit(
     loads = [
         np.array([x * normal, y * normal, -normal])
         for normal in CALIBRATION_NORMAL_N
-        for x, y in [(s, 0.0) for s in CALIBRATION_SHEAR] + [(0.0, s) for s in CALIBRATION_SHEAR[1:]]
+        for x, y in [(s, 0.0) for s in CALIBRATION_SHEAR]
+        + [(0.0, s) for s in CALIBRATION_SHEAR[1:]]
     ]
     forces, fields = [], []
     force = np.zeros_like(rest)

@@ -1,0 +1,231 @@
+"""What is to go wrong, when and how often: a seeded plan, from text or from a TOML table."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from sim_device.scripts import ScriptError
+
+DELAY_S = 0.02
+"""s that a delayed frame holds up the line unless told: two samples at 100 Hz."""
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """From ``start`` s after power-on, for ``duration`` s (inf: to the end)."""
+
+    start: float
+    duration: float = math.inf
+
+    def covers(self, seconds: float) -> bool:
+        """Whether ``seconds`` after power-on lie inside."""
+        return self.start <= seconds < self.start + self.duration
+
+
+class TaxelFaultKind(StrEnum):
+    """What a broken taxel does."""
+
+    STUCK = "stuck"  # repeats its value, unflagged: a chip that stopped converting
+    SATURATED = "saturated"  # full scale, flagged
+    FAILED = "failed"  # does not answer the bus: flagged, the counts mean nothing
+
+
+@dataclass(frozen=True, slots=True)
+class TaxelFault:
+    """Taxel number ``taxel`` of ``array`` is broken while ``window`` lasts."""
+
+    kind: TaxelFaultKind
+    array: str
+    taxel: int
+    window: Window
+
+
+@dataclass(frozen=True, slots=True)
+class FaultPlan:
+    """All faults of one board and its wire. ValueError for probabilities outside 0 to 1.
+
+    ``flip`` is per bit, ``byteloss`` and ``byteinsert`` per byte, the other probabilities per
+    frame; ``delay_s`` is how long a delayed frame holds up the line.
+    """
+
+    seed: int = 0
+    flip: float = 0.0
+    byteloss: float = 0.0
+    byteinsert: float = 0.0
+    loss: float = 0.0
+    duplicate: float = 0.0
+    reorder: float = 0.0
+    splice: float = 0.0
+    delay: float = 0.0
+    delay_s: float = DELAY_S
+    silence: tuple[Window, ...] = ()
+    reset: tuple[float, ...] = ()
+    busoff: tuple[Window, ...] = ()
+    taxels: tuple[TaxelFault, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse figures out of range."""
+        for name in PROBABILITIES:
+            value = getattr(self, name)
+            if not 0 <= value <= 1:
+                raise ValueError(f"{name} is a probability from 0 to 1, not {value!r}")
+        if not 0 <= self.delay_s < math.inf:
+            raise ValueError(f"delay_s is a time of at least 0 s, not {self.delay_s!r}")
+
+    @classmethod
+    def parse(cls, text: str) -> FaultPlan:
+        """Plan from text such as ``flip=1e-5,loss=0.01,silence@5s+2s,reset@8s,stuck=left:3@2s``.
+
+        Entries, parted by commas: ``seed=N``; ``NAME=PROBABILITY`` for flip, byteloss,
+        byteinsert, loss, duplicate, reorder, splice; ``delay=PROBABILITY:SECONDSs``;
+        ``silence@Ts+Ds``, ``busoff@Ts+Ds``, ``reset@Ts``; ``stuck|saturated|failed=ARRAY:TAXEL``
+        with an optional ``@Ts`` or ``@Ts+Ds``. ScriptError names the entry and what is allowed.
+        """
+        entries = [e.strip() for e in text.split(",")]
+        return _collect([(e, f"fault {e!r}") for e in entries if e])
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, object], where: str) -> FaultPlan:
+        """Plan from a TOML table that holds the words of `parse` by their names.
+
+        ``flip = 1e-5``, ``delay = "0.01:0.02s"``, ``silence = ["5s+2s"]``, ``reset = "8s"``,
+        ``stuck = ["left:3@2s"]``. ``where``: file and table, for messages.
+        """
+        entries = []
+        for key, value in table.items():
+            for item in value if isinstance(value, list) else [value]:
+                if isinstance(item, bool) or not isinstance(item, (int, float, str)):
+                    raise ScriptError(
+                        f"{where}: {key}: given {item!r}; allowed: a number, a text such as "
+                        f"'5s+2s', or a list of these"
+                    )
+                mark = "@" if key in TIMED else "="
+                entries.append((f"{key}{mark}{item}", f"{where}: {key}: {item!r}"))
+        return _collect(entries)
+
+    @property
+    def touches_wire(self) -> bool:
+        """Whether any fault is on the wire."""
+        return bool(self.silence) or any(getattr(self, name) > 0 for name in PROBABILITIES)
+
+
+PROBABILITIES = (
+    "flip",
+    "byteloss",
+    "byteinsert",
+    "loss",
+    "duplicate",
+    "reorder",
+    "splice",
+    "delay",
+)
+TIMED = ("silence", "reset", "busoff")
+
+_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_ENTRY = re.compile(r"(?P<name>[a-z_]+)\s*(?P<mark>[=@])\s*(?P<rest>.+)")
+_DELAY = re.compile(rf"(?P<p>{_NUMBER})\s*(?::\s*(?P<s>{_NUMBER})\s*s)?")
+_WINDOW = re.compile(rf"(?P<at>{_NUMBER})\s*s\s*(?:\+\s*(?P<for>{_NUMBER})\s*s)?")
+_TAXEL = re.compile(
+    rf"(?P<array>[A-Za-z0-9_-]+):(?P<taxel>\d{{1,4}})\s*(?:@\s*(?P<window>{_NUMBER}\s*s.*))?"
+)
+_FORMS = (
+    "allowed: seed=N; flip, byteloss, byteinsert, loss, duplicate, reorder, splice = probability "
+    "from 0 to 1; delay=PROBABILITY:SECONDSs; silence@Ts+Ds; busoff@Ts+Ds; reset@Ts; "
+    "stuck, saturated, failed = ARRAY:TAXEL@Ts+Ds"
+)
+
+
+def _collect(entries: list[tuple[str, str]]) -> FaultPlan:
+    """Plan of ``(entry, how to call it in a message)``."""
+    figures: dict[str, float] = {}
+    seed: int | None = None
+    windows: dict[str, list[Window]] = {name: [] for name in TIMED}
+    taxels: list[TaxelFault] = []
+    for entry, label in entries:
+        match = _ENTRY.fullmatch(entry)
+        if match is None:
+            raise ScriptError(f"{label} is not understood; {_FORMS}")
+        name, mark, rest = match["name"], match["mark"], match["rest"].strip()
+        if name in TIMED and mark == "@":
+            windows[name].append(
+                _window(rest, label, needs_end=name != "reset", may_end=name != "reset")
+            )
+        elif mark != "=":
+            raise ScriptError(f"{label} is not understood; {_FORMS}")
+        elif name in set(TaxelFaultKind):
+            taxels.append(_taxel_fault(TaxelFaultKind(name), rest, label))
+        elif name in figures or (name == "seed" and seed is not None):
+            raise ScriptError(f"{label}: {name} is given twice; give it once")
+        elif name == "seed":
+            if not rest.isdecimal():
+                raise ScriptError(f"{label}: allowed: a whole number of at least 0")
+            seed = int(rest)
+        elif name == "delay":
+            figures |= _delay(rest, label)
+        elif name in PROBABILITIES:
+            figures[name] = _probability(rest, label)
+        else:
+            raise ScriptError(f"{label} is not understood; {_FORMS}")
+    chance = {name: figures.get(name, 0.0) for name in PROBABILITIES}
+    return FaultPlan(
+        seed=seed or 0,
+        flip=chance["flip"],
+        byteloss=chance["byteloss"],
+        byteinsert=chance["byteinsert"],
+        loss=chance["loss"],
+        duplicate=chance["duplicate"],
+        reorder=chance["reorder"],
+        splice=chance["splice"],
+        delay=chance["delay"],
+        delay_s=figures.get("delay_s", DELAY_S),
+        silence=tuple(windows["silence"]),
+        reset=tuple(w.start for w in windows["reset"]),
+        busoff=tuple(windows["busoff"]),
+        taxels=tuple(taxels),
+    )
+
+
+def _probability(text: str, label: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value <= 1:
+        raise ScriptError(f"{label}: allowed: a probability from 0 to 1")
+    return value
+
+
+def _delay(text: str, label: str) -> dict[str, float]:
+    match = _DELAY.fullmatch(text)
+    if match is None:
+        raise ScriptError(f"{label}: allowed: PROBABILITY:SECONDSs, such as 0.01:0.02s")
+    plan = {"delay": _probability(match["p"], label)}
+    if match["s"]:
+        plan["delay_s"] = float(match["s"])
+    return plan
+
+
+def _window(text: str, label: str, needs_end: bool, may_end: bool) -> Window:
+    match = _WINDOW.fullmatch(text)
+    if match is None or (needs_end and not match["for"]) or (match["for"] and not may_end):
+        form = "Ts+Ds" if needs_end else "Ts or Ts+Ds" if may_end else "Ts"
+        raise ScriptError(f"{label}: allowed: {form}, seconds after power-on, such as 5s+2s or 5s")
+    return Window(float(match["at"]), float(match["for"]) if match["for"] else math.inf)
+
+
+def _taxel_fault(kind: TaxelFaultKind, text: str, label: str) -> TaxelFault:
+    match = _TAXEL.fullmatch(text)
+    if match is None:
+        raise ScriptError(
+            f"{label}: allowed: ARRAY:TAXEL, then @Ts or @Ts+Ds, such as left:3@2s+5s"
+        )
+    window = (
+        _window(match["window"], label, needs_end=False, may_end=True)
+        if match["window"]
+        else Window(0.0)
+    )
+    return TaxelFault(kind, match["array"], int(match["taxel"]), window)
