@@ -6,6 +6,7 @@ Last byte of each frame (tail): start 0x80, end 0x40, toggle 0x20, transfer id 0
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -143,6 +144,13 @@ class CanDecoder:
     def __init__(self) -> None:
         self._transfers: dict[int, _Transfer] = {}
         self._tally = Tally(_REASONS)
+        self._unknown: deque[tuple[int, int]] = deque(maxlen=packet.MAX_UNKNOWN)
+
+    def take_unknown(self) -> list[tuple[int, int]]:
+        """Type and request number of the messages skipped as unknown since the last call."""
+        unknown = list(self._unknown)
+        self._unknown.clear()
+        return unknown
 
     @property
     def counters(self) -> dict[str, int]:
@@ -181,6 +189,7 @@ class CanDecoder:
         if can_id >> 8 & 0xFF not in _KNOWN:
             if tail & _START:
                 tally[Reject.UNKNOWN_TYPE] += 1
+                self._unknown.append((can_id >> 8 & 0xFF, packet.request_number(data[:-1])))
             return None
         key = can_id & 0xFFFF
         transfer = self._transfers.get(key)

@@ -34,6 +34,8 @@ class Reject(StrEnum):
     NO_START = "no_start"  # CAN frame of a transfer whose start was not seen
     INTERRUPTED = "interrupted"  # a CAN transfer begun before the last one ended
     OUT_OF_ORDER = "out_of_order"  # toggle, transfer id or kind of a CAN frame does not follow
+    LOST_LOCK = "lost_lock"  # an unframed stream no longer ends its frames where expected
+    DISCARDED_BYTES = "discarded_bytes"  # bytes, not frames, that belong to no frame
     DUPLICATE = "duplicate"  # a CAN frame came twice running; the second was ignored
 
 

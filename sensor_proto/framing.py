@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import deque
 
 from sensor_proto import cobs, packet
 from sensor_proto.decoder import ACCEPTED, Reject, Tally
@@ -39,6 +40,13 @@ class SerialDecoder:
         self._partial = b""
         self._discarding = False
         self._tally = Tally(_REASONS)
+        self._unknown: deque[tuple[int, int]] = deque(maxlen=packet.MAX_UNKNOWN)
+
+    def take_unknown(self) -> list[tuple[int, int]]:
+        """Type and request number of the whole messages skipped as unknown since the last call."""
+        unknown = list(self._unknown)
+        self._unknown.clear()
+        return unknown
 
     @property
     def counters(self) -> dict[str, int]:
@@ -117,6 +125,8 @@ class SerialDecoder:
             message = decode_payload(raw[0], raw, packet.HEADER_SIZE, len(raw) - 4)
             if isinstance(message, Reject):
                 tally[message] += 1
+                if message is Reject.UNKNOWN_TYPE:
+                    self._unknown.append((raw[0], packet.request_number(raw)))
                 continue
             received.append(Received(message, 0, after))
         tally[ACCEPTED] += len(received)

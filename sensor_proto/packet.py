@@ -21,6 +21,14 @@ OVERHEAD = HEADER_SIZE + _CRC.size
 MAX_PACKET = MAX_PAYLOAD + OVERHEAD
 """Bytes of the longest packet; decoders hold no more than this of one that is not yet whole."""
 
+MAX_UNKNOWN = 8
+"""Messages of unknown type that a decoder remembers so that a board can refuse them by number."""
+
+
+def request_number(packet: bytes) -> int:
+    """Request that the command in ``packet`` carries, for every command begins with it; else 0."""
+    return int.from_bytes(packet[HEADER_SIZE : HEADER_SIZE + 2], "little")
+
 
 def pack(message: Message, board: int = 0) -> bytes:
     """Packet of ``message`` from or to ``board``; ValueError for values that do not fit."""

@@ -1,0 +1,131 @@
+"""Where the frames of an unframed float stream begin, and how many magnetometers they hold.
+
+CR LF ends every frame but occurs inside the floats as well, so that it is trusted only at the
+right distance and together with temperatures that a chip can have. Among overlapping claims the
+better supported wins. All claims of one search are judged at once: noise full of CR LF is cheap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_MAGNETOMETERS = 20
+"""Four boards of five on one controller, the largest assembly on sale."""
+
+LOCK_FRAMES = 3
+"""Consecutive frames that must fit before a count of magnetometers is believed."""
+
+READING = 16
+"""Bytes of one magnetometer: t, x, y, z as float32."""
+
+END = b"\r\n"
+FLOAT = np.dtype("<f4")
+
+COLDEST_C, HOTTEST_C = -45.0, 130.0
+"""MLX90393 works from −40 to 85 °C; some room for self-heating and trim."""
+
+FAILED_C = (-998.1, 451.8)
+"""What its temperature formula gives for raw 0 and 0xFFFF: the chip did not answer."""
+
+TINY_C = 1e-3
+"""Half of all bit patterns are floats below 1; a temperature in steps of 1/45.2 °C never is this
+close to nought, save nought itself."""
+
+Flags = NDArray[np.bool_]
+
+
+def frame_size(magnetometers: int) -> int:
+    """Bytes of one frame."""
+    return READING * magnetometers + len(END)
+
+
+def plausible(temperature_c: NDArray[np.float32]) -> Flags:
+    """Whether each can come from a chip, working or dead; same shape."""
+    size = np.abs(temperature_c)
+    usual = (temperature_c >= COLDEST_C) & (temperature_c <= HOTTEST_C)
+    usual &= (size >= TINY_C) | (size == 0)
+    for dead in FAILED_C:
+        usual |= np.abs(temperature_c - np.float32(dead)) < 0.1
+    return usual
+
+
+class Search:
+    """One look at the bytes since the last frame (or since the beginning)."""
+
+    def __init__(self, data: bytes) -> None:
+        values = np.frombuffer(data, np.uint8)
+        self._size = len(data)
+        self._mark = np.zeros(self._size, dtype=np.bool_)
+        if self._size > 1:
+            self._mark[:-1] = (values[:-1] == END[0]) & (values[1:] == END[1])
+        self._ends = np.flatnonzero(self._mark)
+        self._values = values
+
+    def known(self, count: int) -> int | None:
+        """Start of the first frame of ``count`` magnetometers after a lost boundary.
+
+        One frame is enough when all of its temperatures are plausible, or more than that.
+        """
+        return self._first(count, 2)
+
+    def new(self, counts: Iterable[int]) -> tuple[int, int] | None:
+        """Start of the first of `LOCK_FRAMES` consecutive frames, and their magnetometers."""
+        if not len(self._ends) or not self._warm.any():
+            return None
+        for count in counts:
+            start = self._first(count, LOCK_FRAMES)
+            if start is not None:
+                return start, count
+        return None
+
+    def _first(self, count: int, depth: int) -> int | None:
+        """Best supported of the first claims that overlap; None while support may yet come."""
+        size = frame_size(count)
+        starts = self._ends + len(END) - size
+        starts = starts[(starts >= 0) & (starts + depth * size <= self._size)]
+        known = depth < LOCK_FRAMES
+        fits = np.ones(len(starts), dtype=np.intp)
+        for nth in range(1, depth):
+            fits += (fits == nth) & self._mark[starts + (nth + 1) * size - len(END)]
+        if not known:
+            starts, fits = starts[fits == depth], fits[fits == depth]
+        if not len(starts):
+            return None
+        shares = self._shares(starts, count, depth)
+        after_end = (starts >= len(END)) & self._mark[starts - len(END)]
+        if known:
+            # What comes before was taken up to the end of a frame.
+            after_end |= starts == 0
+        summed = np.where(np.arange(depth) < fits[:, None], shares, 0.0).sum(axis=1)
+        score = fits - 1 + summed / fits + 0.5 * after_end
+        enough = score >= 1.0 if known else shares.min(axis=1) > 0.5
+        # Part of a damaged frame can end like a whole one; its first readings give it away.
+        enough &= after_end | (shares[:, 0] == 1.0)
+        chosen = np.flatnonzero(enough)
+        if not len(chosen):
+            return None
+        rivals = chosen[starts[chosen] < starts[chosen[0]] + size]
+        best = int(starts[rivals[score[rivals].argmax()]])
+        return best if best + (depth + 1) * size <= self._size else None
+
+    @cached_property
+    def _warm(self) -> Flags:
+        """(bytes,): whether the float that begins there is a plausible temperature."""
+        words = np.zeros(self._size, dtype="<u4")
+        whole = max(0, self._size - 3)
+        for byte in range(4):
+            words[:whole] |= self._values[byte : whole + byte].astype("<u4") << np.uint32(8 * byte)
+        with np.errstate(invalid="ignore"):
+            warm = plausible(words.view(FLOAT))
+        warm[whole:] = False
+        return warm
+
+    def _shares(self, starts: NDArray[np.intp], count: int, depth: int) -> NDArray[np.float64]:
+        """Share of plausible temperatures in each of ``depth`` frames from each start."""
+        nth = np.arange(depth)[:, None] * frame_size(count) + np.arange(count) * READING
+        shares: NDArray[np.float64] = self._warm[starts[:, None, None] + nth].mean(axis=2)
+        return shares
