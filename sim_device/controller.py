@@ -61,6 +61,9 @@ MAX_QUEUED_REPLIES = 32
 
 LOG_INFO = 20
 
+HOST_BIT = 0x80
+"""Set in the type of everything that a host sends; other unknown types are of newer boards."""
+
 
 class ResetCause(IntEnum):
     """``reset_cause`` of a `Status`."""
@@ -167,7 +170,7 @@ class Controller:
     def refuse(self, command: int, request: int, now: Instant) -> None:
         """Answer a command of a type that this firmware does not know."""
         self.advance(now)
-        if now >= self._run.ready:
+        if now >= self._run.ready and command & HOST_BIT:
             self._reply(Ack(command, request, AckResult.UNKNOWN_COMMAND))
 
     def count_rejected(self, frames: int) -> None:

@@ -90,6 +90,8 @@ class SimulatedBoard(SkinOwner, ABC):
     ) -> None:
         for item in received:
             self.controller.handle(item.message, now)
+        for command, request in decoder.take_unknown():
+            self.controller.refuse(command, request, now)
         counters = decoder.counters
         rejected = sum(counters.values()) - counters[ACCEPTED]
         self.controller.count_rejected(rejected - self._rejected)
