@@ -31,6 +31,10 @@ class Topic:
         key = self.template.format(name=name)
         return f"{prefix}/{key}" if prefix else key
 
+    def channel(self, name: str) -> str:
+        """Name of the channel in a log: the key with the leading slash of a ROS topic."""
+        return "/" + self.key(name)
+
 
 _OWN = "tactile_msgs/msg"
 

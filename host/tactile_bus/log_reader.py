@@ -1,0 +1,414 @@
+"""Reads MCAP logs as they are: finished, cut off, or damaged. Constant memory on any length.
+
+A sound file is read record by record. Where a record cannot be right, reading goes on at the next
+chunk, found by its header; everything passed over is reported as `Damage`, never silently.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import zlib
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO
+
+from tactile_bus import mcap_file as op
+from tactile_bus.log_records import (
+    ATTACHMENT_HEAD,
+    U32,
+    U64,
+    AttachmentRecord,
+    BadRecordError,
+    Block,
+    ChannelRecord,
+    ChunkHead,
+    Cursor,
+    Damage,
+    Event,
+    LogError,
+    Message,
+    SchemaRecord,
+    parse_channel,
+    parse_metadata,
+    parse_schema,
+    unpack,
+    unpack_start,
+)
+
+MAX_CHUNK = 256 << 20
+"""Bytes of one chunk: rosbag2 and Foxglove write 0.8 to 4 MB, this project 1 MB; bounds memory."""
+
+MAX_RECORD = 16 << 20
+"""Bytes of a schema, channel or metadata record: real ones are a few kB."""
+
+MAX_DAMAGES = 1000
+"""Places reported one by one; beyond that they are only counted."""
+
+WINDOW = 1 << 20
+"""Bytes read at once while looking for the next chunk."""
+
+CHUNK_START = re.compile(rb"(?=\x06.{4}\x00{4})", re.DOTALL)
+CHUNK_FIXED = 40  # bytes of a chunk record but for its compression's name and its data
+FOOTER_SIZE = 9 + 20
+Progress = Callable[[int, int], None]
+
+
+@dataclass(slots=True)
+class LogReader:
+    """One pass over a log, as a context manager. `LogError` when the file is none.
+
+    After the pass: ``schemas`` and ``channels`` by number, ``damages`` (the first MAX_DAMAGES),
+    ``damage_count``, ``closed`` (the file was finished in order).
+    """
+
+    path: Path
+    progress: Progress | None = None
+    size: int = 0
+    closed: bool = False
+    profile: str = ""
+    library: str = ""
+    schemas: dict[int, SchemaRecord] = field(default_factory=dict)
+    channels: dict[int, ChannelRecord] = field(default_factory=dict)
+    damages: list[Damage] = field(default_factory=list)
+    damage_count: int = 0
+    _file: BinaryIO | None = None
+    _data_end: int = 0
+    _lost_chunk: Damage | None = None
+
+    def __enter__(self) -> LogReader:
+        try:
+            self._file = open(self.path, "rb")
+            self.size = os.fstat(self._file.fileno()).st_size
+        except OSError as error:
+            raise LogError(f"{self.path}: {error.strerror}") from error
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def read_at(self, position: int, size: int) -> bytes:
+        """Bytes of the file; fewer at its end. `LogError` when the disk fails."""
+        if self._file is None:
+            raise ValueError("the log is not open")
+        try:
+            self._file.seek(position)
+            return self._file.read(size)
+        except OSError as error:
+            raise LogError(f"{self.path}: {error.strerror} at byte {position}") from error
+
+    def events(self) -> Iterator[Event]:
+        """Everything readable, in the order of the file."""
+        position = self._start()
+        while position < self._data_end:
+            if self.progress is not None:
+                self.progress(position, self.size)
+            try:
+                after, event = self._record(position)
+            except BadRecordError as error:
+                after, event = self._skip(position, str(error)), None
+            if event is not None:
+                yield event
+            if after <= position:
+                break
+            position = after
+        self._settle_lost_chunk()
+        if self.progress is not None:
+            self.progress(self.size, self.size)
+
+    def messages(self, block: Block) -> Iterator[Message]:
+        """Messages of a block; schemas and channels in it are taken up on the way."""
+        data, at, end = block.data, 0, len(block.data)
+        head, fixed = op.MESSAGE_HEAD, op.MESSAGE_FIXED
+        while at + 9 <= end:
+            opcode, length = op.RECORD.unpack_from(data, at)
+            after = at + 9 + length
+            if after > end:
+                break  # the last record of a chunk that was cut off
+            if opcode == op.MESSAGE and length >= fixed:
+                _, _, channel, sequence, log_ns, publish_ns = head.unpack_from(data, at)
+                yield Message(channel, sequence, log_ns, publish_ns, data[at + 31 : after])
+            elif opcode in (op.SCHEMA, op.CHANNEL):
+                try:
+                    self._define(opcode, data[at + 9 : after])
+                except BadRecordError as error:
+                    self._damaged(Damage(block.offset, 0, str(error)))
+            at = after
+
+    def check_structure(self) -> None:
+        """`LogError` unless the records follow one another soundly; chunks are not unpacked."""
+        position = self._start()
+        while position < self._data_end and not self.damage_count:
+            opcode, length = op.RECORD.unpack(self.read_at(position, 9).ljust(9, b"\0"))
+            after = position + 9 + length
+            if (opcode == op.CHUNK and self._chunk_head(position) is None) or (
+                not 0 < opcode <= op.DATA_END and opcode < 0x80
+            ):
+                raise LogError(f"{self.path}: no record at byte {position}")
+            if opcode == op.DATA_END or after > self._data_end:
+                break
+            position = after
+        if self.damage_count:
+            raise LogError(f"{self.path}: {self.damages[0].reason}")
+
+    def _start(self) -> int:
+        """Where the first record is; finds out whether the file was finished, and how it ends."""
+        if self.size == 0:
+            raise LogError(f"{self.path} is empty: its writer ended before the first byte")
+        self._data_end = self.size
+        magic = self.read_at(0, 8)
+        if magic != op.MAGIC:
+            first = self._find_chunk(0)
+            if op.MAGIC.startswith(magic):
+                raise LogError(f"{self.path} is cut off after {self.size} bytes: nothing to read")
+            if first is None:
+                raise LogError(f"{self.path} is no MCAP file")
+            self._damaged(Damage(0, first, "the start of the file is overwritten"))
+            self._read_summary()
+            return first
+        self._read_summary()
+        return 8
+
+    def _read_summary(self) -> None:
+        """Take schemas and channels from the summary of a finished file, and note where it is."""
+        tail = self.read_at(max(self.size - FOOTER_SIZE - 8, 0), FOOTER_SIZE + 8)
+        if len(tail) != FOOTER_SIZE + 8 or tail[-8:] != op.MAGIC or tail[0] != op.FOOTER:
+            return
+        start, _, crc = struct.unpack_from("<QQI", tail, 9)
+        length = self.size - 12 - start  # all that its checksum covers
+        if start == 0:
+            self.closed = True
+            self._data_end = self.size - FOOTER_SIZE - 8
+            return
+        if not 8 <= start <= self.size - FOOTER_SIZE - 8 or length > MAX_CHUNK:
+            return
+        summary = self.read_at(start, length)
+        if crc != 0 and zlib.crc32(summary) != crc:
+            self._damaged(Damage(start, length, "the checksum of the summary is wrong"))
+            return
+        self.closed = True
+        self._data_end = start
+        at = 0
+        while at + 9 <= len(summary):
+            opcode, size = op.RECORD.unpack_from(summary, at)
+            if opcode in (op.SCHEMA, op.CHANNEL):
+                try:
+                    self._define(opcode, summary[at + 9 : at + 9 + size])
+                except BadRecordError as error:
+                    self._damaged(Damage(start + at, size, f"in the summary: {error}"))
+            at += 9 + size
+
+    def _record(self, position: int) -> tuple[int, Event | None]:
+        """The record at ``position`` and where the next one is."""
+        head = self.read_at(position, 9)
+        if len(head) < 9:
+            raise BadRecordError("cut off within a record")
+        opcode, length = op.RECORD.unpack(head)
+        after = position + 9 + length
+        if opcode != op.MESSAGE_INDEX:
+            self._settle_lost_chunk()
+        if opcode == op.CHUNK:
+            return self._chunk(position, length)
+        if after > self._data_end:
+            raise BadRecordError("cut off within a record")
+        if opcode == op.MESSAGE_INDEX:
+            self._message_index(length)
+        elif opcode == op.ATTACHMENT:
+            return after, self._attachment(position, length)
+        elif opcode == op.DATA_END:
+            if length != 4 or (self.closed and after != self._data_end):
+                raise BadRecordError("an end mark amid the data")
+            return self._after_end_mark(position, after), None
+        elif opcode in (op.HEADER, op.SCHEMA, op.CHANNEL, op.METADATA, op.MESSAGE):
+            if length > MAX_RECORD:
+                raise BadRecordError(f"a record of {length} bytes")
+            return after, self._small(opcode, position, self.read_at(position + 9, length))
+        elif opcode < 0x80:  # 0x80 and up are anyone's own records
+            raise BadRecordError(f"record type {opcode} amid the data")
+        return after, None
+
+    def _after_end_mark(self, position: int, after: int) -> int:
+        """An end mark without a summary that fits: the file was cut off while being finished."""
+        if not self.closed and self._find_chunk(after) is not None:
+            raise BadRecordError("an end mark amid the data")
+        if not self.closed:
+            self._damaged(Damage(position, self.size - position, "cut off within the summary", 0))
+        return self._data_end
+
+    def _small(self, opcode: int, position: int, body: bytes) -> Event | None:
+        if opcode == op.MESSAGE:
+            if len(body) < op.MESSAGE_FIXED:
+                raise BadRecordError("a message is shorter than its fields")
+            return Block(position, op.RECORD.pack(opcode, len(body)) + body, False)
+        if opcode == op.METADATA:
+            return parse_metadata(body)
+        if opcode == op.HEADER:
+            cursor = Cursor(body)
+            self.profile, self.library = cursor.string(), cursor.string()
+            return None
+        self._define(opcode, body)
+        return None
+
+    def _define(self, opcode: int, body: bytes) -> None:
+        """Take up a schema or a channel."""
+        if opcode == op.SCHEMA:
+            schema = parse_schema(body)
+            self.schemas[schema.number] = schema
+        else:
+            channel = parse_channel(body)
+            self.channels[channel.number] = channel
+
+    def _chunk(self, position: int, length: int) -> tuple[int, Event | None]:
+        head = self._chunk_head(position)
+        if head is None:
+            raise BadRecordError("a chunk whose sizes do not agree")
+        after = position + 9 + length
+        place = position + 9 + CHUNK_FIXED + len(head.compression)
+        if after > self._data_end:
+            if self._find_chunk(position + 1) is not None:
+                raise BadRecordError("a chunk that is longer than the file")
+            rest = self.read_at(place, self._data_end - place)
+            self._damaged(
+                Damage(
+                    position,
+                    self._data_end - position,
+                    "cut off within a chunk",
+                    None,
+                    head.start_ns,
+                    head.end_ns,
+                )
+            )
+            return self._data_end, Block(position, unpack_start(rest, head), False)
+        if head.size > MAX_CHUNK or length > MAX_CHUNK:
+            self._lose_chunk(position, after, head, f"a chunk of {head.size} bytes")
+            return after, None
+        try:
+            data = unpack(self.read_at(place, head.data_length), head)
+        except BadRecordError as error:
+            self._lose_chunk(position, after, head, str(error))
+            return after, None
+        return after, Block(position, data, head.crc != 0)
+
+    def _lose_chunk(self, position: int, after: int, head: ChunkHead, reason: str) -> None:
+        """Note a chunk that is lost; the indexes behind it will say how many messages it had."""
+        self._lost_chunk = Damage(position, after - position, reason, 0, head.start_ns, head.end_ns)
+
+    def _settle_lost_chunk(self) -> None:
+        lost, self._lost_chunk = self._lost_chunk, None
+        if lost is not None:
+            known = lost.messages or None  # no index followed: nobody knows
+            self._damaged(
+                Damage(lost.offset, lost.length, lost.reason, known, lost.first_ns, lost.last_ns)
+            )
+
+    def _message_index(self, length: int) -> None:
+        if length < 6 or (length - 6) % 16:
+            raise BadRecordError("a message index of impossible length")
+        lost = self._lost_chunk
+        if lost is not None:
+            entries = (lost.messages or 0) + (length - 6) // 16
+            self._lost_chunk = Damage(
+                lost.offset, lost.length, lost.reason, entries, lost.first_ns, lost.last_ns
+            )
+
+    def _attachment(self, position: int, length: int) -> AttachmentRecord | None:
+        head = Cursor(self.read_at(position + 9, min(length, MAX_RECORD)))
+        log_ns, create_ns = head.take(ATTACHMENT_HEAD)
+        name, media_type = head.string(), head.string()
+        (size,) = head.take(U64)
+        if head.at + size + 4 != length:
+            raise BadRecordError("an attachment whose sizes do not agree")
+        start = position + 9 + head.at
+        crc, at = 0, position + 9
+        while at < start + size:
+            piece = self.read_at(at, min(WINDOW, start + size - at))
+            crc = zlib.crc32(piece, crc)
+            at += len(piece)
+        (stored,) = U32.unpack(self.read_at(start + size, 4))
+        if stored not in (0, crc):
+            reason = f"the checksum of attachment {name!r} is wrong"
+            self._damaged(Damage(position, length + 9, reason, 0))
+            return None
+        return AttachmentRecord(name, media_type, log_ns, create_ns, start, size)
+
+    def _skip(self, position: int, reason: str) -> int:
+        """Pass over what cannot be read, to the next chunk or the end of the data."""
+        self._settle_lost_chunk()
+        found = self._find_chunk(position + 1)
+        after = self._data_end if found is None else found
+        self._damaged(Damage(position, after - position, reason))
+        return after
+
+    def _damaged(self, damage: Damage) -> None:
+        self.damage_count += 1
+        if len(self.damages) < MAX_DAMAGES:
+            self.damages.append(damage)
+
+    def _chunk_head(self, position: int) -> ChunkHead | None:
+        """Header of a chunk at ``position``, or None when its sizes do not agree."""
+        raw = self.read_at(position, 9 + CHUNK_FIXED + 4)
+        if len(raw) < 9 + CHUNK_FIXED or raw[0] != op.CHUNK:
+            return None
+        (length,) = U64.unpack_from(raw, 1)
+        start, end, size, crc = op.CHUNK_HEAD.unpack_from(raw, 9)
+        (name_length,) = U32.unpack_from(raw, 37)
+        name = raw[41 : 41 + name_length]
+        if name_length > 4 or name not in (b"", b"lz4", b"zstd"):
+            return None
+        if len(raw) < 41 + name_length + 8:
+            return None
+        (data_length,) = U64.unpack_from(raw, 41 + name_length)
+        if data_length + CHUNK_FIXED + name_length != length:
+            return None
+        return ChunkHead(start, end, size, crc, name.decode(), data_length)
+
+    def _find_chunk(self, position: int) -> int | None:
+        """Offset of the first whole, plausible chunk at or after ``position``."""
+        while position < self._data_end:
+            window = self.read_at(position, WINDOW + 16)
+            for match in CHUNK_START.finditer(window):
+                at = position + match.start()
+                head = self._chunk_head(at)
+                if head is not None:
+                    end = at + 9 + CHUNK_FIXED + len(head.compression) + head.data_length
+                    if end <= self._data_end:
+                        return at
+            if self.progress is not None:
+                self.progress(position, self.size)
+            position += WINDOW
+        return None
+
+
+def read_messages(
+    path: Path, topics: Collection[str] | None = None
+) -> Iterator[tuple[ChannelRecord, Message]]:
+    """Messages of a log in the order of the file, whole or cut off; all, or those of ``topics``.
+
+    `LogError` when the file is no log. Damaged stretches are passed over.
+    """
+    with LogReader(path) as reader:
+        for event in reader.events():
+            if not isinstance(event, Block):
+                continue
+            for message in reader.messages(event):
+                channel = reader.channels.get(message.channel)
+                if channel is not None and (topics is None or channel.topic in topics):
+                    yield channel, message
+
+
+def check_readable(path: Path) -> None:
+    """`LogError` unless the records of a log follow one another soundly to its end.
+
+    Chunks are not decompressed: meant to be cheap, before older files are deleted.
+    """
+    with LogReader(path) as reader:
+        reader.check_structure()

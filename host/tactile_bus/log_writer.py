@@ -1,0 +1,313 @@
+"""Chunks into files: opening, splitting, disk trouble. Owns no thread; one thread may use it."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import time
+import uuid
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from importlib.metadata import version
+
+import msgspec
+import zstandard
+
+from tactile_bus.config import Count, Duration, FlushPeriod, Size
+from tactile_bus.gaps import GAP, Gaps
+from tactile_bus.mcap_file import ZSTD_LEVEL, ChunkBuffer, McapFile, SealedChunk, Storage
+from tactile_bus.messages import codec
+from tactile_bus.retention import LogSet, enforce
+from tactile_bus.topics import Topic
+
+log = logging.getLogger(__name__)
+
+RETRY_MAX = 10.0
+"""s: longest pause between attempts to open a file again."""
+
+LATCHED_MAX = 64
+"""Latched messages repeated in each file: one geometry a board, more boards than one host has."""
+
+
+class RecorderSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How logs are cut, kept and bounded. Sizes in bytes, durations in s."""
+
+    split_bytes: Count = 1 << 30
+    split_seconds: Duration = 3600.0
+    min_free_bytes: Size = 1 << 30  # logging stops, loudly, when less is free (faults.md row 30)
+    max_files: Count | None = None  # retention: the oldest go when there are more; None keeps all
+    max_bytes: Count | None = None
+    flush_period: FlushPeriod = 0.5  # what `kill -9` may cost, plus the time of one write
+    chunk_bytes: Count = 1 << 20
+    queue_messages: Count = 16384  # 27 s of one board's six streams at 100 Hz
+    queue_bytes: Count = 64 << 20
+    retry_seconds: Duration = 1.0
+
+
+@dataclass(slots=True, eq=False)
+class Channel:
+    """One stream of a log. ``sequence``: number of the next message."""
+
+    number: int
+    topic: Topic
+    name: str
+    path: str
+    sequence: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One message on its way into a log; stamps in wall-clock ns."""
+
+    channel: Channel
+    sequence: int
+    log_ns: int
+    publish_ns: int
+    data: bytes
+
+
+class LogWriter:
+    """The files of one log.
+
+    When a file cannot be written on, the chunk in hand is kept for the next file, which begins
+    with a gap record; `blocked` says so, and whoever feeds the writer must hold on to the rest.
+    """
+
+    def __init__(
+        self,
+        log_set: LogSet,
+        settings: RecorderSettings,
+        storage: Storage,
+        now_ns: Callable[[], int],
+    ) -> None:
+        self.state = "recording"
+        self.last_error = ""
+        self.errors = 0
+        self.written = 0
+        self.files = 0
+        self.gaps = Gaps()
+        self._set = log_set
+        self._settings = settings
+        self._storage = storage
+        self._now_ns = now_ns
+        self._identity = uuid.uuid4().hex
+        self._bytes = 0
+        self._compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
+        self._chunk = ChunkBuffer()
+        self._pending: SealedChunk | None = None
+        self._latched: dict[int, Item] = {}
+        self._new_latched: dict[int, Item] = {}
+        self._channels: dict[int, Channel] = {}
+        self._extras: dict[tuple[str, str], Callable[[McapFile], None]] = {}
+        self._unwritten: list[tuple[str, str]] = []
+        self._schemas: dict[str, int] = {}
+        self._in_file: set[int] = set()
+        self._file: McapFile | None = None
+        self._opened = 0.0
+        self._retry_at = 0.0
+        self._retry_pause = settings.retry_seconds
+
+    @property
+    def blocked(self) -> bool:
+        """Whether a chunk waits for a file that can be written."""
+        return self._pending is not None
+
+    @property
+    def waiting(self) -> int:
+        """Messages taken in but not yet on the disk."""
+        return self._chunk.messages + (self._pending.messages if self._pending else 0)
+
+    @property
+    def path(self) -> str:
+        """The present file, or the next one where there is none."""
+        return str(self._set.current)
+
+    @property
+    def bytes_written(self) -> int:
+        """Bytes of all files so far, without the summaries of those that were finished."""
+        return self._bytes + (self._file.size if self._file else 0)
+
+    def set_metadata(self, name: str, values: dict[str, str]) -> None:
+        """A table of texts for this and every later file."""
+        self._extras["metadata", name] = lambda file: file.add_metadata(name, values)
+        self._unwritten.append(("metadata", name))
+
+    def attach(self, name: str, media_type: str, data: bytes) -> None:
+        """A file to embed in this and every later file."""
+        now_ns = self._now_ns()
+        self._extras["attachment", name] = lambda file: file.add_attachment(
+            name, media_type, data, now_ns, now_ns
+        )
+        self._unwritten.append(("attachment", name))
+
+    def open_first(self) -> None:
+        """Open the first file; OSError when that fails, FileExistsError when it is there."""
+        self._open()
+
+    def add(self, item: Item) -> None:
+        """Take one message into the chunk to come; flushes when that is full."""
+        channel = item.channel
+        self._channels[channel.number] = channel
+        if channel.topic.latched and len(self._latched) < LATCHED_MAX:
+            self._new_latched[channel.number] = item
+        self._chunk.add(channel.number, item.sequence, item.log_ns, item.publish_ns, item.data)
+        if len(self._chunk.data) >= self._settings.chunk_bytes:
+            self.flush()
+
+    def flush(self, last: bool = False) -> None:
+        """Write all that waits, and make it durable. ``last``: try at once, without a pause."""
+        if self._pending is None and self._chunk.messages:
+            self._pending = self._chunk.seal(self._compressor)
+            self._chunk = ChunkBuffer()
+        try:
+            if self._ready(last):
+                self._write_waiting()
+        except OSError as error:
+            self._fail(error)
+
+    def finish(self) -> None:
+        """Flush and finish the file; ``state`` is closed unless something stayed unwritten."""
+        self.flush(last=True)
+        try:
+            self._end_file()
+        except OSError as error:
+            self._fail(error)
+        if not self.waiting and self.state == "recording":
+            self.state = "closed"
+
+    def _ready(self, last: bool) -> bool:
+        """Whether there is a file with room for what waits; ends and opens files."""
+        now = time.monotonic()
+        if self._file is None and now < self._retry_at and not last:
+            return False
+        if self._storage.free(self._set.directory) < self._settings.min_free_bytes:
+            self._stop_for_space()
+            return False
+        size = len(self._pending.data) if self._pending else 0
+        file = self._file
+        if file is not None and (
+            now - self._opened >= self._settings.split_seconds
+            or (file.messages and file.size + size > self._settings.split_bytes)
+        ):
+            self._end_file()
+            self._set.advance()
+        if self._file is None and (self._pending is not None or self.gaps):
+            self._open_next()
+        return self._file is not None
+
+    def _open_next(self) -> None:
+        while True:
+            try:
+                self._open()
+                break
+            except FileExistsError:
+                self._set.advance()
+        if self.state != "recording":
+            log.warning("log: writing again, to %s", self.path)
+        self.state = "recording"
+        self._retry_pause = self._settings.retry_seconds
+        self._repeat_latched()
+        enforce(self._set, self._settings.max_files, self._settings.max_bytes)
+
+    def _open(self) -> None:
+        """Open the current file of the set and write what every file starts with."""
+        file = McapFile(
+            self._set.current, self._storage, f"tactile-reach {version('tactile-reach')}"
+        )
+        try:
+            place = {
+                "set": self._identity,
+                "file": str(self.files),
+                "started_ns": str(self._now_ns()),
+            }
+            file.add_metadata("file", place)
+            for write in self._extras.values():
+                write(file)
+            self._in_file = set()
+            self._register(file, self._channels)
+            file.sync()
+        except OSError:
+            file.abandon()
+            raise
+        self._unwritten.clear()
+        self._file = file
+        self._opened = time.monotonic()
+        self.files += 1
+
+    def _write_waiting(self) -> None:
+        file = self._file
+        if file is None:
+            return
+        while self._unwritten:
+            self._extras[self._unwritten[0]](file)
+            del self._unwritten[0]
+        for reason in self.gaps:
+            file.add_metadata(GAP, self.gaps[reason].metadata(reason))
+            del self.gaps[reason]
+        if self._pending is not None:
+            self._register(file, self._pending.counts)
+            file.add_chunk(self._pending)
+            self.written += self._pending.messages
+            self._pending = None
+            self._latched |= self._new_latched
+            self._new_latched = {}
+        file.sync()
+
+    def _register(self, file: McapFile, numbers: Iterable[int]) -> None:
+        """Write the schemas and channels that this file does not have yet."""
+        for number in numbers:
+            if number in self._in_file:
+                continue
+            channel = self._channels[number]
+            schema = codec().schema(channel.topic)
+            identity = self._schemas.setdefault(schema.name, len(self._schemas) + 1)
+            types = {self._channels[other].topic.msgtype for other in self._in_file}
+            if schema.name not in types:
+                file.add_schema(identity, schema.name, schema.encoding, schema.data)
+            # Both keys are those rosbag2 writes.
+            metadata = {"offered_qos_profiles": "", "topic_type_hash": schema.type_hash}
+            file.add_channel(number, identity, channel.path, "cdr", metadata)
+            self._in_file.add(number)
+
+    def _repeat_latched(self) -> None:
+        """Give a new file the values that hold: with their old numbers, so no gap is seen."""
+        if self._file is None or self._pending is None or not self._latched:
+            return
+        chunk = ChunkBuffer()
+        for number, item in self._latched.items():
+            chunk.add(number, item.sequence, self._pending.start_ns, item.publish_ns, item.data)
+        self._file.add_chunk(chunk.seal(self._compressor))
+
+    def _end_file(self) -> None:
+        file, self._file = self._file, None
+        if file is not None:
+            self._bytes += file.size
+            file.finish()
+
+    def _fail(self, error: OSError) -> None:
+        """Leave the file that cannot be written on, and try another one later."""
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        remedy = "make room" if full else "check the disk; trying another file"
+        self._leave("disk_full" if full else "io_error", f"{self.path}: {error.strerror}", remedy)
+
+    def _stop_for_space(self) -> None:
+        """Close the file while there is still room to close it in order."""
+        free = self._storage.free(self._set.directory) / 1e9
+        kept = self._settings.min_free_bytes / 1e9
+        text = f"{free:.2f} GB free in {self._set.directory}, logs stop at {kept:.2f}"
+        self._leave("low_space", text, "make room")
+
+    def _leave(self, reason: str, text: str, remedy: str) -> None:
+        if self.state != reason:
+            log.error("log: %s; %s", text, remedy)
+        self.state, self.last_error = reason, text
+        self.errors += 1
+        self.gaps.note(reason, text, self._now_ns())
+        try:
+            if self._file is not None:
+                self._end_file()
+        except OSError as error:
+            log.error("log: %s is left without a summary: %s", self.path, error.strerror)
+        self._set.advance()
+        self._retry_at = time.monotonic() + self._retry_pause
+        self._retry_pause = min(self._retry_pause * 2, RETRY_MAX)

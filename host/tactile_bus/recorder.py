@@ -1,0 +1,250 @@
+"""The log: MCAP files written by a thread of their own, from a bounded queue.
+
+Nothing is lost without a trace. Every message gets its channel's next sequence number when it is
+handed over, so a number that is missing in the log is a message that was dropped there; and the
+next flush writes a metadata record called ``gap`` that says why, how many of each channel, and
+the times of the first and last. The sum of ``messages`` over all gap records is the number of
+dropped messages. A file that could not be written on has its gap record in the file after it.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+from tactile_bus.gaps import Gaps
+from tactile_bus.instant import WallClock, monotonic_now
+from tactile_bus.log_writer import Channel, Item, LogWriter, RecorderSettings
+from tactile_bus.mcap_file import DiskStorage, Storage
+from tactile_bus.messages import MAX_PAYLOAD
+from tactile_bus.retention import LogSet
+from tactile_bus.topics import Topic
+
+__all__ = ["Recorder", "RecorderError", "RecorderSettings", "RecorderStats"]
+
+log = logging.getLogger(__name__)
+
+BATCH = 64
+"""Messages the writer takes at once, about 0.1 ms: then other threads may run."""
+
+POLL = 0.02
+"""s between looks at the queue: waking the writer for every message would cost both threads."""
+
+
+class RecorderError(Exception):
+    """The log cannot be started as asked; the message names the remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderStats:
+    """State of a log. ``state``: recording, disk_full, io_error, low_space, failed or closed.
+
+    ``written``: messages on the disk. ``dropped``: messages lost, by reason; their sum is that of
+    the log's gap records once it is closed. ``waiting``: messages not yet on the disk.
+    """
+
+    state: str
+    path: str
+    files: int
+    written: int
+    dropped: dict[str, int]
+    waiting: int
+    bytes_written: int
+    errors: int
+    last_error: str
+
+
+class Recorder:
+    """Writes messages to a set of MCAP files. `write`, `attach` and `metadata` never block.
+
+    ``destination``: a ``.mcap`` file, which must not exist, or a directory, made when missing, for
+    files called ``<prefix>_<UTC time>_<number>.mcap``. `RecorderError` when it cannot be written.
+    """
+
+    def __init__(
+        self,
+        destination: Path | str,
+        settings: RecorderSettings | None = None,
+        *,
+        prefix: str = "tactile",
+        clock: WallClock | None = None,
+        storage: Storage | None = None,
+    ) -> None:
+        self._settings = settings or RecorderSettings()
+        self._clock = clock or WallClock.take()
+        self._lock = threading.Lock()
+        self._wake = threading.Event()
+        self._queue: deque[Item] = deque()
+        self._queued_bytes = 0
+        self._closing = False
+        self._channels: dict[tuple[str, str], Channel] = {}
+        self._gaps = Gaps()
+        self._dropped: dict[str, int] = {}
+        self._extras: list[Callable[[], None]] = []
+        self._failed = ""
+        log_set = LogSet.at(Path(destination), prefix, self._now_ns())
+        self._writer = LogWriter(log_set, self._settings, storage or DiskStorage(), self._now_ns)
+        self._open(log_set, storage or DiskStorage())
+        self._thread = threading.Thread(target=self._run, name="log-writer", daemon=True)
+        self._thread.start()
+
+    @property
+    def stats(self) -> RecorderStats:
+        """Snapshot of the counters."""
+        writer = self._writer
+        with self._lock:
+            return RecorderStats(
+                state="failed" if self._failed else writer.state,
+                path=writer.path,
+                files=writer.files,
+                written=writer.written,
+                dropped=dict(self._dropped),
+                waiting=len(self._queue) + writer.waiting,
+                bytes_written=writer.bytes_written,
+                errors=writer.errors,
+                last_error=self._failed or writer.last_error,
+            )
+
+    def write(self, topic: Topic, name: str, data: bytes, log_ns: int, publish_ns: int) -> None:
+        """Hand over CDR bytes of ``topic``; stamps in wall-clock ns. Drops the oldest when full.
+
+        ValueError above MAX_PAYLOAD bytes or for a name that is none.
+        """
+        if len(data) > MAX_PAYLOAD:
+            raise ValueError(f"{len(data)} bytes for {topic.key(name)}: {MAX_PAYLOAD} allowed")
+        key = (topic.template, name)
+        with self._lock:
+            channel = self._channels.get(key)
+            if channel is None:
+                channel = Channel(len(self._channels) + 1, topic, name, topic.channel(name))
+                self._channels[key] = channel
+            item = Item(channel, channel.sequence, log_ns, publish_ns, data)
+            channel.sequence = (channel.sequence + 1) & 0xFFFFFFFF
+            if self._closing or self._failed:
+                self._drop(item, "closed" if self._closing else "failed")
+                return
+            self._queue.append(item)
+            self._queued_bytes += len(data)
+            while (
+                len(self._queue) > self._settings.queue_messages
+                or self._queued_bytes > self._settings.queue_bytes
+            ):
+                oldest = self._queue.popleft()
+                self._queued_bytes -= len(oldest.data)
+                state = self._writer.state
+                self._drop(oldest, "queue_full" if state == "recording" else state)
+
+    def attach(self, name: str, media_type: str, data: bytes) -> None:
+        """Embed a file (calibration, configuration) in this and every later file of the log."""
+        with self._lock:
+            self._extras.append(lambda: self._writer.attach(name, media_type, data))
+
+    def metadata(self, name: str, values: dict[str, str]) -> None:
+        """Write a table of texts to this and every later file of the log."""
+        table = dict(values)
+        with self._lock:
+            self._extras.append(lambda: self._writer.set_metadata(name, table))
+
+    def close(self, timeout: float = 1.0) -> bool:
+        """Write what is queued and finish the file; False when that takes over ``timeout`` s.
+
+        Then, or when the disk refuses, the file may miss its summary: ``tactile log recover``
+        makes it whole.
+        """
+        with self._lock:
+            self._closing = True
+        self._wake.set()
+        self._thread.join(timeout)
+        if self._thread.is_alive():
+            log.error("log %s: still writing after %g s, not closed", self._writer.path, timeout)
+        return not self._thread.is_alive() and self._writer.state == "closed"
+
+    def _now_ns(self) -> int:
+        return self._clock.wall_ns(monotonic_now())
+
+    def _open(self, log_set: LogSet, storage: Storage) -> None:
+        """Open the first file in the caller's thread, so that its errors reach the user."""
+        software = {
+            "name": "tactile-reach",
+            "version": version("tactile-reach"),
+            "clock_offset_ns": str(self._clock.offset_ns),
+        }
+        self._writer.set_metadata("software", software)
+        directory = log_set.directory
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            free, least = storage.free(directory), self._settings.min_free_bytes
+            if free < least:
+                raise RecorderError(
+                    f"{free / 1e9:.2f} GB free in {directory}, logs stop at {least / 1e9:.2f}: "
+                    "make room, name another directory, or lower min_free_bytes"
+                )
+            self._writer.open_first()
+        except FileExistsError as error:
+            raise RecorderError(
+                f"{self._writer.path} exists and is not overwritten: move it or name another file"
+            ) from error
+        except OSError as error:
+            raise RecorderError(
+                f"cannot write a log to {directory}: {error.strerror}; name a directory that this "
+                "user may write to"
+            ) from error
+
+    def _drop(self, item: Item, reason: str) -> None:
+        """Count a lost message (the lock is held)."""
+        self._dropped[reason] = self._dropped.get(reason, 0) + 1
+        self._gaps.count(reason, item.channel.path, item.log_ns)
+
+    # What follows runs in the writer's thread.
+
+    def _run(self) -> None:
+        period = self._settings.flush_period
+        next_flush = time.monotonic() + period - POLL
+        try:
+            while not self._closing:
+                self._wake.wait(POLL)
+                self._take()
+                if time.monotonic() >= next_flush:
+                    self._writer.flush()
+                    next_flush = time.monotonic() + period - POLL
+            self._take()
+            self._writer.finish()
+        except Exception as error:  # thread boundary: a dead writer must be seen, not guessed
+            log.exception("log writer failed; nothing more is logged")
+            with self._lock:
+                self._failed = f"{type(error).__name__}: {error}"
+        self._count_unwritten()
+
+    def _take(self) -> None:
+        """Move what is queued into the writer, in batches so that other threads can run."""
+        with self._lock:
+            extras, self._extras = self._extras, []
+            gaps, self._gaps = self._gaps, Gaps()
+        for hand_over in extras:
+            hand_over()
+        self._writer.gaps.merge(gaps)
+        while not self._writer.blocked:
+            with self._lock:
+                batch = [self._queue.popleft() for _ in range(min(BATCH, len(self._queue)))]
+                self._queued_bytes -= sum(len(item.data) for item in batch)
+            if not batch:
+                return
+            for item in batch:
+                self._writer.add(item)
+            time.sleep(0)
+
+    def _count_unwritten(self) -> None:
+        """At the end: what is still in hand is lost."""
+        with self._lock:
+            reason = "failed" if self._failed else self._writer.state
+            lost = len(self._queue) + self._writer.waiting
+            self._queue.clear()
+            if lost:
+                self._dropped[reason] = self._dropped.get(reason, 0) + lost
+                log.error("log: %d messages could not be written before the end", lost)
