@@ -6,7 +6,8 @@ from collections import deque
 
 import numpy as np
 
-from sensor_proto.anyskin import MAX_MAGNETOMETERS, encode_anyskin
+from sensor_proto.anyskin import encode_anyskin
+from sensor_proto.anyskin_search import MAX_MAGNETOMETERS
 from sensor_proto.packets import FloatSamples, TaxelStatus
 from sim_device.chips import Reading, temperature_of_raw
 from sim_device.environment import Environment

@@ -126,14 +126,12 @@ class Magnetometers:
         """
         noisy = field_ut + self._noise * rng.standard_normal(field_ut.shape)
         limit = self.parameters.saturation_ut
-        saturated = np.abs(noisy) >= limit
-        if saturated.any():
-            noisy = np.clip(noisy, -limit, limit)
-        wide = np.rint(noisy / self._lsb).astype(np.int64)
-        counts = wide.astype(np.int16)
-        saturated |= (counts == COUNT_MAX) | (counts == -COUNT_MAX - 1)
-        status = np.where(saturated.any(axis=1), TaxelStatus.SATURATED, TaxelStatus.OK)
+        beyond = np.abs(noisy) >= limit
+        np.clip(noisy, -limit, limit, out=noisy)
+        noisy /= self._lsb
+        counts = np.rint(noisy).astype(np.int64).astype(np.int16)
+        beyond |= (counts == COUNT_MAX) | (counts == -COUNT_MAX - 1)
+        status = np.zeros(len(counts), np.uint8)
+        status[beyond.any(axis=1)] = TaxelStatus.SATURATED
         raw = np.rint((temperature_c - 25.0 + self._thermometer) * THERMOMETER_LSB_PER_K)
-        return Reading(
-            counts, status.astype(np.uint8), temperature_of_raw(raw + THERMOMETER_RAW_25)
-        )
+        return Reading(counts, status, temperature_of_raw(raw + THERMOMETER_RAW_25))
