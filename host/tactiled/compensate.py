@@ -20,7 +20,7 @@ Bool = NDArray[np.bool_]
 class Estimate:
     """What a method takes for the ambient field in one cycle.
 
-    ``theta``: (A, 3, 3), coefficients over `Layout.design` of each component in ``ee``, µT.
+    ``theta``: (A, 3, 3) µT, [a, component in ``ee``, coefficient over `Layout.design`].
     ``ambient``: the same for the outside. ``borrowed``: (A,) bool, where the array's own fit has
     no support and the field was carried on by what the board's other arrays see.
     """
@@ -36,7 +36,7 @@ class Compensator(Protocol):
     def update(self, field_ee: Float, forces: Float, healthy: Bool, captured: Instant) -> Estimate:
         """Estimate for one cycle.
 
-        ``field_ee``: (A, n, 3) µT. ``forces``: (A, n, 3) N, ambient included. ``healthy``:
+        ``field_ee``: (A, 3, n) µT. ``forces``: (A, 3, n) N, ambient included. ``healthy``:
         (A, n), False in the padding; what unhealthy taxels hold is finite and means nothing.
         """
 
@@ -79,13 +79,6 @@ class Off:
 
 def outside_plane(theta: Float, layout: Layout) -> Float:
     """(A, 3, 3) of `Ambient.plane` ([a, component, value or slope per m]) from ``theta``."""
-    plane = theta.swapaxes(1, 2).copy()
+    plane = theta.copy()
     plane[:, :, 1:] /= layout.scale[:, None, None]
     return plane
-
-
-def inside_plane(plane: Float, layout: Layout) -> Float:
-    """``theta`` from `Ambient.plane`: the inverse of `outside_plane`."""
-    theta = plane.swapaxes(1, 2).copy()
-    theta[:, 1:, :] *= layout.scale[:, None, None]
-    return theta

@@ -4,12 +4,14 @@ A contact disturbs a taxel in all three components, the ambient field is a plane
 skin, nearly the same constant on every array when seen in ``ee`` axes. So: designed subsets
 propose planes, all taxels vote on them by their joint three-component distance, the winner (or
 the constant that the whole board agrees on, where that explains an array better) is refined by
-reweighted least squares, the last steps on fields from which the neighbours' contacts were taken.
+reweighted least squares, the last time on fields from which the neighbours' contacts were taken.
 Linear in the field wherever the choice of taxels is the same: an added plane comes out exactly.
+Shapes as in `Layout`.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,10 +25,10 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 INLIER_SIGMAS = 4.0
-"""A taxel supports a fit within this many sigma, all components together: noise leaves 0.1 % out."""
+"""A taxel supports a fit within this many sigma, components together: noise leaves 0.1 % out."""
 FIRST_REACH = 6.0
 LAST_REACH = 5.0
-"""Sigma at which Tukey's weight falls to zero, in the first and the later refinements: wide while
+"""Sigma at which Tukey's weight falls to zero, in the first and the last refinement: wide while
 the proposal still carries the noise of its few taxels, then just beyond the inliers."""
 MODEL_ERROR_UT = 1.5
 """µT rms by which chips differ in a uniform field: 3 % sensitivity in 50 µT."""
@@ -57,8 +59,9 @@ SLOPE_UT_PER_M = 100.0
 class Fit:
     """One fit of all arrays.
 
-    ``theta``: (A, 3, 3) over `Layout.design`. ``support``, ``residual_ut``, ``valid``: (A,) as in
-    `Ambient`. ``common``: (3,) µT in ``ee`` that the arrays with a valid fit share; NaN when none.
+    ``theta``: (A, 3, 3) µT, [a, component in ``ee``, coefficient]. ``support``, ``residual_ut``,
+    ``valid``: (A,) as in `Ambient`. ``common``: (3,) µT in ``ee`` that the arrays with a valid fit
+    share; NaN when there is none.
     """
 
     theta: Float
@@ -75,24 +78,28 @@ class Consensus:
         self._layout, self._model = layout, model
         arrays, n = layout.arrays, layout.width
         self._design = layout.design
-        self._transposed = np.ascontiguousarray(layout.design.swapaxes(1, 2))
-        x = layout.design
-        self._products = (x[:, :, :, None] * x[:, :, None, :]).reshape(arrays, n, 9)
-        sets = [design_candidates(x[a, : layout.counts[a]]) for a in range(arrays)]
-        self._count = max(len(operators) for operators, _ in sets)
-        propose = np.zeros((arrays, n, self._count, 3))
-        self._uses = np.zeros((arrays, self._count, n))
+        taxels_first = np.ascontiguousarray(layout.design.swapaxes(1, 2))
+        self._taxels_first = taxels_first
+        self._products = (taxels_first[..., None] * taxels_first[:, :, None]).reshape(arrays, n, 9)
+        sets = [design_candidates(taxels_first[a, : layout.counts[a]]) for a in range(arrays)]
+        self._count = count = max(len(operators) for operators, _ in sets)
+        operators_of = np.zeros((arrays, count, 3, n))
+        self._uses = np.zeros((arrays, count, n))
         for a, (operators, uses) in enumerate(sets):
-            # arrays with fewer subsets repeat theirs
-            k = np.arange(self._count) % len(operators)
-            propose[a, : layout.counts[a]] = operators[k].transpose(2, 0, 1)
+            k = np.arange(count) % len(operators)  # arrays with fewer subsets repeat theirs
+            operators_of[a, :, :, : layout.counts[a]] = operators[k]
             self._uses[a, :, : layout.counts[a]] = uses[k]
-        self._propose = propose.reshape(arrays, n, 3 * self._count)
+        # the vote only ranks proposals: single precision halves its time
+        propose = operators_of.transpose(0, 3, 2, 1).reshape(arrays, n, 3 * count)
+        self._propose = np.ascontiguousarray(propose, np.float32)
+        self._places = taxels_first.astype(np.float32)
         self._rows = np.arange(arrays)
         few = layout.counts < PLANE_TAXELS
         self._stiff = np.zeros((arrays, 3, 3))
+        # the constant's 1e-9 keeps an array without any weight invertible; `_judge` refuses it
+        self._stiff[:, 0, 0] = 1e-9
         self._stiff[:, 1, 1] = self._stiff[:, 2, 2] = np.where(few, 1e9, 1e-9) * layout.counts
-        self._plane = ~few
+        self._few = few
         self._shrink = 1.0 / (layout.scale * SLOPE_UT_PER_M) ** 2
         self._variance = 1.0
         self.set_noise(np.array([4.4, 4.4, 6.7]))
@@ -100,136 +107,142 @@ class Consensus:
     def set_noise(self, noise_ut: Float) -> None:
         """Noise of one sample, (3,) µT rms in chip axes."""
         self._variance = float((noise_ut**2).mean()) + MODEL_ERROR_UT**2
+        self._gate = INLIER_SIGMAS**2 * self._variance
+        # mean of a taxel's squared distance when a quarter of them are at the gate
+        self._doubtful = (0.25 * self._gate + 0.75 * 3.3 * self._variance) * self._layout.counts
 
     def fit(self, field_ee: Float, forces: Float, healthy: Bool) -> Fit:
         """Fit of one cycle; see `Compensator.update` for the arguments."""
         weight = healthy.astype(np.float64)
-        theta, score = self._vote(field_ee, weight, healthy)
-        if len(theta) > 1:
-            theta = self._prefer_common(theta, score, field_ee, weight)
-        reach = FIRST_REACH**2 * self._variance
-        theta = self._refine(theta, field_ee, weight, reach)
-        target = field_ee
-        reach = LAST_REACH**2 * self._variance
-        if self._model.coupled:
-            undone = self._model.decoupled_in_ee(field_ee, forces)
-            target = undone - self._model.plane_leak(theta)
-            theta = self._refine(theta, target, weight, reach)
-            target = undone - self._model.plane_leak(theta)
-        else:
-            theta = self._refine(theta, target, weight, reach)
-        theta = self._refine(theta, target, weight, reach, shrink=True)
+        theta, score = self._vote(field_ee, healthy)
+        if len(theta) > 1 and (score > self._doubtful).any():
+            self._prefer_common(theta, score, field_ee, weight)
+        theta = self._refine(theta, field_ee, weight, FIRST_REACH**2 * self._variance)
+        target = self._target(theta, field_ee, forces)
+        theta = self._refine(theta, target, weight, LAST_REACH**2 * self._variance, shrink=True)
         return self._judge(theta, target, healthy)
 
     def check(self, theta: Float, field_ee: Float, forces: Float, healthy: Bool) -> Fit:
-        """How the present cycle supports the earlier fit ``theta``."""
-        target = field_ee
-        if self._model.coupled:
-            undone = self._model.decoupled_in_ee(field_ee, forces)
-            target = undone - self._model.plane_leak(theta)
+        """How far the present cycle bears out the earlier fit ``theta``."""
+        target = self._target(theta, field_ee, forces)
         return self._judge(theta, target, healthy)
 
-    def _vote(self, field: Float, weight: Float, healthy: Bool) -> tuple[Float, Float]:
+    def _target(self, theta: Float, field_ee: Float, forces: Float) -> Float:
+        """Fields without neighbours' contacts, given about where the ambient field is."""
+        if not self._model.decouples:
+            return field_ee
+        target = self._model.decoupled_in_ee(field_ee, forces)
+        target -= self._model.plane_leak(theta)
+        return target
+
+    def _vote(self, field: Float, healthy: Bool) -> tuple[Float, Float]:
         """Best proposal of each array, (A, 3, 3), and its score, (A,) µT²."""
-        arrays, n, _ = field.shape
-        by_component = field.swapaxes(1, 2)
-        proposed = (by_component @ self._propose).reshape(arrays, 3 * self._count, 3)
-        away = (proposed @ self._transposed).reshape(arrays, 3, self._count, n)
-        away -= by_component[:, :, None, :]
+        # component first, so that every step below runs over contiguous numbers
+        single = field.swapaxes(0, 1).astype(np.float32, order="C")
+        proposed = single[:, :, None] @ self._propose
+        proposed = proposed.reshape(3, len(field), 3, self._count)
+        away = self._places @ proposed
+        away -= single[..., None]
         np.square(away, out=away)
-        squared = away[:, 0]
-        squared += away[:, 1]
-        squared += away[:, 2]
-        np.minimum(squared, INLIER_SIGMAS**2 * self._variance, out=squared)
-        score = (squared @ weight[:, :, None])[..., 0]
-        sick = (1.0 - weight) * self._layout.real
-        if sick.any():
+        squared = away[0]
+        squared += away[1]
+        squared += away[2]
+        np.minimum(squared, np.float32(self._gate), out=squared)
+        score = (healthy.astype(np.float32)[:, None, :] @ squared)[:, 0]
+        if not np.array_equal(healthy, self._layout.real):
+            sick = self._layout.real & ~healthy
             score += 1e12 * (self._uses @ sick[:, :, None])[..., 0]
         best = score.argmin(axis=1)
-        chosen = proposed.reshape(arrays, 3, self._count, 3)[self._rows, :, best]
-        return chosen.swapaxes(1, 2), score[self._rows, best]
+        theta = proposed[:, self._rows, :, best].astype(np.float64)
+        return theta, score[self._rows, best]
 
-    def _prefer_common(self, theta: Float, score: Float, field: Float, weight: Float) -> Float:
-        """Start from the board's constant on arrays that it explains about as well."""
-        middle = theta[:, 0, :]
-        away = field[None] - middle[:, None, None, :]
-        squared = np.einsum("kanc,kanc->kan", away, away)
-        gate = INLIER_SIGMAS**2 * self._variance + BOARD_REACH_UT**2
+    def _prefer_common(self, theta: Float, score: Float, field: Float, weight: Float) -> None:
+        """Put the board's constant into ``theta`` for arrays that it explains about as well."""
+        flat = field.swapaxes(0, 1).reshape(3, -1)
+        flat_weight = weight.reshape(-1)
+        gate = self._gate + BOARD_REACH_UT**2
+        proposals = theta[:, :, 0]
+        squared = np.square(flat - proposals[:, :, None]).sum(axis=1)
         np.minimum(squared, gate, out=squared)
-        common = middle[int(np.tensordot(squared, weight, 2).argmin())]
-        for _ in range(2):
-            away = field - common
-            inside = np.maximum(0.0, 1.0 - np.einsum("anc,anc->an", away, away) / gate)
-            inside *= weight
-            total = inside.sum()
-            if total > 0:
-                common = np.einsum("an,anc->c", inside, field) / total
-        away = field - common
-        squared = np.minimum(
-            np.einsum("anc,anc->an", away, away), INLIER_SIGMAS**2 * self._variance
-        )
-        better = (squared * weight).sum(axis=1) * BOARD_BONUS <= score
-        if better.any():
-            theta = theta.copy()
-            theta[better] = 0.0
-            theta[better, 0] = common
-        return theta
+        common = proposals[(squared @ flat_weight).argmin()]
+        inside = 1.0 - np.square(flat - common[:, None]).sum(axis=0) / gate
+        np.maximum(inside, 0.0, out=inside)
+        inside *= flat_weight
+        total = inside.sum()
+        if total > 0:
+            common = flat @ inside / total
+        squared_now = np.square(flat - common[:, None]).sum(axis=0)
+        np.minimum(squared_now, self._gate, out=squared_now)
+        explained = (squared_now * flat_weight).reshape(weight.shape).sum(axis=1)
+        for a in np.flatnonzero(explained * BOARD_BONUS <= score).tolist():
+            theta[a] = 0.0
+            theta[a, :, 0] = common
 
     def _refine(
         self, theta: Float, target: Float, weight: Float, reach: float, shrink: bool = False
     ) -> Float:
         """One step of reweighted least squares with Tukey's weights."""
-        away = target - self._design @ theta
-        inside = np.einsum("anc,anc->an", away, away)
+        away = target - theta @ self._design
+        inside = np.einsum("acn,acn->an", away, away)
         inside *= -1.0 / reach
         inside += 1.0
         np.maximum(inside, 0.0, out=inside)
         inside *= inside
         inside *= weight
-        normal = (inside[:, None, :] @ self._products).reshape(-1, 3, 3) + self._stiff
-        normal[:, 0, 0] += 1e-9  # no taxel inside: zero, and `_judge` refuses it
-        right = (self._transposed * inside[:, None, :]) @ target
+        normal = (inside[:, None, :] @ self._products).reshape(-1, 3, 3)
+        normal += self._stiff
+        right = (target * inside[:, None, :]) @ self._taxels_first
         inverse = np.linalg.inv(normal)
         if shrink:
-            leverage = np.einsum("ank,ank->an", self._design @ inverse, self._design).max(axis=1)
-            over = np.minimum(leverage - MAX_LEVERAGE, 1.0)
-            over[~self._plane] = 0.0
-            if (over > 0).any():
-                ridge = np.maximum(over, 0.0) * self._variance * self._shrink
+            leverage = np.einsum("akn,akn->an", inverse @ self._design, self._design).max(axis=1)
+            over = leverage - MAX_LEVERAGE
+            over[self._few] = 0.0
+            if over.max() > 0:
+                ridge = np.minimum(np.maximum(over, 0.0), 1.0) * self._variance * self._shrink
                 normal[:, 1, 1] += ridge
                 normal[:, 2, 2] += ridge
                 inverse = np.linalg.inv(normal)
-        refined: Float = inverse @ right
+        refined: Float = right @ inverse  # symmetric: each row is the solution of one component
         return refined
 
     def _judge(self, theta: Float, target: Float, healthy: Bool) -> Fit:
         """Whether the taxels bear out a fit."""
-        away = target - self._design @ theta
-        squared = np.einsum("anc,anc->an", away, away)
-        agree = (squared <= INLIER_SIGMAS**2 * self._variance) & healthy
-        inliers = agree.sum(axis=1)
-        support = inliers / np.maximum(healthy.sum(axis=1), 1)
-        residual = np.sqrt((squared * agree).sum(axis=1) / (3.0 * np.maximum(inliers, 1)))
-        valid = (
-            (support >= MIN_SUPPORT)
-            & (inliers >= MIN_INLIERS)
-            & (residual <= MAX_RESIDUAL_RATIO * self._variance**0.5)
+        away = target - theta @ self._design
+        squared = np.einsum("acn,acn->an", away, away)
+        agree = squared <= self._gate
+        agree &= healthy
+        squared *= agree
+        # there are few arrays: plain numbers are faster from here on
+        inliers = agree.sum(axis=1).tolist()
+        sums, sound = squared.sum(axis=1).tolist(), healthy.sum(axis=1).tolist()
+        middle = theta[:, :, 0].tolist()
+        limit = 3.0 * MAX_RESIDUAL_RATIO**2 * self._variance
+        support = [k / h if h else 0.0 for k, h in zip(inliers, sound, strict=True)]
+        valid = [
+            s >= MIN_SUPPORT and k >= MIN_INLIERS and q <= limit * k
+            for s, k, q in zip(support, inliers, sums, strict=True)
+        ]
+        common = _shared(middle, inliers, valid)
+        if len(valid) > 1 and common is not None:
+            for a, centre in enumerate(middle):
+                if support[a] < IMPOSTOR_SUPPORT and math.dist(centre, common) > IMPOSTOR_UT:
+                    valid[a] = False
+            common = _shared(middle, inliers, valid)
+        return Fit(
+            theta,
+            np.array(support),
+            np.array(
+                [math.sqrt(q / (3 * k)) if k else 0.0 for q, k in zip(sums, inliers, strict=True)]
+            ),
+            np.array(valid),
+            np.array(common or (math.nan,) * 3),
         )
-        middle = theta[:, 0, :]
-        common = _shared(middle, inliers * valid)
-        if len(theta) > 1 and valid.any():
-            far = np.linalg.norm(middle - common, axis=1) > IMPOSTOR_UT
-            impostor = far & (support < IMPOSTOR_SUPPORT)
-            if (impostor & valid).any():
-                valid &= ~impostor
-                common = _shared(middle, inliers * valid)
-        return Fit(theta, support, residual, valid, common)
 
 
-def _shared(middle: Float, inliers: NDArray[np.int_]) -> Float:
-    """(3,) mean of the arrays' constants, weighted by their supporting taxels; NaN without any."""
-    total = inliers.sum()
+def _shared(middle: list[list[float]], inliers: list[int], valid: list[bool]) -> list[float] | None:
+    """Mean of the valid arrays' constants, weighted by their supporting taxels; None without."""
+    weights = [k if ok else 0 for k, ok in zip(inliers, valid, strict=True)]
+    total = sum(weights)
     if not total:
-        return np.full(3, np.nan)
-    mean: Float = inliers @ middle / total
-    return mean
+        return None
+    return [sum(w * m[c] for w, m in zip(weights, middle, strict=True)) / total for c in range(3)]

@@ -35,13 +35,17 @@ class FeatureExtractor:
 
     def __init__(self, geometry: SkinGeometry, settings: PipelineSettings) -> None:
         self._adjacency = Adjacency(geometry)
-        self._position = np.concatenate([a.position for a in geometry.arrays])
-        self._rotation = np.concatenate([a.rotation for a in geometry.arrays])
+        position = np.concatenate([a.position for a in geometry.arrays])
+        rotation = np.concatenate([a.rotation for a in geometry.arrays])
+        self._position = position.tolist()
+        # (N, 6, 3): a taxel's force in its own axes to force and moment about the origin of ee
+        turned = np.cross(position[:, :, None], rotation, axis=1)
+        self._lever = np.concatenate([rotation, turned], axis=1)
+        self._place = np.concatenate([np.ones((len(position), 1)), position], axis=1)
         self._array = np.concatenate(
             [np.full(a.taxels, i) for i, a in enumerate(geometry.arrays)]
         ).tolist()
         self._side = [a.side for a in geometry.arrays]
-        self._tip = np.concatenate([np.full(a.taxels, a.side is Side.TIP) for a in geometry.arrays])
         self._light = settings.tip_light_n
         self._minimum = settings.contact_minimum_n
         self._sigmas = settings.contact_sigmas
@@ -90,81 +94,73 @@ class FeatureExtractor:
         """
         normal = -force[:, 2]
         above = normal > self._on
-        contact = (
-            (above & self._above)
-            | (normal > self._certain)
-            | (self._contact & (normal > self._off))
-        )
+        contact = above & self._above
+        contact |= normal > self._certain
+        contact |= self._contact & (normal > self._off)
         self._above, self._contact = above, contact
         members = contact.nonzero()[0]
-        tip_force = 0.0
         if members.size == 0:
-            tip_time = self._tip_time(tip_force, tip_usable, captured)
+            tip_time = self._tip_time(0.0, tip_usable, captured)
             return Features(
                 valid, reasons, 0.0, Side.NONE, _ZERO3, 0.0, _ZERO6, 0.0, tip_time, 0, masked
             )
         pressed = normal[members]
-        position = self._position[members]
-        force_ee = (self._rotation[members] @ force[members][:, :, None])[..., 0]
-        tip_force = float(pressed[self._tip[members]].sum())
-        wrench = np.empty(6)
-        wrench[:3] = force_ee.sum(axis=0)
-        wrench[3:] = _cross_sum(position, force_ee)
-        peak = int(members[pressed.argmax()])
+        taxels, presses = members.tolist(), pressed.tolist()
+        groups = self._adjacency.clusters(taxels)
+        row = {taxel: i for i, taxel in enumerate(taxels)}
+        belongs = np.zeros((len(groups), len(taxels)))
+        for g, group in enumerate(groups):
+            belongs[g, [row[taxel] for taxel in group]] = 1.0
+        # columns: fx, fy, fz, mx, my, mz about the origin of ee, then the normal force's moments
+        table = np.empty((len(taxels), 10))
+        table[:, :6] = (self._lever[members] * force[members, None]).sum(axis=2)
+        table[:, 6:] = self._place[members] * pressed[:, None]
+        sums = belongs @ table
+        total = sums.sum(axis=0)
+        centroids = sums[:, 7:] / sums[:, 6:7]
+        patches = []
+        for g, (group, normal_force) in enumerate(zip(groups, sums[:, 6].tolist(), strict=True)):
+            array = self._array[group[0]]
+            peak_force = max(presses[row[taxel]] for taxel in group)
+            patches.append(
+                Patch(
+                    array=array,
+                    side=self._side[array],
+                    taxels=len(group),
+                    normal_force=normal_force,
+                    peak_force=peak_force,
+                    force=sums[g, :3],
+                    centroid=centroids[g],
+                )
+            )
+        patches.sort(key=lambda patch: -patch.normal_force)  # stable: then by first taxel
+        tip_force = sum(patch.normal_force for patch in patches if patch.side is Side.TIP)
+        peak_force = max(presses)
+        peak = taxels[presses.index(peak_force)]
         return Features(
             valid=valid,
             reasons=reasons,
-            peak_force=float(pressed.max()),
+            peak_force=peak_force,
             peak_side=self._side[self._array[peak]],
-            peak_position=self._peak_position(peak, normal),
-            normal_force=float(pressed.sum()),
-            wrench=wrench,
+            peak_position=self._peak_position(peak, row, presses),
+            normal_force=float(total[6]),
+            wrench=total[:6],
             tip_force=tip_force,
             tip_contact_time=self._tip_time(tip_force, tip_usable, captured),
-            taxels_in_contact=len(members),
+            taxels_in_contact=len(taxels),
             taxels_masked=masked,
-            patches=self._patches(members.tolist(), pressed, position, force_ee),
+            patches=tuple(patches),
         )
 
-    def _peak_position(self, peak: int, normal: Float) -> Float:
+    def _peak_position(self, peak: int, row: dict[int, int], presses: list[float]) -> Float:
         """Centroid of the normal forces on the peak taxel and its neighbours in contact."""
-        around = self._adjacency.neighbours[peak]
-        weight = np.where(self._contact[around], normal[around], 0.0)
-        place: Float = weight @ self._position[around] / weight.sum()
-        return place
-
-    def _patches(
-        self, members: list[int], pressed: Float, position: Float, force_ee: Float
-    ) -> tuple[Patch, ...]:
-        """All patches, the strongest first."""
-        row = {taxel: i for i, taxel in enumerate(members)}
-        groups = self._adjacency.clusters(members)
-        belongs = np.zeros((len(groups), len(members)))
-        for g, group in enumerate(groups):
-            belongs[g, [row[taxel] for taxel in group]] = 1.0
-        table = np.empty((len(members), 7))
-        table[:, 0] = pressed
-        table[:, 1:4] = force_ee
-        table[:, 4:7] = position * pressed[:, None]
-        sums = belongs @ table
-        sums[:, 4:7] /= sums[:, :1]
-        peaks = (belongs * pressed).max(axis=1).tolist()
-        total = sums[:, 0].tolist()
-        out = []
-        for g in sorted(range(len(groups)), key=lambda g: (-total[g], groups[g][0])):
-            array = self._array[groups[g][0]]
-            out.append(
-                Patch(
-                    array,
-                    self._side[array],
-                    len(groups[g]),
-                    total[g],
-                    peaks[g],
-                    sums[g, 1:4],
-                    sums[g, 4:7],
-                )
-            )
-        return tuple(out)
+        around = [taxel for taxel in self._adjacency.neighbours[peak] if taxel in row]
+        weights = [presses[row[taxel]] for taxel in around]
+        share = 1.0 / sum(weights)
+        places = [self._position[taxel] for taxel in around]
+        return np.array(
+            [share * sum(w * p[c] for w, p in zip(weights, places, strict=True)) for c in range(3)]
+        )
 
     def _tip_time(self, tip_force: float, usable: bool, captured: Instant) -> float:
         """Seconds that the tip has been in light contact without a break, bridging a lost cycle."""
@@ -183,9 +179,3 @@ class FeatureExtractor:
         if self._light_since is None or self._light_until is None:
             return 0.0
         return seconds_between(self._light_since, self._light_until)
-
-
-def _cross_sum(a: Float, b: Float) -> list[float]:
-    """Sum of a × b over rows of (k, 3), without the overhead of np.cross on few rows."""
-    p = a.T @ b
-    return [p[1, 2] - p[2, 1], p[2, 0] - p[0, 2], p[0, 1] - p[1, 0]]

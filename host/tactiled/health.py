@@ -21,6 +21,8 @@ FROZEN_CYCLES = 3
 readings by chance do not condemn it (three 12-bit noisy components repeat once in 10^3)."""
 TEMPERATURE_LIMITS_C = (-45.0, 130.0)
 """A magnetometer outside its datasheet's −40 to 125 °C (and some tolerance) did not answer."""
+_MIDDLE_C = sum(TEMPERATURE_LIMITS_C) / 2
+_HALF_RANGE_C = (TEMPERATURE_LIMITS_C[1] - TEMPERATURE_LIMITS_C[0]) / 2
 
 
 class HealthMonitor:
@@ -30,7 +32,8 @@ class HealthMonitor:
         shape = (layout.arrays, layout.width)
         self._frozen_after = None if frozen_after_s is None else round(frozen_after_s * NS_PER_S)
         self._limit = range_limit_ut
-        self._last = np.full((*shape, 3), np.nan)
+        self._last = np.full((layout.arrays, 3, layout.width), np.nan)
+        self._padding = ~layout.real
         self._since = np.zeros(shape, dtype=np.int64)
         self._repeats = np.zeros(shape, dtype=np.int64)
 
@@ -44,16 +47,21 @@ class HealthMonitor:
     ) -> UInt8:
         """(A, n) uint8 of `TaxelHealth` for one cycle.
 
-        ``raw``: (A, n, 3) µT in chip axes. ``temperature_c``: (A, n). ``status``: (A, n), what the
+        ``raw``: (A, 3, n) µT in chip axes. ``temperature_c``: (A, n). ``status``: (A, n), what the
         board said. ``present``: (A,) whether the array's block came at all.
         """
         health = status.copy()
-        low, high = TEMPERATURE_LIMITS_C
-        possible = np.abs(raw).max(axis=-1) <= self._limit  # False for NaN too
-        possible &= (temperature_c >= low) & (temperature_c <= high)
+        possible = np.abs(raw).max(axis=1) <= self._limit  # False for NaN too
+        possible &= np.abs(temperature_c - _MIDDLE_C) <= _HALF_RANGE_C
         if not possible.all():
             health[~possible] |= _OUT_OF_RANGE
-        changed = (raw != self._last).any(axis=-1)
+        changed = (raw != self._last).any(axis=1)
+        changed |= self._padding
+        if changed.all() and present.all():
+            self._last = raw
+            self._since.fill(captured)
+            self._repeats.fill(0)
+            return health
         if not present.all():
             changed &= present[:, None]  # an array that did not come neither froze nor moved
             health[~present] = _MISSING

@@ -1,4 +1,9 @@
-"""Where each taxel stands in the rectangular arrays the sensing core computes with."""
+"""Where each taxel stands in the rectangular arrays the sensing core computes with.
+
+Vectors of all taxels are (A, 3, n): A arrays, component, n taxels of the largest array, so that
+one component of one array is contiguous; scalars are (A, n). The padding of smaller arrays holds
+zeros and counts as unhealthy.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +19,16 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 class Layout:
-    """Arrays of different sizes side by side as (A, n, ...), n taxels of the largest.
+    """Shapes and places of a board's taxels.
 
     ``real``: (A, n) bool, False in the padding. ``counts``: (A,) taxels of each array.
-    ``design``: (A, n, 3), 1 and both coordinates on the unrolled skin about the array's centre,
+    ``design``: (A, 3, n), 1 and both coordinates on the unrolled skin about the array's centre,
     divided by ``scale`` (A,) m so that fits are well conditioned; zero in the padding.
-    ``rotation``: (A, n, 3, 3), taxel axes to ``ee``.
+    ``rotation``: (A, 3, 3, n), [a, :, :, i] turns the axes of taxel i to ``ee``.
     """
 
     def __init__(self, geometry: SkinGeometry) -> None:
         arrays = geometry.arrays
-        self.geometry = geometry
         self.arrays = len(arrays)
         self.counts = np.array([a.taxels for a in arrays])
         self.width = int(self.counts.max())
@@ -32,24 +36,29 @@ class Layout:
         self.real = np.arange(self.width) < self.counts[:, None]
         self._uniform = bool(self.real.all())
         self._where = np.flatnonzero(self.real)
-        self.design = np.zeros((self.arrays, self.width, 3))
-        self.rotation = np.zeros((self.arrays, self.width, 3, 3))
+        self.design = np.zeros((self.arrays, 3, self.width))
+        self.rotation = np.zeros((self.arrays, 3, 3, self.width))
         self.scale = np.ones(self.arrays)
         for a, array in enumerate(arrays):
             flat = array.surface - array.surface.mean(axis=0)
             spread = float(np.sqrt((flat**2).mean()))
             self.scale[a] = spread if spread > 0 else 1.0
-            self.design[a, : array.taxels, 0] = 1.0
-            self.design[a, : array.taxels, 1:] = flat / self.scale[a]
-            self.rotation[a, : array.taxels] = array.rotation
+            self.design[a, 0, : array.taxels] = 1.0
+            self.design[a, 1:, : array.taxels] = flat.T / self.scale[a]
+            self.rotation[a, :, :, : array.taxels] = array.rotation.transpose(1, 2, 0)
 
     def flat(self, padded: NDArray[Scalar]) -> NDArray[Scalar]:
-        """(A, n, ...) → (N, ...), all taxels one array after another; may be a view."""
-        joined = padded.reshape(self.arrays * self.width, *padded.shape[2:])
+        """(A, n) → (N,), all taxels one array after another; may be a view."""
+        joined = padded.reshape(-1)
         return joined if self._uniform else joined[self._where]
 
-    def padded(self, flat: Float, fill: float = 0.0) -> Float:
-        """(N, ...) → (A, n, ...), ``fill`` in the padding."""
-        out = np.full((self.arrays * self.width, *flat.shape[1:]), fill)
+    def flat_vectors(self, padded: NDArray[Scalar]) -> NDArray[Scalar]:
+        """(A, 3, n) → (N, 3), all taxels one array after another; always a copy."""
+        joined = padded.swapaxes(1, 2).reshape(-1, 3)
+        return joined if self._uniform else joined[self._where]
+
+    def padded(self, flat: NDArray[Scalar]) -> NDArray[Scalar]:
+        """(N,) → (A, n), zero in the padding."""
+        out = np.zeros(self.arrays * self.width, flat.dtype)
         out[self._where] = flat
-        return out.reshape(self.arrays, self.width, *flat.shape[1:])
+        return out.reshape(self.arrays, self.width)

@@ -15,19 +15,19 @@ grid are at 1.41, the second row at 2."""
 class Adjacency:
     """Which taxels touch which, within each array: a patch belongs to one array and one side.
 
-    ``masks``: per taxel an int whose bits are its neighbours. ``neighbours``: per taxel the same
-    as an index array that begins with the taxel itself.
+    ``masks``: per taxel an int whose bits are its neighbours. ``neighbours``: per taxel itself
+    and its neighbours.
     """
 
     def __init__(self, geometry: SkinGeometry) -> None:
         self.masks: list[int] = []
-        self.neighbours: list[NDArray[np.intp]] = []
+        self.neighbours: list[tuple[int, ...]] = []
         for part, array in zip(geometry.slices, geometry.arrays, strict=True):
             near = _near(array)
             for i in range(array.taxels):
                 others = np.flatnonzero(near[i]) + part.start
                 self.masks.append(sum(1 << j for j in others.tolist()))
-                self.neighbours.append(np.concatenate([[part.start + i], others]).astype(np.intp))
+                self.neighbours.append((part.start + i, *others.tolist()))
 
     def clusters(self, members: list[int]) -> list[list[int]]:
         """Connected groups of the taxels ``members``, each ascending, ordered by first taxel."""

@@ -117,7 +117,7 @@ class BoardPipeline:
         whole = bool(healthy.sum() == layout.taxels)
         if not whole:
             # what an unhealthy taxel reads must not leak into its neighbours' forces
-            np.copyto(field, model.plane_field(self._theta), where=~healthy[..., None])
+            np.copyto(field, model.plane_field(self._theta), where=~healthy[:, None])
         if self._tare is not None:
             field = self._advance_tare(field, healthy, bool(present.all()), captured, group)
         forces = model.forces(field)
@@ -126,8 +126,8 @@ class BoardPipeline:
         if estimate.ambient.method != "off":
             forces = forces - model.plane_forces(estimate.theta)
         if not whole:
-            forces[~healthy] = np.nan
-        force = layout.flat(forces)
+            np.copyto(forces, np.nan, where=~healthy[:, None])
+        force = layout.flat_vectors(forces)
         self._health = flat_health = layout.flat(health)
         reasons, valid = self._reasons(estimate, healthy, present)
         tip_usable = self._tip_usable(estimate, present)
@@ -137,14 +137,14 @@ class BoardPipeline:
         if self._track is not None and valid and not reasons:
             self._follow_rest(field, estimate, healthy, captured)
         self._last_captured = captured
-        shown = field if whole else np.where(healthy[..., None], field, np.nan)
+        shown = field if whole else np.where(healthy[:, None], field, np.nan)
         return Cycle(
             sequence=group.sequence,
             captured=captured,
             received=max(block.received for block in blocks),
             uncertainty=max(block.uncertainty for block in blocks),
             temperature_c=gather_temperature(group),
-            field_ut=layout.flat(shown),
+            field_ut=layout.flat_vectors(shown),
             force=force,
             health=flat_health,
             ambient=estimate.ambient,
@@ -156,7 +156,7 @@ class BoardPipeline:
     def _collect(self, group: Group) -> tuple[Float, Float, NDArray[np.uint8], Bool]:
         """Blocks of a cycle in padded arrays; missing ones are zero and marked by ``present``."""
         shape = (self._layout.arrays, self._layout.width)
-        raw = np.zeros((*shape, 3))
+        raw = np.zeros((shape[0], 3, shape[1]))
         temperature = np.full(shape, 25.0)  # in the padding, so that it is never out of range
         status = np.zeros(shape, np.uint8)
         present = np.ones(shape[0], dtype=bool)
@@ -165,7 +165,7 @@ class BoardPipeline:
                 present[a] = False
                 continue
             n = len(block.status)
-            raw[a, :n] = block.field_ut
+            raw[a, :, :n] = block.field_ut.T
             temperature[a, :n] = block.temperature_c
             status[a, :n] = block.status
         return raw, temperature, status, present
@@ -208,7 +208,7 @@ class BoardPipeline:
         )
 
     def _begin_tare(self, initial: bool) -> None:
-        shape = (self._layout.arrays, self._layout.width, 3)
+        shape = (self._layout.arrays, 3, self._layout.width)
         self._tare = Tare(shape, self.settings.tare_s, self._noise)
         self._tare_initial = initial
 
@@ -227,7 +227,7 @@ class BoardPipeline:
             if not self._rest_known:
                 self._begin_tare(initial=True)
             return field
-        shift = np.where(tare.healthy[..., None], tare.mean, 0.0)
+        shift = np.where(tare.healthy[:, None], tare.mean, 0.0)
         self._model.rest += shift
         noise = tare.noise()
         largest = float(np.abs(shift).max())
@@ -257,8 +257,7 @@ class BoardPipeline:
     def _apply_noise(self, noise: Float) -> None:
         """Noise of one sample, (3,) µT in chip axes, sets the thresholds of contact and fit."""
         self._noise = np.maximum(noise, MIN_NOISE_UT)
-        spread = np.broadcast_to(self._noise, self._model.rest.shape)
-        self._features.set_noise(self._layout.flat(self._model.normal_sigma(spread)))
+        self._features.set_noise(self._layout.flat(self._model.normal_sigma(self._noise)))
         self._compensator.set_noise(self._noise)
 
     def _follow_rest(
@@ -268,9 +267,9 @@ class BoardPipeline:
         if self._track is None or self._last_captured is None:
             return
         share = min(1.0, (captured - self._last_captured) / NS_PER_S / self._track)
-        free = healthy & ~self._layout.padded(self._features.contact.astype(float)).astype(bool)
+        free = healthy & ~self._layout.padded(self._features.contact)
         left = field - self._model.plane_field(estimate.theta)
-        self._model.rest += np.where(free[..., None], share * left, 0.0)
+        self._model.rest += np.where(free[:, None], share * left, 0.0)
 
     def _due(self, captured: Instant) -> bool:
         """Whether this cycle's features are to be sent, at ``feature_rate_hz``."""

@@ -32,7 +32,7 @@ def fit_plane(
 ) -> Float | None:
     """(3,) value at the origin and slopes of the RANSAC plane through ``values`` (n,) at
     ``surface`` (n, 2), by scikit-learn's defaults; None when it finds no consensus.
-    """  # noqa: D205 - one contract, too long for one line
+    """
     from sklearn.linear_model import LinearRegression, RANSACRegressor  # 1.1 s: only when asked for
 
     regressor = RANSACRegressor(
@@ -53,7 +53,7 @@ def fit_plane(
 class RansacCompensator:
     """The paper's method; see `Compensator`. Whether the planes in force are borne out is checked
     in every cycle, by the same measure as for consensus.
-    """  # noqa: D205 - one contract, too long for one line
+    """
 
     def __init__(
         self, layout: Layout, checker: Consensus, period_s: float, rng: np.random.Generator
@@ -105,13 +105,13 @@ class RansacCompensator:
             plane = None
             if use.sum() >= MIN_TAXELS:
                 plane = fit_plane(
-                    self._layout.design[a, use, 1:], field[a, use, component], self._rng
+                    self._layout.design[a, 1:, use], field[a, component, use], self._rng
                 )
             if component == 0:
                 self._complete[a] = True
             if plane is None:
                 self._complete[a] = False
             else:
-                self._theta[a, :, component] = plane
+                self._theta[a, component] = plane
             self._done += 1
         return self._done == surfaces

@@ -52,7 +52,7 @@ class Tare:
         self._squares = np.zeros(shape)
         self._pivot = np.zeros(shape)  # the first cycle: sums of differences keep their digits
         self._counts = [0, 0]
-        self._healthy = np.ones(shape[:-1], dtype=bool)
+        self._healthy = np.ones((shape[0], shape[2]), dtype=bool)
 
     @property
     def cycles(self) -> int:
@@ -61,7 +61,7 @@ class Tare:
 
     @property
     def mean(self) -> Float:
-        """(A, n, 3) µT, mean of the cycles taken, at least one."""
+        """(A, 3, n) µT, mean of the cycles taken, at least one."""
         mean: Float = self._pivot + self._sums.sum(axis=0) / self.cycles
         return mean
 
@@ -93,11 +93,11 @@ class Tare:
             return f"only {self.cycles} whole cycles came"
         if not self._healthy.any():
             return "no taxel was healthy throughout"
-        spread = self._spread()[self._healthy]
+        spread = self._spread().swapaxes(1, 2)[self._healthy]
         drift = np.abs(self._sums[1] / self._counts[1] - self._sums[0] / self._counts[0])
         error = self._expected * np.sqrt(1 / self._counts[0] + 1 / self._counts[1])
         allowed = np.maximum(STILL_SIGMAS * error, STILL_FLOOR_UT)
-        moved = drift[self._healthy]
+        moved = drift.swapaxes(1, 2)[self._healthy]
         if (moved > allowed).any():
             return f"the field moved by {moved.max():.1f} µT during the tare: keep the skin still"
         if (spread > NOISY_RATIO * self._expected).any():
@@ -106,7 +106,7 @@ class Tare:
 
     def noise(self) -> Float:
         """(3,) µT rms of one sample in x, y, z: median over taxels healthy throughout."""
-        noise: Float = np.median(self._spread()[self._healthy], axis=0)
+        noise: Float = np.median(self._spread().swapaxes(1, 2)[self._healthy], axis=0)
         return noise
 
     def _spread(self) -> Float:

@@ -77,8 +77,8 @@ class FieldTracker:
         theta = self.theta.copy()
         for a in np.flatnonzero(~valid):
             if age[a] <= OFFSET_MEMORY_S:
-                theta[a, 0] += fit.common - self._common[a]
+                theta[a, :, 0] += fit.common - self._common[a]
             else:
                 theta[a] = 0.0
-                theta[a, 0] = fit.common
+                theta[a, :, 0] = fit.common
         return theta, ~valid
