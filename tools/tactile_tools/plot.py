@@ -102,10 +102,11 @@ def _taxel_map(axes: Axes, board: BoardSeries, moment: int, label: str, taxels: 
     force = board.force[moment][taxels]
     healthy = np.isfinite(force).all(axis=1)
     normal = np.clip(-force[:, 2], 0.0, None)
-    axes.scatter(*surface[healthy].T, s=6, color="0.75", zorder=1)
-    axes.scatter(*surface[~healthy].T, s=40, color="crimson", marker="x", label="masked")
+    axes.scatter(surface[healthy, 0], surface[healthy, 1], s=6, color="0.75", zorder=1)
+    axes.scatter(surface[~healthy, 0], surface[~healthy, 1], s=40, color="crimson", marker="x")
     axes.scatter(
-        *surface[healthy].T,
+        surface[healthy, 0],
+        surface[healthy, 1],
         s=CIRCLE_AREA_PER_N * normal[healthy],
         color=COLOURS[0],
         alpha=0.45,

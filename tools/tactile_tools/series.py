@@ -30,6 +30,7 @@ class BoardSeries:
     """What a log says of one board. Times are s since the first cycle; lists grow together."""
 
     name: str
+    start_ns: int = 0  # monotonic clock of the sender at time 0
     geometry: Any = None
     time: list[float] = field(default_factory=list)
     force: list[Float] = field(default_factory=list)  # (N, 3) N, taxel axes
@@ -91,7 +92,8 @@ def read_boards(path: Path) -> dict[str, BoardSeries]:
         captured = getattr(message, "captured_ns", None)
         if captured is None:
             continue
-        start = captured if start is None else start
+        if start is None:
+            start = captured
         now = (captured - start) * 1e-9
         if (board := board_of(key, FORCES)) and len(board.time) < MAX_POINTS:
             board.time.append(now)
@@ -103,6 +105,8 @@ def read_boards(path: Path) -> dict[str, BoardSeries]:
         elif (board := board_of(key, AMBIENT)) and len(board.ambient_time) < MAX_POINTS:
             board.ambient_time.append(now)
             board.ambient.append(message)
+    for board in boards.values():
+        board.start_ns = start or 0
     boards = {n: b for n, b in boards.items() if b.geometry is not None and b.time}
     if not boards:
         raise LogUnreadableError(
