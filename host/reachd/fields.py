@@ -125,8 +125,8 @@ def check_known(names: Sequence[str], given: Mapping[str, object], what: str) ->
     for key in given:
         if key not in names:
             near = difflib.get_close_matches(str(key), names, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else "."
-            raise SettingError(f"unknown {what} {key!r}{hint} There are: {', '.join(names)}")
+            hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(names)}"
+            raise SettingError(f"unknown {what} {key!r}; {hint}")
 
 
 S = TypeVar("S")

@@ -1,0 +1,102 @@
+"""Finding a strategy by name, entry point or ``module:Class``, and asking it safely."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import cast
+
+import numpy as np
+
+from reachd.parameter_fields import Parameters
+from reachd.seam import ArmState, Goal, Strategy, Touch, Twist
+from reachd.strategies.hybrid import HybridClock, HybridEvent
+from reachd.strategies.isolated import Burrow, Excavate, Straight
+from tactile_bus.instant import Instant
+
+GROUP = "tactile_reach.strategies"
+"""Entry-point group in which an installed package offers strategies."""
+
+Factory = Callable[[Parameters, np.random.Generator], Strategy]
+
+BUILT_IN: dict[str, Factory] = {
+    "straight": Straight,
+    "burrow": Burrow,
+    "excavate": Excavate,
+    "hybrid_clock": HybridClock,
+    "hybrid_event": HybridEvent,
+}
+
+
+class StrategyError(ValueError):
+    """A strategy that cannot be had: says what was asked for, what exists and what to do."""
+
+
+def available() -> tuple[str, ...]:
+    """Names that ``load_strategy`` knows: the built-in ones, then those of installed packages."""
+    return (*BUILT_IN, *sorted(e.name for e in _offered() if e.name not in BUILT_IN))
+
+
+def load_strategy(spec: str, parameters: Parameters, rng: np.random.Generator) -> Strategy:
+    """Make the strategy ``spec``: a built-in name, an entry point's name, or ``module:Class``.
+
+    A class is called with (parameters, rng). Built-in names cannot be taken by a package. Raises
+    StrategyError.
+    """
+    strategy = _guarded(spec, lambda: _factory(spec)(parameters, rng))
+    missing = [name for name in ("start", "step", "activity") if not hasattr(strategy, name)]
+    if missing:
+        raise StrategyError(
+            f"strategy {spec!r} has no {' and no '.join(missing)}; docs/strategies.md shows one"
+        )
+    return strategy
+
+
+def ask(
+    strategy: Strategy, touch: Touch, arm: ArmState, goal: Goal, now: Instant
+) -> tuple[Twist | None, str | None]:
+    """One step of a strategy: (twist, None), or (None, what went wrong) whatever it did."""
+    try:
+        twist = strategy.step(touch, arm, goal, now)
+    except Exception as error:  # noqa: BLE001 - a plug-in may raise anything, and must not end motion control
+        return None, f"{type(error).__name__}: {error}"
+    if not isinstance(twist, Twist):
+        return None, f"it returned {type(twist).__name__}, not a Twist"
+    return twist, None
+
+
+def _offered() -> tuple[EntryPoint, ...]:
+    return tuple(entry_points(group=GROUP))
+
+
+def _factory(spec: str) -> Factory:
+    """Class or function that makes the strategy ``spec``."""
+    if spec in BUILT_IN:
+        return BUILT_IN[spec]
+    for entry in _offered():
+        if entry.name == spec:
+            return cast(Factory, entry.load())
+    module, colon, name = spec.partition(":")
+    if not colon or not module or not name:
+        raise StrategyError(
+            f"unknown strategy {spec!r}; there are: {', '.join(available())}; one of your own is "
+            "named module:Class"
+        )
+    made = getattr(import_module(module), name, None)
+    if not callable(made):
+        raise StrategyError(f"strategy {spec!r}: module {module!r} has no class {name!r}")
+    return cast(Factory, made)
+
+
+def _guarded(spec: str, make: Callable[[], Strategy]) -> Strategy:
+    """Run the making of a strategy; whatever it raises becomes a StrategyError."""
+    try:
+        return make()
+    except StrategyError:
+        raise
+    except Exception as error:
+        raise StrategyError(
+            f"strategy {spec!r} cannot be loaded ({type(error).__name__}: {error}); there are: "
+            f"{', '.join(available())}"
+        ) from error
