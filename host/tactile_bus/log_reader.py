@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 import struct
 import zlib
 from collections.abc import Callable, Collection, Iterator
@@ -61,8 +62,9 @@ Progress = Callable[[int, int], None]
 class LogReader:
     """One pass over a log, as a context manager. `LogError` when the file is none.
 
-    After the pass: ``schemas`` and ``channels`` by number, ``damages`` (the first MAX_DAMAGES),
-    ``damage_count``, ``closed`` (the file was finished in order).
+    After the pass: ``schemas`` and ``channels`` by number, ``closed`` (the file was finished in
+    order), ``damages`` (the first MAX_DAMAGES) and their ``damage_count``, ``bytes_damaged``,
+    ``messages_lost`` as far as indexes tell, ``lost_unknown`` places where they do not.
     """
 
     path: Path
@@ -75,12 +77,17 @@ class LogReader:
     channels: dict[int, ChannelRecord] = field(default_factory=dict)
     damages: list[Damage] = field(default_factory=list)
     damage_count: int = 0
+    bytes_damaged: int = 0
+    messages_lost: int = 0
+    lost_unknown: int = 0
     _file: BinaryIO | None = None
     _data_end: int = 0
     _lost_chunk: Damage | None = None
 
     def __enter__(self) -> LogReader:
         try:
+            if not stat.S_ISREG(os.stat(self.path).st_mode) and not self.path.is_dir():
+                raise LogError(f"{self.path} is no file but a device or a pipe")
             self._file = open(self.path, "rb")
             self.size = os.fstat(self._file.fileno()).st_size
         except OSError as error:
@@ -350,6 +357,9 @@ class LogReader:
 
     def _damaged(self, damage: Damage) -> None:
         self.damage_count += 1
+        self.bytes_damaged += damage.length
+        self.messages_lost += damage.messages or 0
+        self.lost_unknown += damage.messages is None
         if len(self.damages) < MAX_DAMAGES:
             self.damages.append(damage)
 

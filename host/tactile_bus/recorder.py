@@ -46,7 +46,7 @@ class RecorderStats:
     """State of a log. ``state``: recording, disk_full, io_error, low_space, failed or closed.
 
     ``written``: messages on the disk. ``dropped``: messages lost, by reason; their sum is that of
-    the log's gap records once it is closed. ``waiting``: messages not yet on the disk.
+    the log's gap records once it is closed. ``queued``: messages not yet on the disk.
     """
 
     state: str
@@ -54,7 +54,7 @@ class RecorderStats:
     files: int
     written: int
     dropped: dict[str, int]
-    waiting: int
+    queued: int
     bytes_written: int
     errors: int
     last_error: str
@@ -105,7 +105,7 @@ class Recorder:
                 files=writer.files,
                 written=writer.written,
                 dropped=dict(self._dropped),
-                waiting=len(self._queue) + writer.waiting,
+                queued=len(self._queue) + writer.waiting,
                 bytes_written=writer.bytes_written,
                 errors=writer.errors,
                 last_error=self._failed or writer.last_error,

@@ -1,0 +1,173 @@
+"""Makes a whole log of one that was cut off or damaged."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import zstandard
+
+from tactile_bus.log_reader import LogReader, Progress
+from tactile_bus.log_records import (
+    AttachmentRecord,
+    Block,
+    ChannelRecord,
+    Damage,
+    LogError,
+    MetadataRecord,
+)
+from tactile_bus.mcap_file import ZSTD_LEVEL, ChunkBuffer, DiskStorage, McapFile
+
+MAX_ATTACHMENT = 256 << 20
+"""Bytes of an attachment that is carried over: calibrations and configurations have kilobytes."""
+
+
+class RecoveryError(Exception):
+    """The recovered log cannot be written; the message names the remedy."""
+
+
+@dataclass(slots=True)
+class RecoveryReport:
+    """What was carried over from ``source`` to ``target`` and what was not.
+
+    ``messages_lost``: those known from indexes; ``lost_unknown``: damaged places whose messages
+    nobody can count. ``orphans``: messages of a channel that is defined nowhere, left out.
+    """
+
+    source: Path
+    target: Path
+    size: int
+    was_closed: bool = False
+    messages: int = 0
+    attachments: int = 0
+    metadata: int = 0
+    orphans: int = 0
+    messages_lost: int = 0
+    lost_unknown: int = 0
+    bytes_lost: int = 0
+    damage_count: int = 0
+    damages: list[Damage] = field(default_factory=list)
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+
+def recover(source: Path, target: Path, progress: Progress | None = None) -> RecoveryReport:
+    """Write everything readable of ``source`` to the new file ``target``. Constant memory.
+
+    `LogError` when the source is no log or holds nothing, `RecoveryError` when the target exists
+    or cannot be written; then no target is left behind. The source is only read.
+    """
+    report = RecoveryReport(source, target, 0)
+    with LogReader(source, progress) as reader:
+        report.size = reader.size
+        out = _Copy(reader, target, report)
+        try:
+            for event in reader.events():
+                out.take(event)
+            out.finish()
+        except FileExistsError as error:
+            raise RecoveryError(f"{target} exists and is not overwritten: name another") from error
+        except OSError as error:
+            out.discard()
+            raise RecoveryError(
+                f"cannot write {target}: {error.strerror}; name a place with room to write to"
+            ) from error
+        except BaseException:
+            out.discard()
+            raise
+        report.was_closed = reader.closed
+        report.damages, report.damage_count = reader.damages, reader.damage_count
+        report.bytes_lost = reader.bytes_damaged
+        report.messages_lost = reader.messages_lost
+        report.lost_unknown = reader.lost_unknown
+    return report
+
+
+class _Copy:
+    """The target of a recovery; made with the first thing that is worth keeping."""
+
+    def __init__(self, reader: LogReader, target: Path, report: RecoveryReport) -> None:
+        self._reader = reader
+        self._target = target
+        self._report = report
+        self._file: McapFile | None = None
+        self._compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
+        self._channels: dict[int, ChannelRecord] = {}
+        self._schemas: set[int] = set()
+
+    def take(self, event: Block | MetadataRecord | AttachmentRecord) -> None:
+        """Write one event over."""
+        if self._file is None:
+            reader = self._reader
+            self._file = McapFile(self._target, DiskStorage(), reader.library, reader.profile)
+        report = self._report
+        if isinstance(event, MetadataRecord):
+            self._file.add_metadata(event.name, event.values)
+            report.metadata += 1
+        elif isinstance(event, AttachmentRecord):
+            self._attachment(self._file, event)
+        else:
+            self._block(self._file, event)
+
+    def finish(self) -> None:
+        """Close the target; `LogError` when there is nothing in it."""
+        if self._file is None:
+            raise LogError(f"{self._report.source} holds nothing that can be read")
+        self._file.finish()
+        self._file = None
+
+    def discard(self) -> None:
+        """Remove a target that could not be completed."""
+        if self._file is not None:
+            self._file.abandon()
+            os.unlink(self._target)
+            self._file = None
+
+    def _attachment(self, file: McapFile, event: AttachmentRecord) -> None:
+        if event.size > MAX_ATTACHMENT:
+            self._report.damages.append(
+                Damage(event.position, event.size, f"attachment {event.name!r} is too large", 0)
+            )
+            return
+        data = self._reader.read_at(event.position, event.size)
+        file.add_attachment(event.name, event.media_type, data, event.log_ns, event.create_ns)
+        self._report.attachments += 1
+
+    def _block(self, file: McapFile, event: Block) -> None:
+        chunk = ChunkBuffer()
+        report = self._report
+        for message in self._reader.messages(event):
+            channel = self._reader.channels.get(message.channel)
+            if channel is None or not self._define(file, channel):
+                report.orphans += 1
+                continue
+            chunk.add(
+                message.channel,
+                message.sequence,
+                message.log_ns,
+                message.publish_ns,
+                message.data,
+            )
+        if not chunk.messages:
+            return
+        file.add_chunk(chunk.seal(self._compressor))
+        report.messages += chunk.messages
+        report.start_ns = min(report.start_ns or chunk.start_ns, chunk.start_ns)
+        report.end_ns = max(report.end_ns or chunk.end_ns, chunk.end_ns)
+
+    def _define(self, file: McapFile, channel: ChannelRecord) -> bool:
+        """Have the target know the channel; False when its schema is lost."""
+        if channel.number in self._channels:
+            return True
+        if channel.schema and channel.schema not in self._schemas:
+            schema = self._reader.schemas.get(channel.schema)
+            if schema is None:
+                return False
+            file.add_schema(schema.number, schema.name, schema.encoding, schema.data)
+            self._schemas.add(schema.number)
+        file.add_channel(
+            channel.number, channel.schema, channel.topic, channel.encoding, channel.metadata
+        )
+        self._channels[channel.number] = channel
+        return True
