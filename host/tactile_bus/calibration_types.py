@@ -121,5 +121,4 @@ class BoardCalibration:
 
 def yaw_degrees(yaw: Float) -> Float:
     """Chip yaw in degrees as files carry it; ``yaw`` in rad."""
-    degrees = np.asarray(np.round(np.rad2deg(yaw), YAW_DECIMALS) + 0.0, np.float64)
-    return degrees
+    return np.asarray(np.round(np.rad2deg(yaw), YAW_DECIMALS) + 0.0, np.float64)

@@ -32,7 +32,8 @@ the largest array of 128 takes no longer than for one of 24 (2,024 triples)."""
 def design_candidates(design: Float) -> tuple[Float, NDArray[np.bool_]]:
     """Operators from the field on n taxels to the coefficients that each subset proposes.
 
-    ``design``: (n, 3), `Layout.design` of one array, taxels first. Returns (k, 3, n) and (k, n) which taxels each uses.
+    ``design``: (n, 3), `Layout.design` of one array, taxels first. Returns
+    (k, 3, n) and (k, n) which taxels each uses.
     """
     n = len(design)
     operators: list[Float] = []

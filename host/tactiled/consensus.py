@@ -54,6 +54,8 @@ are too few or too much to one side to tell its slope; shrinkage sets in."""
 SLOPE_UT_PER_M = 100.0
 """Spread of ambient gradients, the scale of that shrinkage: steel at arm's length makes 30."""
 
+_NONE = (math.nan, math.nan, math.nan)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
@@ -222,6 +224,7 @@ class Consensus:
             s >= MIN_SUPPORT and k >= MIN_INLIERS and q <= limit * k
             for s, k, q in zip(support, inliers, sums, strict=True)
         ]
+        residual = [math.sqrt(q / (3 * max(k, 1))) for q, k in zip(sums, inliers, strict=True)]
         common = _shared(middle, inliers, valid)
         if len(valid) > 1 and common is not None:
             for a, centre in enumerate(middle):
@@ -229,13 +232,7 @@ class Consensus:
                     valid[a] = False
             common = _shared(middle, inliers, valid)
         return Fit(
-            theta,
-            np.array(support),
-            np.array(
-                [math.sqrt(q / (3 * k)) if k else 0.0 for q, k in zip(sums, inliers, strict=True)]
-            ),
-            np.array(valid),
-            np.array(common or (math.nan,) * 3),
+            theta, np.array(support), np.array(residual), np.array(valid), np.array(common or _NONE)
         )
 
 

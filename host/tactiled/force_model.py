@@ -128,7 +128,8 @@ class ForceModel:
         """(A, n) N rms of the normal force, from independent noise ``noise_ut`` (3,) µT rms."""
         arrays, n = self.layout.arrays, self.layout.width
         rows = self._matrix.reshape(arrays, 3, n, 3, n)[:, 2]
-        return np.sqrt(np.einsum("aicj,c->ai", rows**2, noise_ut**2))
+        sigma: Float = np.sqrt(np.einsum("aicj,c->ai", rows**2, noise_ut**2))
+        return sigma
 
     def _of_plane(self, matrix: Float, theta: Float) -> Float:
         vectors: Float = (matrix @ theta.reshape(-1, 9, 1)).reshape(
