@@ -63,6 +63,11 @@ class Inbox:
         self.dropped = 0
         """Chunks dropped since the start."""
 
+    @property
+    def full(self) -> bool:
+        """Whether the next chunk would push out the oldest."""
+        return self._chunks >= self._limit
+
     def put(self, item: Item) -> None:
         """Hand over one item; never waits."""
         with self._lock:

@@ -71,6 +71,11 @@ class McapTransport:
         return str(self._path)
 
     @property
+    def board(self) -> str | None:
+        """Name of the board played; where none was asked for known once open."""
+        return self._board
+
+    @property
     def medium(self) -> Medium:
         """Medium of the recorded board; known once open."""
         return self._medium

@@ -1,0 +1,124 @@
+"""The command ``tactiled``."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from types import FrameType
+
+from rich.console import Console
+from rich.logging import RichHandler
+
+from tactile_bus.instant import monotonic_now, seconds_between
+from tactiled.arguments import make_parser
+from tactiled.daemon import Daemon, StartError
+from tactiled.settings import Settings, SettingsError, make_settings
+from tactiled.status import REFRESH, Status
+from tactiled.transports import list_ports
+
+log = logging.getLogger(__name__)
+
+DONE, FAILED, USAGE, REFUSED = range(4)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run tactiled; returns the exit status: 0 done, 1 failed, 2 usage, 3 refused."""
+    options = make_parser().parse_args(argv)
+    console = Console(stderr=True)
+    _set_up_logging(console, options.verbose)
+    if options.list_ports:
+        return _list_ports()
+    try:
+        settings = make_settings(options)
+    except SettingsError as error:
+        print(f"tactiled: {error}", file=sys.stderr)
+        return USAGE
+    stopping = threading.Event()
+
+    def stop(number: int, _: FrameType | None) -> None:
+        stopping.set()
+        signal.signal(number, signal.SIG_DFL)  # a second one ends it at once
+
+    before = {n: signal.signal(n, stop) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        return _run(settings, console, stopping)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _run(settings: Settings, console: Console, stopping: threading.Event) -> int:
+    daemon = Daemon(settings)
+    try:
+        daemon.start()
+    except StartError as error:
+        print(f"tactiled: {error}", file=sys.stderr)
+        return REFUSED
+    try:
+        with Status(console, daemon.ports, daemon.recorder) as status:
+            trouble = _watch(daemon, status, stopping)
+    finally:
+        daemon.stop()
+    if daemon.failure is not None:
+        thread, cause = daemon.failure
+        print(f"tactiled: thread {thread} failed: {cause}", file=sys.stderr)
+        return FAILED
+    if trouble is not None:
+        print(f"tactiled: {trouble}", file=sys.stderr)
+        return REFUSED
+    if daemon.recorder is not None:
+        log.info("log: %s", daemon.recorder.stats.path)
+    return DONE
+
+
+def _watch(daemon: Daemon, status: Status, stopping: threading.Event) -> str | None:
+    """Wait for the end; what kept the job from being done, None when it was."""
+    settings = daemon.settings
+    start = monotonic_now()
+    while not stopping.is_set() and not daemon.done.is_set():
+        stopping.wait(REFRESH)
+        status.show()
+        trouble = None if settings.wait else daemon.trouble()
+        if trouble is not None:
+            return trouble
+        elapsed = seconds_between(start, monotonic_now())
+        if settings.duration is not None and elapsed >= settings.duration:
+            return _unserved(daemon)
+    return _unserved(daemon) if daemon.done.is_set() else None
+
+
+def _unserved(daemon: Daemon) -> str | None:
+    """Ports of which no board ever came into service."""
+    missing = [port.name for port in daemon.ports if not port.served]
+    if not missing:
+        return None
+    return f"no samples came from {', '.join(missing)}; see the messages above"
+
+
+def _list_ports() -> int:
+    ports = list_ports()
+    for port in ports:
+        print(port)
+    if not ports:
+        print("no serial ports are plugged in", file=sys.stderr)
+    return DONE
+
+
+def _set_up_logging(console: Console, verbose: bool) -> None:
+    level = logging.DEBUG if verbose else logging.INFO
+    if console.is_terminal:
+        handler: logging.Handler = RichHandler(
+            console=console, show_path=False, rich_tracebacks=False, markup=False
+        )
+        handler.setFormatter(logging.Formatter("%(message)s"))
+    else:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler], force=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

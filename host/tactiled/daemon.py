@@ -1,0 +1,337 @@
+"""The daemon: threads and I/O round the pure parts.
+
+Threads: one reader a port (`reader`), the pipeline's (here), the log's writer (`recorder`), zenoh's
+own for services, and the main thread, which watches. Each that dies takes the daemon down loudly.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import platform
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from tactile_bus.calibration import CalibrationError
+from tactile_bus.instant import Instant, WallClock, after, monotonic_now
+from tactile_bus.recorder import Recorder, RecorderError
+from tactile_bus.services import ServiceError
+from tactile_bus.session import BusError, close_session, open_session
+from tactile_bus.streams import declare_alive
+from tactile_bus.topics import DIAGNOSTICS, alive_key
+from tactiled import diagnostics
+from tactiled.can_line import CanLine
+from tactiled.events import Identity, Refusal
+from tactiled.inbox import Inbox, Wake
+from tactiled.line import Line, SerialLine
+from tactiled.outlet import Outlet
+from tactiled.port import Port, Trouble
+from tactiled.reader import PortReader
+from tactiled.services import BoardServices
+from tactiled.settings import REPLAY_PREFIX, PortSettings, Settings
+from tactiled.shelf import Shelf
+from tactiled.station import Station
+from tactiled.transports import Medium, Transport, TransportError
+from tactiled.transports.can_bus import CanTransport
+from tactiled.transports.mcap_file import McapTransport
+from tactiled.transports.serial_port import SerialTransport
+
+log = logging.getLogger(__name__)
+
+TICK = 0.01
+"""s between looks at the clock when nothing arrives."""
+
+SWITCH_INTERVAL = 0.0005
+"""s after which Python hands the interpreter on: a reader must stamp soon after its data came."""
+
+FREEZE_AFTER = 5
+"""s after the start at which what lives then is taken out of the collector's sight for good."""
+
+COLLECT_EVERY = 10
+"""s between collections thereafter; with so few objects left to look at they take 1 ms."""
+
+CALLS = 64
+"""Requests that may wait for the pipeline's thread."""
+
+NAME_TIMEOUT = 0.3
+"""s to ask the bus whether a name is in use."""
+
+JOIN_TIMEOUT = 1.0
+"""s for the pipeline's thread to end."""
+
+
+class StartError(Exception):
+    """The daemon cannot start as asked; the message holds the remedy."""
+
+
+class Daemon:
+    """Everything between `start` and `stop`; used from the main thread.
+
+    ``failure``: what a thread died of. ``done``: set when there is nothing more to do.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.ports: list[Port] = []
+        self.failure: tuple[str, BaseException] | None = None
+        self.done = threading.Event()
+        self.recorder: Recorder | None = None
+        self._wall = WallClock.take()
+        self._prefix = REPLAY_PREFIX if settings.replay else ""
+        self._wake = Wake()
+        self._calls: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
+        self._session: zenoh.Session | None = None
+        self._outlet: Outlet | None = None
+        self._services: list[BoardServices] = []
+        self._tokens: list[zenoh.LivelinessToken] = []
+        self._stopping = threading.Event()
+        self._seconds = 0
+        self._log_state = "recording"
+        self._thread = threading.Thread(target=self._run, name="pipeline", daemon=True)
+        ports = len(settings.ports)
+        self._shelf = Shelf(settings.calibrations, strict=len(settings.calibrations) >= ports)
+
+    @property
+    def stations(self) -> list[Station]:
+        """Boards known so far, in the order of their ports."""
+        return [station for port in self.ports for station in list(port.stations.values())]
+
+    def start(self) -> None:
+        """Bring everything up; `StartError`, and everything down again, when that cannot be."""
+        sys.setswitchinterval(SWITCH_INTERVAL)
+        try:
+            self._start()
+        except (BusError, RecorderError, TransportError, CalibrationError) as error:
+            self.stop()
+            raise StartError(str(error)) from error
+        except StartError:
+            self.stop()
+            raise
+
+    def _start(self) -> None:
+        settings = self.settings
+        transports = [_make_transport(port, settings.speed) for port in settings.ports]
+        self._session = session = open_session(settings.bus)
+        self._outlet = outlet = Outlet(session, None, self._wall, self._prefix)
+        for wanted, transport in zip(settings.ports, transports, strict=True):
+            self.ports.append(self._make_port(wanted, transport, outlet))
+        if settings.log is not None:
+            self.recorder = outlet.recorder = self._open_log(settings.log)
+        self._thread.start()
+        for port in self.ports:
+            port.reader.start()
+
+    def _make_port(self, wanted: PortSettings, transport: Transport, outlet: Outlet) -> Port:
+        settings = self.settings
+        replay = wanted.medium == "log"
+        inbox = Inbox(self._wake)
+        reader = PortReader(transport, inbox, outlet, wanted.name, self._fail, paced=replay)
+        reader.open(settings.wait and not replay)
+        name = wanted.name
+        if isinstance(transport, McapTransport):
+            name = transport.board or "board0"
+
+        def admit(node: int, identity: Identity) -> Refusal | None:
+            return port.admit(node, identity)
+
+        line: Line
+        if transport.medium is Medium.CAN:
+            fd = isinstance(transport, CanTransport) and transport.spec.fd
+            nodes = frozenset(wanted.nodes) or None
+            line = CanLine(transport.name, admit, fd, settings.rate, nodes, listen_only=replay)
+        else:
+            line = SerialLine(
+                transport.name, admit, wanted.kind, settings.rate, wanted.baud, listen_only=replay
+            )
+
+        def names(nodes: tuple[int, ...], late: bool) -> dict[int, str]:
+            return bus_names(name, wanted.nodes, nodes, late)
+
+        port = Port(name, line, reader, inbox, names, self._open_station, live=not replay)
+        if isinstance(line, SerialLine):
+            port.add_station(0, name)
+            if port.trouble is not None:
+                raise StartError(str(port.trouble))
+        return port
+
+    def _open_station(self, port: Port, node: int, name: str) -> Station | Trouble:
+        """Take a name on the bus; called from the pipeline's thread for boards on a CAN bus."""
+        session, outlet = self._session, self._outlet
+        assert session is not None
+        assert outlet is not None
+        station = Station(name, outlet, self._shelf, self.settings.pipeline)
+        if self._prefix:
+            # A recording is nobody to be spoken to.
+            return station
+        if _is_taken(session, name):
+            return Trouble(
+                f"another tactiled publishes for the name {name!r} already",
+                "stop that one, or give this board another --name",
+            )
+        self._tokens.append(declare_alive(session, name))
+        self._services.append(BoardServices(session, self._call, self._shelf, port, node, station))
+        return station
+
+    def _open_log(self, destination: Path) -> Recorder:
+        settings = self.settings
+        recorder = Recorder(
+            destination, settings.recorder, prefix=self.ports[0].name, clock=self._wall
+        )
+        recorder.metadata(
+            "tactiled",
+            {
+                "ports": ", ".join(port.spec for port in settings.ports),
+                "pipeline": repr(settings.pipeline),
+                "rate": repr(settings.rate),
+                "python": platform.python_version(),
+                "host": platform.platform(),
+            },
+        )
+        if settings.config_path is not None:
+            text = settings.config_path.read_bytes()
+            recorder.attach(settings.config_path.name, "application/toml", text)
+        return recorder
+
+    def stop(self) -> None:
+        """End in order: boards, readers, pipeline, log (at most 1 s), bus."""
+        self._stopping.set()
+        self._wake.ring()
+        if self._thread.is_alive():
+            self._thread.join(JOIN_TIMEOUT)
+        for port in self.ports:
+            port.reader.stop()
+        if self.recorder is not None and not self.recorder.close():
+            log.error("the log was not closed in time; see `tactile log recover`")
+        for service in self._services:
+            service.close()
+        self._services.clear()
+        if self._outlet is not None:
+            self._outlet.close()
+        if self._session is not None:
+            close_session(self._session)
+            self._session = None
+
+    def trouble(self) -> str | None:
+        """Why a port has not come into service and will not by itself; None: all is well yet."""
+        for port in self.ports:
+            if port.served:
+                continue
+            if port.trouble is not None:
+                return str(port.trouble)
+            for station in list(port.stations.values()):
+                if station.refusal is not None:
+                    return f"{station.refusal.problem}; {station.refusal.remedy}"
+        return None
+
+    # The pipeline's thread
+
+    def _run(self) -> None:
+        try:
+            next_second = after(monotonic_now(), 1.0)
+            while not self._stopping.is_set():
+                self._wake.wait(TICK)
+                now = monotonic_now()
+                for port in self.ports:
+                    port.pump(now)
+                self._serve_calls()
+                if now >= next_second:
+                    next_second = after(next_second, 1.0)
+                    self._each_second(now)
+                if all(port.ended for port in self.ports):
+                    self.done.set()
+            for port in self.ports:
+                port.farewell()
+        except BaseException as error:  # noqa: BLE001 - thread boundary: the daemon must end loudly
+            self._fail(error)
+
+    def _call(self, work: Callable[[], Any]) -> Future[Any]:
+        """Have ``work`` done by the pipeline's thread."""
+        future: Future[Any] = Future()
+        if len(self._calls) >= CALLS:
+            future.set_exception(ValueError(f"{CALLS} requests are waiting already"))
+        else:
+            self._calls.append((work, future))
+            self._wake.ring()
+        return future
+
+    def _serve_calls(self) -> None:
+        while self._calls:
+            work, future = self._calls.popleft()
+            try:
+                future.set_result(work())
+            except (ValueError, ServiceError, CalibrationError) as error:
+                future.set_exception(error)
+
+    def _each_second(self, now: Instant) -> None:
+        outlet = self._outlet
+        if outlet is None:
+            return
+        for port in self.ports:
+            for node, station in port.stations.items():
+                station.each_second(now)
+                wall_ns = self._wall.wall_ns(now)
+                values = diagnostics.summary(port, node, station, now)
+                message = diagnostics.message(station.name, values, self.recorder, wall_ns)
+                outlet.send(DIAGNOSTICS, station.name, message, wall_ns)
+        self._watch_log(outlet)
+        self._collect_garbage()
+
+    def _watch_log(self, outlet: Outlet) -> None:
+        if self.recorder is None:
+            return
+        stats = self.recorder.stats
+        if stats.state == self._log_state:
+            return
+        self._log_state = stats.state
+        good = stats.state == "recording"
+        text = f"log {stats.path}: {stats.state}" + (f" ({stats.last_error})" if not good else "")
+        for station in self.stations:
+            outlet.announce(station.name, logging.INFO if good else logging.ERROR, text)
+
+    def _collect_garbage(self) -> None:
+        """Keep collections off the hot path: they would stop every thread at any moment."""
+        self._seconds += 1
+        if self._seconds == FREEZE_AFTER:
+            gc.collect()
+            gc.freeze()
+            gc.disable()
+        elif self._seconds > FREEZE_AFTER and self._seconds % COLLECT_EVERY == 0:
+            gc.collect()
+
+    def _fail(self, error: BaseException) -> None:
+        if self.failure is None:
+            name = threading.current_thread().name
+            self.failure = (name, error)
+            log.critical("thread %s failed", name, exc_info=error)
+        self.done.set()
+
+
+def bus_names(
+    stem: str, given: dict[int, str], nodes: tuple[int, ...], late: bool
+) -> dict[int, str]:
+    """Names of boards on a CAN bus: as given by node; the stem for a lone board, else stem-node."""
+    if given:
+        return {node: given[node] for node in nodes if node in given}
+    if len(nodes) == 1 and not late:
+        return {nodes[0]: stem}
+    return {node: f"{stem}-{node}" for node in nodes}
+
+
+def _make_transport(port: PortSettings, speed: float) -> Transport:
+    if port.medium == "log":
+        return McapTransport(port.spec, board=port.name or None, speed=speed)
+    if port.medium == "can":
+        return CanTransport(port.spec)
+    return SerialTransport(port.spec, port.baud)
+
+
+def _is_taken(session: zenoh.Session, name: str) -> bool:
+    replies = session.liveliness().get(alive_key(name), timeout=NAME_TIMEOUT)
+    return any(reply.ok is not None for reply in replies)

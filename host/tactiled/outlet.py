@@ -1,0 +1,80 @@
+"""Where messages leave the daemon: encoded once, the same bytes to the bus and into the log."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import zenoh
+
+from tactile_bus.instant import Instant, WallClock, monotonic_now
+from tactile_bus.messages import codec, log_message
+from tactile_bus.recorder import Recorder
+from tactile_bus.streams import Publisher, declare_publisher
+from tactile_bus.topics import LOG, RAW, Topic
+from tactiled.blocks import Chunk
+from tactiled.outgoing import split
+from tactiled.transports.raw_chunk import to_raw
+
+log = logging.getLogger(__name__)
+
+NODE = "tactiled"
+"""Name of this program in ``rcl_interfaces/Log``."""
+
+
+class Outlet:
+    """Bus and log behind one call. ``recorder`` None: nothing is logged."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        recorder: Recorder | None,
+        wall: WallClock,
+        prefix: str = "",
+    ) -> None:
+        self.wall = wall
+        self.recorder = recorder
+        self._session = session
+        self._prefix = prefix
+        self._codec = codec()
+        self._publishers: dict[tuple[str, str], Publisher] = {}
+
+    def send(self, topic: Topic, name: str, message: Any, stamp_ns: int) -> None:
+        """Encode and send; ``stamp_ns``: wall-clock time that the message stands for."""
+        data = self._codec.encode(topic, message)
+        if topic.published:
+            publisher = self._publishers.get((topic.template, name))
+            if publisher is None:
+                publisher = declare_publisher(self._session, topic, name, self._prefix)
+                self._publishers[topic.template, name] = publisher
+            publisher.put(data, stamp_ns)
+        if self.recorder is not None and topic.logged:
+            now_ns = self.wall.wall_ns(monotonic_now())
+            self.recorder.write(topic, name, data, now_ns, stamp_ns)
+
+    def raw(self, name: str, port: str, chunk: Chunk) -> None:
+        """Log what one read returned; called from the reader's thread."""
+        if self.recorder is None:
+            return
+        stamp_ns = self.wall.wall_ns(chunk.received)
+        for part in split(chunk):
+            data = self._codec.encode(RAW, to_raw(part, port, self.wall))
+            self.recorder.write(RAW, name, data, stamp_ns, stamp_ns)
+
+    def announce(self, name: str, level: int, text: str, at: Instant | None = None) -> None:
+        """Say something of a board: to people, on the bus and into the log."""
+        log.log(level, "%s: %s", name, text)
+        self.firmware_text(name, level, NODE, text, at)
+
+    def firmware_text(
+        self, name: str, level: int, speaker: str, text: str, at: Instant | None = None
+    ) -> None:
+        """``rcl_interfaces/Log`` on the bus and into the log alone."""
+        stamp_ns = self.wall.wall_ns(monotonic_now() if at is None else at)
+        self.send(LOG, name, log_message(stamp_ns, level, speaker, text), stamp_ns)
+
+    def close(self) -> None:
+        """Take all streams back."""
+        for publisher in self._publishers.values():
+            publisher.close()
+        self._publishers.clear()

@@ -1,0 +1,140 @@
+"""The thread that reads one port: stamp, hand over, log, and reopen what vanished."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from collections.abc import Callable
+
+from tactiled.inbox import Inbox, PortEnded, PortLost, PortOpened
+from tactiled.outlet import Outlet
+from tactiled.transports import EndOfLog, PortClosed, Transport, TransportError
+from tactiled.transports.serial_port import SerialTransport
+
+log = logging.getLogger(__name__)
+
+READ_TIMEOUT = 0.2
+"""s a read waits; `Transport.close` ends it sooner."""
+
+REOPEN_FIRST = 0.05
+"""s to the second attempt at a port that vanished; grows to `REOPEN_SLOWEST`."""
+
+REOPEN_SLOWEST = 0.5
+"""s between attempts: data must be back 2 s after a replug."""
+
+PACE = 0.002
+"""s between looks whether the pipeline has caught up with a recording."""
+
+BITS_PER_BYTE = 10
+"""On a UART: start bit, eight data bits, stop bit."""
+
+NO_UART = ("/dev/ttyACM", "/dev/pts/", "/dev/ttys")
+"""Beginnings of devices whose baud rate means nothing: USB CDC and pseudo-terminals."""
+
+
+class PortReader:
+    """Reads ``transport`` into ``inbox`` on a thread of its own until `stop`.
+
+    ``name``: under which raw chunks are logged. ``paced``: wait for the pipeline rather than drop,
+    for recordings. ``failed`` is called with what the thread died of.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        inbox: Inbox,
+        outlet: Outlet,
+        name: str,
+        failed: Callable[[BaseException], None],
+        paced: bool = False,
+    ) -> None:
+        self.transport = transport
+        self.reopened = 0
+        self._inbox = inbox
+        self._outlet = outlet
+        self._name = name
+        self._failed = failed
+        self._paced = paced
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"read-{name}", daemon=True)
+
+    def open(self, wait: bool) -> None:
+        """Open the port; `TransportError` when it cannot be opened, unless ``wait``."""
+        try:
+            self.transport.open()
+        except TransportError as error:
+            if not wait:
+                raise
+            log.warning("%s; waiting for it", error)
+        else:
+            self._tell_opened()
+
+    def start(self) -> None:
+        """Begin to read."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Close the port and end the thread."""
+        self._stopping.set()
+        self.transport.close()
+        if self._thread.is_alive():
+            self._thread.join(1.0)
+
+    def _run(self) -> None:
+        try:
+            while not self._stopping.is_set():
+                self._read_until_lost()
+                self._reopen()
+        except EndOfLog:
+            self._inbox.put(PortEnded())
+        except BaseException as error:  # noqa: BLE001 - thread boundary: the daemon must end loudly
+            self._failed(error)
+
+    def _read_until_lost(self) -> None:
+        transport, inbox, outlet = self.transport, self._inbox, self._outlet
+        try:
+            while True:
+                chunk = transport.read(READ_TIMEOUT)
+                if chunk is not None:
+                    while self._paced and inbox.full and not self._stopping.wait(PACE):
+                        pass
+                    inbox.put(chunk)
+                    outlet.raw(self._name, transport.name, chunk)
+        except EndOfLog:
+            raise
+        except PortClosed:
+            return
+        except TransportError as error:
+            if not self._stopping.is_set():
+                inbox.put(PortLost(str(error)))
+
+    def _reopen(self) -> None:
+        wait, said = REOPEN_FIRST, ""
+        while not self._stopping.wait(wait):
+            try:
+                self.transport.open()
+            except TransportError as error:
+                if str(error) != said:
+                    said = str(error)
+                    log.info("%s", error)
+                wait = min(2 * wait, REOPEN_SLOWEST)
+            else:
+                self.reopened += 1
+                self._tell_opened()
+                return
+
+    def _tell_opened(self) -> None:
+        transport = self.transport
+        if isinstance(transport, SerialTransport):
+            serial = transport.usb_serial or ""
+            self._inbox.put(PortOpened(serial, byte_time(transport.device, transport.baud)))
+        else:
+            self._inbox.put(PortOpened())
+
+
+def byte_time(device: str | None, baud: int) -> float:
+    """s that a byte takes on the wire of ``device``; 0 where there is no UART."""
+    if device is None or os.path.realpath(device).startswith(NO_UART):
+        return 0.0
+    return BITS_PER_BYTE / baud

@@ -1,0 +1,177 @@
+"""What can be asked of a board while it runs: status, tare, set_rate, recalibrate, geometry.
+
+Requests come on zenoh's threads and are carried out by the pipeline's thread. Whatever goes wrong
+comes back as an error reply.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from typing import Any, TypeVar
+
+import msgspec
+import zenoh
+
+from sensor_proto.packets import AckResult, SetRate
+from tactile_bus.calibration import CalibrationError
+from tactile_bus.instant import monotonic_now
+from tactile_bus.services import Service, ServiceError, declare_service
+from tactile_bus.topics import service_key
+from tactiled.diagnostics import summary
+from tactiled.events import Answered, Event
+from tactiled.link import BoardLink
+from tactiled.port import Port
+from tactiled.shelf import Shelf
+from tactiled.station import Station
+
+PIPELINE_TIMEOUT = 1.0
+"""s the pipeline's thread may take to look at a request: it does so every 10 ms."""
+
+TARE_TIMEOUT = 15.0
+"""s for a tare: ten times its usual half second, and the retries of a first one."""
+
+COMMAND_TIMEOUT = 3.0
+"""s for a board's answer: five tries of 0.2 s, after those of commands before it."""
+
+T = TypeVar("T")
+
+Run = Callable[[Callable[[], T]], "Future[T]"]
+"""Carries a function out on the pipeline's thread."""
+
+
+class Nothing(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """A request without parameters."""
+
+
+class RateRequest(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """``rate_hz``: samples a second, above 0."""
+
+    rate_hz: float
+
+
+class BoardServices:
+    """The services of one board."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        run: Callable[[Callable[[], Any]], Future[Any]],
+        shelf: Shelf,
+        port: Port,
+        node: int,
+        station: Station,
+        prefix: str = "",
+    ) -> None:
+        self._run = run
+        self._shelf = shelf
+        self._port = port
+        self._node = node
+        self._station = station
+        handlers: dict[str, tuple[Callable[[Any], object], type]] = {
+            "status": (self._status, Nothing),
+            "tare": (self._tare, Nothing),
+            "set_rate": (self._set_rate, RateRequest),
+            "recalibrate": (self._recalibrate, Nothing),
+            "geometry": (self._geometry, Nothing),
+        }
+        lead = f"{prefix}/" if prefix else ""
+        self._services: list[Service] = [
+            declare_service(session, lead + service_key(station.name, name), handler, request)
+            for name, (handler, request) in handlers.items()
+        ]
+
+    def close(self) -> None:
+        """Take the services back."""
+        for service in self._services:
+            service.close()
+
+    def _status(self, _: Nothing) -> dict[str, Any]:
+        result: dict[str, Any] = self._do(
+            lambda: summary(self._port, self._node, self._station, monotonic_now())
+        )
+        return result
+
+    def _tare(self, _: Nothing) -> dict[str, Any]:
+        future: Future[dict[str, Any]] = self._do(self._station.tare)
+        stuck = "the tare did not end: no samples are coming"
+        report: dict[str, Any] = self._await(future, TARE_TIMEOUT, stuck)
+        if not report["accepted"]:
+            raise ServiceError(report["message"])
+        return report
+
+    def _set_rate(self, request: RateRequest) -> dict[str, float]:
+        rate = request.rate_hz
+        if not (math.isfinite(rate) and rate > 0):
+            raise ServiceError(f"rate_hz is {rate:g}; allowed: a finite number above 0")
+        future: Future[Event] = self._do(lambda: self._ask_rate(rate))
+        answer = self._await(future, COMMAND_TIMEOUT, "the board did not answer")
+        if not isinstance(answer, Answered) or answer.ack is None:
+            raise ServiceError("the board did not answer")
+        if answer.ack.result is not AckResult.OK:
+            raise ServiceError(f"the board refuses {rate:g} Hz: {answer.ack.result.name}")
+        return {"rate_hz": rate}
+
+    def _ask_rate(self, rate: float) -> Future[Event]:
+        link = self._port.line.links.get(self._node)
+        if not isinstance(link, BoardLink):
+            what = "the board" if link is None else f"the {self._station.identity}"
+            raise ServiceError(f"{what} takes no commands: its rate cannot be set")
+        identity = self._station.identity
+        if identity is not None and identity.max_rate is not None and rate > identity.max_rate:
+            raise ServiceError(
+                f"rate_hz is {rate:g}; the board takes {identity.max_rate:g} at most"
+            )
+        mhz = round(rate * 1000)
+        if mhz < 1:
+            raise ServiceError(f"rate_hz is {rate:g}; the finest step is 0.001")
+        request = link.request(lambda n: SetRate(n, mhz), monotonic_now())
+        return self._station.await_answer(request)
+
+    def _recalibrate(self, _: Nothing) -> dict[str, Any]:
+        def reload() -> dict[str, Any]:
+            self._shelf.reload()
+            self._port.retry(self._node, monotonic_now())
+            return self._station.recalibrate()
+
+        result: dict[str, Any] = self._do(reload)
+        return result
+
+    def _geometry(self, _: Nothing) -> dict[str, Any]:
+        def publish() -> dict[str, Any]:
+            choice = self._station.choice
+            if choice is None:
+                raise ServiceError("no board has been identified yet")
+            self._station.send_geometry()
+            geometry = choice.calibration.geometry
+            return {
+                "model": geometry.model,
+                "frame": geometry.frame,
+                "arrays": [
+                    {
+                        "name": a.name,
+                        "side": a.side.name.lower(),
+                        "rows": a.rows,
+                        "columns": a.columns,
+                        "position_m": a.position.round(6).tolist(),
+                        "normal": a.rotation[:, :, 2].round(6).tolist(),
+                    }
+                    for a in geometry.arrays
+                ],
+            }
+
+        result: dict[str, Any] = self._do(publish)
+        return result
+
+    def _do(self, work: Callable[[], Any]) -> Any:
+        return self._await(self._run(work), PIPELINE_TIMEOUT, "the pipeline does not answer")
+
+    def _await(self, future: Future[Any], timeout: float, otherwise: str) -> Any:
+        try:
+            return future.result(timeout)
+        except FutureTimeoutError:
+            raise ServiceError(otherwise) from None
+        except (CalibrationError, ValueError) as error:
+            raise ServiceError(str(error)) from error

@@ -1,0 +1,349 @@
+"""What tactiled is to do: a TOML file and flags, checked once, as one frozen value.
+
+Flags win over the file. `SettingsError` says what was given and what is allowed; the command then
+exits with 2.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta
+
+from tactile_bus.calibration import CalibrationError, load
+from tactile_bus.can_bus import CanSpec
+from tactile_bus.config import ConfigError, Count, Duration, Positive, Rate, load_toml
+from tactile_bus.recorder import RecorderSettings
+from tactile_bus.session import BusConfig, TlsConfig
+from tactile_bus.topics import NAME
+from tactiled.pipeline_settings import PipelineSettings
+from tactiled.transports import listing
+
+DEFAULT_BAUD = 115_200
+
+DEFAULT_LOG = "tactile-logs"
+"""Folder of the logs, below the folder tactiled was started in."""
+
+DEFAULT_LOG_BYTES = 32 << 30
+"""Bytes that the logs of one name may take in a folder before the oldest go: about 18 h of one
+board at 100 Hz."""
+
+REPLAY_PREFIX = "replay"
+"""First part of every key of a replay, so that nothing old is taken for live."""
+
+T = TypeVar("T")
+
+Node = Annotated[int, Meta(ge=0, le=126, description="a node number from 0 to 126")]
+Kind = Literal["auto", "tactile", "anyskin", "reskin", "eflesh"]
+
+
+class SettingsError(Exception):
+    """Arguments or configuration that are refused."""
+
+
+class BoardTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[[board]]``: one board, on a serial port or a CAN bus."""
+
+    name: str | None = None
+    port: str | None = None
+    can: str | None = None
+    node: Node | None = None
+    kind: Kind = "auto"
+    baud: Count = DEFAULT_BAUD
+    calibration: str | None = None
+
+
+class CompensationTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[compensation]`` of the ambient field; ``rate`` in Hz."""
+
+    method: Literal["off", "ransac", "consensus"] = "consensus"
+    rate: Rate | None = None
+
+
+class SensingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[sensing]``: thresholds of contact, health and taring; see `PipelineSettings`."""
+
+    feature_rate: Rate | None = None
+    contact_minimum_n: Positive = 0.1
+    contact_sigmas: Positive = 4.5
+    tip_light_n: tuple[float, float] = (0.5, 7.5)
+    frozen_after_s: Duration = 0.5
+    range_limit_ut: Positive = 50_000.0
+    tare_s: Duration = 0.5
+    auto_tare: bool | None = None
+    rest_tracking_s: Duration | None = None
+    hold_s: Duration = 1.5
+
+
+class LogTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[log]``: a folder, or a file that ends in .mcap; ``[log.recorder]``: how it is cut."""
+
+    enabled: bool = True
+    destination: str = DEFAULT_LOG
+    recorder: RecorderSettings = RecorderSettings(max_bytes=DEFAULT_LOG_BYTES)
+
+
+class BusTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[bus]``: zenoh endpoints."""
+
+    listen: tuple[str, ...] | None = None
+    connect: tuple[str, ...] | None = None
+    tls: TlsConfig | None = None
+    insecure: bool = False
+
+
+class ConfigFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The whole file."""
+
+    rate: Rate | None = None
+    calibration: tuple[str, ...] = ()
+    board: tuple[BoardTable, ...] = ()
+    compensation: CompensationTable = CompensationTable()
+    sensing: SensingTable = SensingTable()
+    log: LogTable = LogTable()
+    bus: BusTable = BusTable()
+
+
+@dataclass(frozen=True, slots=True)
+class PortSettings:
+    """One port. ``spec``: path, CAN spec or log. ``nodes``: names of boards on a CAN bus by node.
+
+    ``name``: of the board on a serial port; on a bus of its only board, or the stem of the names.
+    """
+
+    name: str
+    spec: str
+    medium: Literal["serial", "can", "log"]
+    kind: str = "auto"
+    baud: int = DEFAULT_BAUD
+    nodes: dict[int, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Everything. ``log``: folder or file, None for none. ``duration``: s, None: until stopped.
+
+    ``speed``: of a replay, inf for as fast as can be.
+    """
+
+    ports: tuple[PortSettings, ...]
+    calibrations: tuple[Path, ...]
+    pipeline: PipelineSettings
+    rate: float | None
+    log: Path | None
+    recorder: RecorderSettings
+    bus: BusConfig
+    duration: float | None
+    wait: bool
+    speed: float
+    config_path: Path | None
+
+    @property
+    def replay(self) -> bool:
+        """Whether a log is played instead of boards being read."""
+        return any(port.medium == "log" for port in self.ports)
+
+
+def make_settings(options: argparse.Namespace) -> Settings:
+    """Settings from parsed flags and the file they name; `SettingsError` for anything wrong."""
+    path: Path | None = options.config
+    try:
+        file = ConfigFile() if path is None else load_toml(path, ConfigFile)
+    except ConfigError as error:
+        raise SettingsError(str(error)) from error
+    ports = _ports(options, file, path)
+    _check_names(ports)
+    calibrations = _calibrations(options, file, path)
+    replay = any(port.medium == "log" for port in ports)
+    return Settings(
+        ports=ports,
+        calibrations=calibrations,
+        pipeline=_pipeline(options, file, path),
+        rate=options.rate if options.rate is not None else file.rate,
+        log=_log(options, file, replay),
+        recorder=file.log.recorder,
+        bus=BusConfig(
+            role="tactiled",
+            listen=tuple(options.listen) if options.listen else file.bus.listen,
+            connect=tuple(options.connect) if options.connect else file.bus.connect,
+            tls=file.bus.tls,
+            insecure=options.insecure or file.bus.insecure,
+        ),
+        duration=options.duration,
+        wait=options.wait,
+        speed=options.speed,
+        config_path=path,
+    )
+
+
+def _ports(
+    options: argparse.Namespace, file: ConfigFile, path: Path | None
+) -> tuple[PortSettings, ...]:
+    given: list[tuple[str, str]] = options.ports or []
+    names: list[str] = options.name or []
+    if options.mcap is not None:
+        if given:
+            raise SettingsError("--mcap plays a log and takes no --port or --can beside it")
+        if len(names) > 1:
+            raise SettingsError(f"{len(names)} names for one log; give --name once: a board in it")
+        return (PortSettings(names[0] if names else "", str(options.mcap), "log"),)
+    if not given:
+        if names or options.board:
+            raise SettingsError("--name and --board go with --port or --can; none is given")
+        if file.board:
+            return _ports_of_file(file.board, path)
+        raise SettingsError(
+            "no board is named: give --port, --can, --mcap or a --config with [[board]] tables; "
+            f"{listing.known_ports()}"
+        )
+    if names and len(names) != len(given):
+        raise SettingsError(
+            f"{len(names)} names for {len(given)} ports; give --name for every one, or for none"
+        )
+    kinds = _each("--board", options.board or ["auto"], len(given))
+    bauds = _each("--baud", options.baud or [DEFAULT_BAUD], len(given))
+    out = []
+    for i, (medium, spec) in enumerate(given):
+        name = names[i] if names else f"board{i}"
+        if medium == "can":
+            _check_can(spec)
+            if options.board and kinds[i] not in ("auto", "tactile"):
+                raise SettingsError(f"{spec}: {kinds[i]} boards have no CAN; they are serial")
+            out.append(PortSettings(name, spec, "can"))
+        else:
+            out.append(PortSettings(name, spec, "serial", kinds[i], bauds[i]))
+    return tuple(out)
+
+
+def _ports_of_file(boards: tuple[BoardTable, ...], path: Path | None) -> tuple[PortSettings, ...]:
+    out: list[PortSettings] = []
+    buses: dict[str, PortSettings] = {}
+    for i, board in enumerate(boards):
+        where, name = f"{path}: board[{i}]", board.name or f"board{i}"
+        if (board.port is None) == (board.can is None):
+            raise SettingsError(f"{where} needs either port or can")
+        if board.port is not None:
+            if board.node is not None:
+                raise SettingsError(f"{where}: node goes with can, not with port")
+            out.append(PortSettings(name, board.port, "serial", board.kind, board.baud))
+            continue
+        spec = board.can or ""
+        _check_can(spec, where)
+        if board.kind not in ("auto", "tactile"):
+            raise SettingsError(f"{where}: {board.kind} boards have no CAN; they are serial")
+        bus = buses.get(spec)
+        if bus is None:
+            bus = PortSettings(name, spec, "can")
+            buses[spec] = bus
+            out.append(bus)
+        elif board.node is None or not bus.nodes:
+            raise SettingsError(f"{where}: several boards on {spec} need a node each")
+        if board.node is not None:
+            if board.node in bus.nodes:
+                raise SettingsError(f"{where}: node {board.node} of {spec} is named twice")
+            bus.nodes[board.node] = name
+    return tuple(out)
+
+
+def _each(flag: str, values: list[T], ports: int) -> list[T]:
+    if len(values) == 1:
+        return values * ports
+    if len(values) != ports:
+        raise SettingsError(
+            f"{flag} is given {len(values)} times for {ports} ports; give it once for all, or for "
+            "each in their order"
+        )
+    return values
+
+
+def _check_can(spec: str, where: str = "--can") -> None:
+    try:
+        CanSpec.parse(spec)
+    except ValueError as error:
+        raise SettingsError(f"{where}: {error}") from error
+
+
+def _check_names(ports: tuple[PortSettings, ...]) -> None:
+    names = [n for p in ports if p.name for n in (p.nodes.values() if p.nodes else (p.name,))]
+    for name in names:
+        if not NAME.fullmatch(name):
+            raise SettingsError(
+                f"the name {name!r} cannot be used; allowed: letters, digits, _ and -, at most 64"
+            )
+    for what, values in (("name", names), ("port", [p.spec for p in ports])):
+        twice = [value for value, count in Counter(values).items() if count > 1]
+        if twice:
+            raise SettingsError(f"the {what} {twice[0]} is given twice")
+
+
+def _calibrations(
+    options: argparse.Namespace, file: ConfigFile, path: Path | None
+) -> tuple[Path, ...]:
+    """Flags, or else the file's, whose paths are relative to the file."""
+    base = Path() if path is None else path.parent
+    named = [Path(p) for p in options.calibration or ()]
+    if not named:
+        named = [base / p for p in file.calibration]
+        named += [base / b.calibration for b in file.board if b.calibration is not None]
+    unique = tuple(dict.fromkeys(named))
+    owners: dict[str, Path] = {}
+    for each in unique:
+        try:
+            serial = load(each).serial_number
+        except CalibrationError as error:
+            raise SettingsError(str(error)) from error
+        if serial in owners:
+            raise SettingsError(f"{owners[serial]} and {each} are both for board {serial}")
+        owners[serial] = each
+    return unique
+
+
+def _pipeline(options: argparse.Namespace, file: ConfigFile, path: Path | None) -> PipelineSettings:
+    s, c = file.sensing, file.compensation
+    try:
+        return PipelineSettings(
+            method=options.compensation or c.method,
+            compensation_rate_hz=options.compensation_rate or c.rate,
+            feature_rate_hz=options.feature_rate or s.feature_rate,
+            contact_minimum_n=s.contact_minimum_n,
+            contact_sigmas=s.contact_sigmas,
+            tip_light_n=s.tip_light_n,
+            frozen_after_s=s.frozen_after_s,
+            range_limit_ut=s.range_limit_ut,
+            tare_s=s.tare_s,
+            auto_tare=s.auto_tare,
+            rest_tracking_s=s.rest_tracking_s,
+            hold_s=s.hold_s,
+        )
+    except ValueError as error:
+        raise SettingsError(f"{path}: {error}" if path is not None else str(error)) from error
+
+
+def _log(options: argparse.Namespace, file: ConfigFile, replay: bool) -> Path | None:
+    """A replay is logged only when --log asks for it: everything is in its log already."""
+    if options.no_log:
+        return None
+    if options.log is not None:
+        return Path(options.log)
+    if replay or not file.log.enabled:
+        return None
+    return Path(file.log.destination)
+
+
+def finite_above_zero(text: str, unit: str) -> float:
+    """Number of a flag; `argparse.ArgumentTypeError` unless finite and above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(
+            f"{text} given; allowed: a finite number of {unit} above 0"
+        )
+    return value

@@ -1,0 +1,102 @@
+"""The calibrations the user gave, and which of them belongs to a board."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tactile_bus.calibration import (
+    BoardCalibration,
+    CalibrationMismatch,
+    load,
+    nominal,
+    nominal_from_descriptor,
+)
+from tactiled.events import Identity, Refusal
+
+UNNUMBERED = "unknown"
+"""Serial number in the nominal calibration of a board that has none."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Choice:
+    """The calibration to use. ``path``: None for nominal figures. ``warning``: empty for none."""
+
+    calibration: BoardCalibration
+    path: Path | None
+    warning: str = ""
+
+
+class Shelf:
+    """Calibration files by serial number.
+
+    ``strict``: a board that no file belongs to is refused rather than run on nominal figures; so
+    it is when there are as many files as ports, for then one of them must be wrong.
+    """
+
+    def __init__(self, paths: Sequence[Path], strict: bool) -> None:
+        self._paths = tuple(paths)
+        self._strict = strict
+        self._files: dict[Path, BoardCalibration] = {}
+        self.reload()
+
+    def reload(self) -> None:
+        """Read every file again; `CalibrationError` (and nothing changed) when one is bad."""
+        self._files = {path: load(path) for path in self._paths}
+
+    def choose(self, identity: Identity) -> Choice | Refusal:
+        """Calibration for a board, or why there is none."""
+        own = [(p, c) for p, c in self._files.items() if c.serial_number == identity.serial_number]
+        if own:
+            path, calibration = own[-1]
+            return _fitting(identity, calibration, path)
+        if not identity.serial_number:
+            alike = [
+                (p, c)
+                for p, c in self._files.items()
+                if c.model == identity.model and _shapes(c) == identity.shapes
+            ]
+            if len(alike) == 1:
+                path, calibration = alike[0]
+                warning = (
+                    f"{path} is of board {calibration.serial_number}; the {identity} cannot "
+                    "confirm that it is that one"
+                )
+                return Choice(calibration, path, warning)
+        if self._files and self._strict:
+            path, calibration = next(iter(self._files.items()))
+            named = CalibrationMismatch(
+                calibration.serial_number, identity.serial_number or UNNUMBERED, str(path)
+            )
+            problem, _, remedy = str(named).partition("; ")
+            return Refusal(problem, remedy)
+        return _nominal(identity)
+
+
+def _nominal(identity: Identity) -> Choice | Refusal:
+    if identity.descriptor is not None:
+        calibration = nominal_from_descriptor(identity.descriptor)
+    else:
+        count = identity.shapes[0][0] * identity.shapes[0][1]
+        calibration = nominal(identity.model, identity.serial_number or UNNUMBERED, count)
+    warning = f"no calibration for {identity}: nominal figures, forces right to a factor of two"
+    return Choice(calibration, None, warning)
+
+
+def _fitting(identity: Identity, calibration: BoardCalibration, path: Path) -> Choice | Refusal:
+    if _shapes(calibration) == identity.shapes:
+        return Choice(calibration, path)
+    return Refusal(
+        f"{path} describes arrays of {_text(_shapes(calibration))} taxels, {identity} has "
+        f"{_text(identity.shapes)}",
+        "calibrate the board again: its firmware or its arrays have changed since",
+    )
+
+
+def _shapes(calibration: BoardCalibration) -> tuple[tuple[int, int], ...]:
+    return tuple((a.geometry.rows, a.geometry.columns) for a in calibration.arrays)
+
+
+def _text(shapes: tuple[tuple[int, int], ...]) -> str:
+    return " + ".join(f"{rows} × {columns}" for rows, columns in shapes)

@@ -1,0 +1,288 @@
+"""One board in service: from its link's events to messages, with its pipeline and its counts."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import Counter, deque
+from concurrent.futures import Future
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from tactile_bus.calibration import saves
+from tactile_bus.instant import NS_PER_S, Instant, monotonic_now, seconds_between
+from tactile_bus.topics import AMBIENT, FEATURES, FIELD, FORCES, GEOMETRY
+from tactiled.blocks import Cycle, Features, SampleBlock
+from tactiled.events import (
+    Answered,
+    BoardLog,
+    Event,
+    FellSilent,
+    Identified,
+    Identity,
+    Refusal,
+    Refused,
+    Reported,
+    Reset,
+    Resumed,
+    Sampled,
+    Streaming,
+)
+from tactiled.outgoing import MessageMaker
+from tactiled.outlet import Outlet
+from tactiled.pipeline import BoardPipeline, PipelineSettings
+from tactiled.shelf import Choice, Shelf
+
+LATENCIES = 512
+"""Latencies kept for the percentiles: a second at the fastest rate of the chip (493 Hz)."""
+
+FIRMWARE_LEVELS = (10, 20, 30, 40)
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """Received to published, s."""
+
+    p50: float = math.nan
+    p99: float = math.nan
+
+
+class Station:
+    """Owned by the pipeline's thread; others read its plain attributes."""
+
+    def __init__(self, name: str, outlet: Outlet, shelf: Shelf, settings: PipelineSettings) -> None:
+        self.name = name
+        self.identity: Identity | None = None
+        self.choice: Choice | None = None
+        self.pipeline: BoardPipeline | None = None
+        self.refusal: Refusal | None = None
+        self.features: Features | None = None
+        self.last: Cycle | None = None
+        self.state = "waiting"
+        self.rate = 0.0
+        self.latency = Latency()
+        self.sent = 0
+        """Cycles whose forces were published."""
+        self.counters: Counter[str] = Counter()
+        self.board_status: dict[str, int] = {}
+        self._outlet = outlet
+        self._shelf = shelf
+        self._settings = settings
+        self._maker: MessageMaker | None = None
+        self._latencies: deque[float] = deque(maxlen=LATENCIES)
+        self._rate_from: tuple[Instant, int] = (monotonic_now(), 0)
+        self._answers: dict[int, Future[Event]] = {}
+        self._tares: list[Future[dict[str, Any]]] = []
+
+    # Who it is
+
+    def admit(self, identity: Identity) -> Refusal | None:
+        """Judge a board by whether there is a calibration for it."""
+        if identity == self.identity and self.pipeline is not None:
+            return None
+        choice = self._shelf.choose(identity)
+        if isinstance(choice, Refusal):
+            return choice
+        same = self.choice is not None and self.choice.calibration.hash == choice.calibration.hash
+        if not same or self.pipeline is None:
+            self._set_up(choice, identity)
+        return None
+
+    def recalibrate(self) -> dict[str, Any]:
+        """Use the board's calibration as its file now says; ValueError when it does not fit."""
+        if self.identity is None:
+            raise ValueError("no board has been identified yet")
+        choice = self._shelf.choose(self.identity)
+        if isinstance(choice, Refusal):
+            raise ValueError(f"{choice.problem}; {choice.remedy}")
+        self._set_up(choice, self.identity)
+        return self.calibration_summary()
+
+    def calibration_summary(self) -> dict[str, Any]:
+        """Which calibration is in use."""
+        if self.choice is None:
+            return {}
+        calibration = self.choice.calibration
+        return {
+            "serial_number": calibration.serial_number,
+            "hash": calibration.hash,
+            "nominal": calibration.nominal,
+            "file": "" if self.choice.path is None else str(self.choice.path),
+        }
+
+    def _set_up(self, choice: Choice, identity: Identity) -> None:
+        before = None if self.pipeline is None else self.pipeline.counters
+        calibration = choice.calibration
+        self.choice, self.identity = choice, identity
+        self.pipeline = BoardPipeline(calibration, self._settings)
+        if before is not None:
+            self.counters.update({k: v for k, v in asdict(before).items() if k not in ("cycles",)})
+        self._maker = MessageMaker(calibration, self._outlet.wall)
+        if choice.warning:
+            self._outlet.announce(self.name, logging.WARNING, choice.warning)
+        recorder = self._outlet.recorder
+        if recorder is not None:
+            text = saves(calibration).encode()
+            recorder.attach(f"{self.name}.cal.toml", "application/toml", text)
+            summary = {key: str(value) for key, value in self.calibration_summary().items()}
+            recorder.metadata(
+                f"board:{self.name}",
+                {"model": identity.model, "firmware": identity.firmware} | summary,
+            )
+        self.send_geometry()
+
+    def send_geometry(self) -> None:
+        """Publish where the taxels are; nothing before a board has been identified."""
+        if self._maker is not None:
+            now_ns = self._outlet.wall.wall_ns(monotonic_now())
+            self._outlet.send(GEOMETRY, self.name, self._maker.geometry(now_ns), now_ns)
+
+    # What happens
+
+    def handle(self, event: Event) -> None:
+        """Act on one event of the board's link."""
+        match event:
+            case Sampled(block):
+                self._on_block(block)
+            case Identified(identity, rebooted):
+                self.identity, self.refusal, self.state = identity, None, "identified"
+                if self.pipeline is not None and rebooted:
+                    self.pipeline.reset()
+                version = f", firmware {identity.firmware}" if identity.firmware else ""
+                self._say(logging.INFO, f"{identity}{version} found")
+            case Streaming(rate):
+                self.state = "streaming"
+                self._say(logging.INFO, f"streaming at {rate:g} Hz" if rate else "streaming")
+            case Refused(refusal):
+                self.refusal, self.state = refusal, "refused"
+                self._say(logging.ERROR, f"refused: {refusal.problem}; {refusal.remedy}")
+            case FellSilent(seconds):
+                self.state = "silent"
+                self.counters["silences"] += 1
+                self._say(logging.WARNING, f"no samples for {seconds:.2f} s")
+            case Resumed(seconds):
+                self.state = "streaming"
+                self._say(logging.INFO, f"samples again after {seconds:.2f} s")
+            case Reset(reason):
+                self.counters["resets"] += 1
+                if self.pipeline is not None:
+                    self.pipeline.reset()
+                self._say(logging.WARNING, f"the board restarted: {reason}")
+            case BoardLog(level, captured, text):
+                known = max((n for n in FIRMWARE_LEVELS if n <= level), default=10)
+                self._outlet.firmware_text(
+                    self.name, known, f"{self.name} firmware", text, captured
+                )
+            case Reported(status):
+                self.board_status = {
+                    "overruns": status.overruns,
+                    "rx_errors": status.rx_errors,
+                    "chip_errors": status.chip_errors,
+                    "uptime_s": status.uptime_ms // 1000,
+                }
+            case Answered(request, _):
+                waiting = self._answers.pop(request, None)
+                if waiting is not None:
+                    waiting.set_result(event)
+            case _:
+                raise TypeError(f"no board's event: {event!r}")
+
+    def port_lost(self, reason: str) -> None:
+        """The port went away under the board."""
+        self.state = "unplugged"
+        self._say(logging.WARNING, f"{reason}; waiting for it to come back")
+
+    def await_answer(self, request: int) -> Future[Event]:
+        """What the board answers to a request."""
+        future: Future[Event] = Future()
+        self._answers[request] = future
+        return future
+
+    def tare(self) -> Future[dict[str, Any]]:
+        """Begin a tare; the future holds its report when it ends. ValueError without a board."""
+        if self.pipeline is None:
+            raise ValueError("no board has been identified yet")
+        if self.state != "streaming":
+            raise ValueError(f"the board is {self.state}: there are no samples to tare on")
+        self.pipeline.tare()
+        future: Future[dict[str, Any]] = Future()
+        self._tares.append(future)
+        return future
+
+    def flush(self) -> None:
+        """Send the cycle under way, as it stands."""
+        if self.pipeline is not None:
+            for cycle in self.pipeline.flush():
+                self._send(cycle)
+
+    def each_second(self, now: Instant) -> None:
+        """Work out rate and latency of the last second."""
+        since, count = self._rate_from
+        elapsed = seconds_between(since, now)
+        if elapsed > 0:
+            self.rate = (self.sent - count) / elapsed
+        self._rate_from = (now, self.sent)
+        if self._latencies:
+            ordered = sorted(self._latencies)
+            last = len(ordered) - 1
+            self.latency = Latency(ordered[last // 2], ordered[math.ceil(last * 0.99)])
+            self._latencies.clear()
+        else:
+            self.latency = Latency()
+
+    def drops(self) -> dict[str, int]:
+        """Cycles and blocks that did not make it through the pipeline, by reason."""
+        counts = Counter(self.counters)
+        if self.pipeline is not None:
+            counts.update(asdict(self.pipeline.counters))
+        return {
+            reason: counts[reason]
+            for reason in (
+                "lost_cycles",
+                "incomplete_cycles",
+                "late_blocks",
+                "duplicate_blocks",
+                "unknown_array",
+                "wrong_shape",
+            )
+        }
+
+    def _on_block(self, block: SampleBlock) -> None:
+        pipeline = self.pipeline
+        if pipeline is None:
+            return
+        before = pipeline.tare_report
+        for cycle in pipeline.feed(block):
+            self._send(cycle)
+        report = pipeline.tare_report
+        if report is not None and report is not before:
+            level = logging.INFO if report.accepted else logging.WARNING
+            self._say(level, report.message)
+            result = {
+                "accepted": report.accepted,
+                "message": report.message,
+                "cycles": report.cycles,
+                "shift_ut": report.shift_ut,
+                "noise_ut": report.noise_ut.tolist(),
+            }
+            for future in self._tares:
+                future.set_result(result)
+            self._tares.clear()
+
+    def _send(self, cycle: Cycle) -> None:
+        maker, outlet, name = self._maker, self._outlet, self.name
+        if maker is None:
+            return
+        stamp_ns = outlet.wall.wall_ns(cycle.captured)
+        if cycle.features_due:
+            outlet.send(FEATURES, name, maker.features(cycle), stamp_ns)
+        self._latencies.append((monotonic_now() - cycle.received) / NS_PER_S)
+        outlet.send(FORCES, name, maker.forces(cycle), stamp_ns)
+        outlet.send(FIELD, name, maker.field(cycle), stamp_ns)
+        if cycle.ambient.method != "off":
+            outlet.send(AMBIENT, name, maker.ambient(cycle), stamp_ns)
+        self.features, self.last = cycle.features, cycle
+        self.sent += 1
+
+    def _say(self, level: int, text: str) -> None:
+        self._outlet.announce(self.name, level, text)

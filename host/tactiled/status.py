@@ -1,0 +1,169 @@
+"""What people see while tactiled runs: a live line for each board, or plain lines now and then."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from tactile_bus.geometry import Side
+from tactile_bus.instant import monotonic_now, seconds_between
+from tactile_bus.recorder import Recorder
+from tactiled import diagnostics
+from tactiled.port import Port
+from tactiled.station import Station
+
+log = logging.getLogger(__name__)
+
+REFRESH = 0.2
+"""s between refreshes of the live lines."""
+
+PLAIN_EVERY = 5.0
+"""s between plain lines."""
+
+FULL_BAR_N = 10.0
+"""N at which a force bar is full: the paper's thresholds lie below."""
+
+BAR = " ▁▂▃▄▅▆▇█"
+STALE_AFTER = 0.5
+"""s without data after which a board's figures are shown as old."""
+
+SIDES = ((Side.LEFT, "L"), (Side.RIGHT, "R"), (Side.TIP, "T"))
+
+
+class Status:
+    """Shows the boards of ``ports``; `show` is called often, from the main thread."""
+
+    def __init__(self, console: Console, ports: list[Port], recorder: Recorder | None) -> None:
+        self._ports = ports
+        self._recorder = recorder
+        self._live: Live | None = None
+        self._plain_at = monotonic_now()
+        if console.is_terminal:
+            self._live = Live(console=console, auto_refresh=False, transient=True)
+
+    def __enter__(self) -> Status:
+        """Begin."""
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the terminal as it was."""
+        if self._live is not None:
+            self._live.stop()
+
+    def show(self) -> None:
+        """Refresh the live lines, or log plain ones when it is time."""
+        if self._live is not None:
+            self._live.update(self._table(), refresh=True)
+        elif seconds_between(self._plain_at, monotonic_now()) >= PLAIN_EVERY:
+            self._plain_at = monotonic_now()
+            for port, node, station in self._boards():
+                cells = [f"{k} {v}" for k, v in describe(port, node, station).items() if v]
+                log.info("%s: %s", station.name, ", ".join(cells))
+            if self._recorder is not None:
+                log.info("log %s", describe_log(self._recorder))
+
+    def _boards(self) -> list[tuple[Port, int, Station]]:
+        return [
+            (port, node, station)
+            for port in self._ports
+            for node, station in list(port.stations.items())
+        ]
+
+    def _table(self) -> Table:
+        table = Table.grid(padding=(0, 2))
+        for port, node, station in self._boards():
+            cells = describe(port, node, station)
+            style = {"streaming": "green", "refused": "red"}.get(station.state, "yellow")
+            table.add_row(
+                Text(station.name, "bold"),
+                Text(cells.pop("state"), style),
+                *(Text(f"{k} {v}" if v else "") for k, v in cells.items()),
+            )
+        if self._recorder is not None:
+            good = self._recorder.stats.state == "recording"
+            row = Text(describe_log(self._recorder), "" if good else "red")
+            grid = Table.grid()
+            grid.add_row(table)
+            grid.add_row(Text.assemble(("log ", "dim"), row))
+            return grid
+        return table
+
+
+def describe(port: Port, node: int, station: Station) -> dict[str, str]:
+    """State of a board in a few short texts; empty where there is nothing to say."""
+    cycle = station.last
+    fresh = cycle is not None and seconds_between(cycle.received, monotonic_now()) < STALE_AFTER
+    latency = station.latency
+    cells = {
+        "state": station.state,
+        "rate": f"{station.rate:.1f} Hz",
+        "drops": drops_text(diagnostics.drops(port, node, station)),
+        "latency": ""
+        if math.isnan(latency.p50)
+        else f"{latency.p50 * 1e3:.1f}/{latency.p99 * 1e3:.1f} ms",
+        "field": "",
+        "force": "",
+        "because": "",
+    }
+    if cycle is not None and fresh:
+        ambient = cycle.ambient
+        if ambient.method != "off":
+            good = "ok" if ambient.valid.all() else "INVALID"
+            worst = float(np.nanmin(ambient.support)) if ambient.support.size else 0.0
+            residual = float(np.nanmax(ambient.residual_ut)) if ambient.residual_ut.size else 0.0
+            cells["field"] = f"{good} {worst:.0%} ±{residual:.1f} µT"
+        cells["force"] = force_text(station)
+        cells["because"] = ", ".join(cycle.features.reasons)
+    return cells
+
+
+def drops_text(drops: dict[str, int]) -> str:
+    """Counts by reason, the largest first."""
+    if not drops:
+        return "0"
+    ordered = sorted(drops.items(), key=lambda item: -item[1])
+    shown = " ".join(f"{reason}={n}" for reason, n in ordered[:4])
+    return f"{shown} …" if len(ordered) > 4 else shown
+
+
+def force_text(station: Station) -> str:
+    """Peak normal force of each side as a bar and in N."""
+    cycle, choice = station.last, station.choice
+    if cycle is None or choice is None:
+        return ""
+    geometry = choice.calibration.geometry
+    normal = -cycle.force[:, 2]
+    peaks: dict[Any, float] = {}
+    for array, taxels in zip(geometry.arrays, geometry.slices, strict=True):
+        seen = normal[taxels]
+        if np.isfinite(seen).any():
+            peaks[array.side] = max(peaks.get(array.side, 0.0), float(np.nanmax(seen)))
+    return " ".join(
+        f"{letter}{bar(peaks[side])}{peaks[side]:4.1f} N" for side, letter in SIDES if side in peaks
+    )
+
+
+def bar(force: float) -> str:
+    """One character for a force in N, full at `FULL_BAR_N`."""
+    level = round(min(max(force / FULL_BAR_N, 0.0), 1.0) * (len(BAR) - 1))
+    return BAR[level]
+
+
+def describe_log(recorder: Recorder) -> str:
+    """State of the log in one line."""
+    stats = recorder.stats
+    text = f"{stats.path}  {stats.bytes_written / 1e6:.1f} MB"
+    if stats.state != "recording":
+        text += f"  {stats.state.upper()} {stats.last_error}"
+    if stats.dropped:
+        text += f"  dropped {drops_text(stats.dropped)}"
+    return text
