@@ -1,0 +1,171 @@
+"""The seam between physics and everything that touches it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_device.world.scenes import Scene
+from tactile_bus.arm_types import Twist
+
+Float = NDArray[np.float64]
+
+PHYSICS_STEP = 0.005
+"""s; 10 ms explodes in MuJoCo, 5 ms is as clean as 2.5 and twice as fast."""
+
+WALL = -1
+"""Body id of back and side walls among contacts."""
+
+MERGE_RADIUS = 0.003
+"""m; touches of one body closer than this are one contact. Engines report the upper and lower
+corner of an edge apart, and corners wander by v_max × a control period = 0.5 mm."""
+
+
+@dataclass(frozen=True, slots=True)
+class FingerContact:
+    """One place where a body presses on the finger.
+
+    ``x``, ``y``: m in ``ee``, on the finger's surface. ``normal_x``, ``normal_y``: outward unit
+    normal of the finger there. ``force_x``, ``force_y``: N in ``ee``, what the body exerts on the
+    finger, friction included. ``body``: index into ``Scene.objects``, or `WALL`.
+    """
+
+    x: float
+    y: float
+    normal_x: float
+    normal_y: float
+    force_x: float
+    force_y: float
+    body: int
+
+    @property
+    def normal_force(self) -> float:
+        """N, positive when pressed."""
+        return -(self.force_x * self.normal_x + self.force_y * self.normal_y)
+
+    @property
+    def shear_force(self) -> float:
+        """N, friction along the surface; positive 90° counter-clockwise of the outward normal."""
+        return self.force_y * self.normal_x - self.force_x * self.normal_y
+
+
+@dataclass(frozen=True, slots=True)
+class FingerState:
+    """Pivot's pose (m, m, rad) and twist in ``cupboard``, wrench (N, N, N·m) on the finger.
+
+    The wrench is what contacts exert, about the pivot, averaged over the last step.
+    """
+
+    x: float
+    y: float
+    heading: float
+    twist: Twist
+    fx: float
+    fy: float
+    mz: float
+
+
+class World(Protocol):
+    """A cupboard with a finger in it, in one plane. Deterministic: same calls, same bits."""
+
+    @property
+    def scene(self) -> Scene:
+        """What it was built from."""
+        ...
+
+    @property
+    def time(self) -> float:
+        """Simulated s since it was built."""
+        ...
+
+    def step(self, dt: float, twist: Twist) -> None:
+        """Advance ``dt`` s, the pivot's motors asking for ``twist``.
+
+        ``dt`` is a multiple of `PHYSICS_STEP`, else ValueError, as where ``twist`` is not finite.
+        """
+        ...
+
+    def limit_wrench(self, f_max: float, m_max: float) -> None:
+        """Bound the motors: N on each axis of ``cupboard``, N·m about the pivot; ValueError."""
+        ...
+
+    def contacts(self) -> tuple[FingerContact, ...]:
+        """Contacts on the finger, forces averaged over the last `step`."""
+        ...
+
+    def finger(self) -> FingerState:
+        """Where the finger is, how it moves and what pushes it."""
+        ...
+
+    def poses(self) -> Float:
+        """(n, 3) x, y m and yaw rad of each object in ``cupboard``; NaN once it has fallen off."""
+        ...
+
+    @property
+    def ejected(self) -> int:
+        """Objects pushed past the front edge of the shelf."""
+        ...
+
+    def kinetic_energy(self) -> float:
+        """J, of finger and objects in the plane."""
+        ...
+
+    @property
+    def motor_work(self) -> float:
+        """J that the motors have put in since it was built, braking counted negative."""
+        ...
+
+
+def substeps(dt: float) -> int:
+    """Physics steps in ``dt`` s; ValueError when it holds no whole number of them."""
+    count = round(dt / PHYSICS_STEP)
+    if count < 1 or abs(count * PHYSICS_STEP - dt) > 1e-9:
+        raise ValueError(f"a step of {dt} s is no multiple of {PHYSICS_STEP} s")
+    return count
+
+
+def merge_contacts(rows: Float, bodies: NDArray[np.int64], count: int) -> list[FingerContact]:
+    """Contacts from touches of ``count`` physics steps.
+
+    ``rows``: (k, 6) x, y, normal x, y, force x, y in ``ee``; ``bodies``: (k,). Touches of one
+    body within `MERGE_RADIUS` of each other become one: forces summed and divided by ``count``,
+    place and normal weighted by normal force.
+    """
+    normal = np.maximum(-(rows[:, 4] * rows[:, 2] + rows[:, 5] * rows[:, 3]), 0.0)
+    open_groups: list[list[float]] = []
+    owners: list[int] = []
+    for (x, y, nx, ny, fx, fy), weight, body in zip(
+        rows.tolist(), normal.tolist(), bodies.tolist(), strict=True
+    ):
+        if weight <= 0.0:
+            continue
+        for group, owner in zip(open_groups, owners, strict=True):
+            total = group[6]
+            dx, dy = x - group[0] / total, y - group[1] / total
+            if owner == body and dx * dx + dy * dy < MERGE_RADIUS**2:
+                break
+        else:
+            group = [0.0] * 7
+            open_groups.append(group)
+            owners.append(body)
+        for index, value in enumerate((x * weight, y * weight, nx * weight, ny * weight, fx, fy)):
+            group[index] += value
+        group[6] += weight
+    contacts = []
+    for (x, y, nx, ny, fx, fy, weight), body in zip(open_groups, owners, strict=True):
+        length = float(np.hypot(nx, ny))
+        contacts.append(
+            FingerContact(
+                x=x / weight,
+                y=y / weight,
+                normal_x=nx / length,
+                normal_y=ny / length,
+                force_x=fx / count,
+                force_y=fy / count,
+                body=body,
+            )
+        )
+    return contacts

@@ -1,0 +1,270 @@
+"""A scene as a planar MuJoCo model.
+
+Figures and their reasons come from trials of several engines: elliptic cones because pyramidal
+ones make jams slip, ``impratio`` 10 because at 1 objects creep at half their friction, 5 ms
+because 10 explodes. Each object slides in x, y, z and turns about z. A disc is a sphere, because
+only its outline in the plane matters and spheres are the cheapest; its box neighbours are tall.
+Weight rests on one massless support sphere whose torsional friction makes sliding and turning
+share one ellipsoidal limit surface, as a spread-out footprint does.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import mujoco
+import numpy as np
+
+from sim_device.world.base import PHYSICS_STEP
+from sim_device.world.parameters import WorldParameters
+from sim_device.world.scenes import Scene, SceneObject, Shape
+from tactile_bus.geometry import FINGER_HEIGHT, FINGER_OUTLINE
+
+PLANE_HEIGHT: Final = 0.06
+"""m, of the plane in which all bodies are centred: half the height of a box."""
+
+SUPPORT_RADIUS: Final = 0.005
+"""m, of the sphere an object rests on."""
+
+DROP: Final = 0.3
+"""m, from the shelf to the floor in front of it, where what fell lies still and costs nothing."""
+
+MOTOR_KV: Final = 600.0
+"""N·s/m; with 3 kg a time constant of 5 ms, one physics step."""
+
+MOTOR_KW: Final = 10.0
+"""N·m·s/rad; with 0.05 kg·m² likewise."""
+
+CONTACT_SOLREF: Final = (0.01, 1.0)
+CONTACT_SOLIMP: Final = (0.95, 0.99, 0.0005, 0.5, 2.0)
+SUPPORT_SOLREF: Final = (0.02, 1.0)
+
+# Bits of contype/conaffinity: bodies of the plane touch each other, supports only the ground.
+_PLANAR, _GROUND = 1, 2
+
+FINGER_BODY: Final = "finger"
+FINGER_GEOM: Final = "finger"
+BACK_WALL: Final = "back"
+
+
+def mean_lever(item: SceneObject) -> float:
+    """Mean distance in m of a footprint's points from its centre: torsional friction over sliding.
+
+    Two thirds of the radius for a disc; for a rectangle the integral in closed form (0.383 of the
+    side for a square).
+    """
+    if item.shape is Shape.DISC:
+        return item.radius * 2 / 3
+    p, q = item.size_x / 2, item.size_y / 2
+    d = math.hypot(p, q)
+    whole = 2 * p * q * d + p**3 * math.log((q + d) / p) + q**3 * math.log((p + d) / q)
+    return whole / (6 * p * q)
+
+
+def yaw_inertia(item: SceneObject) -> float:
+    """Moment of inertia about the vertical through the centre, kg·m², of a homogeneous object."""
+    if item.shape is Shape.DISC:
+        return item.mass * item.radius**2 / 2
+    return item.mass * (item.size_x**2 + item.size_y**2) / 12
+
+
+def base_spec(gravity: float = 9.81) -> mujoco.MjSpec:
+    """Empty model with the solver's settings. ``gravity`` in m/s², downwards."""
+    spec = mujoco.MjSpec()
+    option = spec.option
+    option.timestep = PHYSICS_STEP
+    option.gravity = [0.0, 0.0, -gravity]
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = 10.0
+    option.iterations = 50
+    option.tolerance = 1e-8
+    option.enableflags = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    # Bounding trees over bodies of one shape each cost an eighth of the time and find nothing.
+    option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
+    return spec
+
+
+def add_object(
+    spec: mujoco.MjSpec,
+    name: str,
+    item: SceneObject,
+    *,
+    friction_objects: float,
+    friction_shelf: float,
+) -> None:
+    """Put ``item`` on the shelf."""
+    body = spec.worldbody.add_body(name=name, pos=[item.x, item.y, PLANE_HEIGHT])
+    for joint, axis in (("x", (1, 0, 0)), ("y", (0, 1, 0)), ("z", (0, 0, 1))):
+        body.add_joint(name=f"{name}_{joint}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+    body.add_joint(name=f"{name}_yaw", type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 0, 1))
+    inertia = yaw_inertia(item)
+    body.explicitinertial = True
+    body.mass = item.mass
+    body.ipos = [0, 0, 0]
+    body.inertia = [inertia, inertia, inertia]
+    if item.shape is Shape.DISC:
+        kind, size = mujoco.mjtGeom.mjGEOM_SPHERE, [item.radius, 0, 0]
+    else:
+        kind = mujoco.mjtGeom.mjGEOM_BOX
+        size = [item.size_x / 2, item.size_y / 2, PLANE_HEIGHT]
+    half = item.yaw / 2
+    body.add_geom(
+        name=name,
+        type=kind,
+        size=size,
+        quat=[math.cos(half), 0, 0, math.sin(half)],
+        mass=0,
+        condim=3,
+        friction=[friction_objects, 0, 0],
+        solref=CONTACT_SOLREF,
+        solimp=CONTACT_SOLIMP,
+        contype=_PLANAR,
+        conaffinity=_PLANAR,
+    )
+    body.add_geom(
+        name=f"{name}_support",
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=[SUPPORT_RADIUS, 0, 0],
+        pos=[0, 0, SUPPORT_RADIUS - PLANE_HEIGHT],
+        mass=0,
+        condim=4,
+        priority=1,
+        friction=[friction_shelf, friction_shelf * mean_lever(item), 0],
+        solref=SUPPORT_SOLREF,
+        contype=_GROUND,
+        conaffinity=0,
+    )
+
+
+def add_wall(
+    spec: mujoco.MjSpec,
+    name: str,
+    point: tuple[float, float],
+    normal: float,
+    friction: float,
+    *,
+    moves: bool = False,
+) -> None:
+    """Vertical plane through ``point`` facing the angle ``normal`` (rad in ``cupboard``).
+
+    ``moves``: it is a mocap body, at a price, so that it can be moved between steps.
+    """
+    # Turn a plane's z axis to the horizontal, then about the vertical.
+    c, s = math.cos(normal / 2), math.sin(normal / 2)
+    h = math.sqrt(0.5)
+    place = [*point, 0.0]
+    body = spec.worldbody.add_body(name=name, pos=place, mocap=True) if moves else spec.worldbody
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[1, 1, 1],
+        pos=[0, 0, 0] if moves else place,
+        quat=[c * h, -s * h, c * h, s * h],
+        condim=3,
+        friction=[friction, 0, 0],
+        solref=CONTACT_SOLREF,
+        solimp=CONTACT_SOLIMP,
+        contype=_PLANAR,
+        conaffinity=_PLANAR,
+    )
+
+
+def add_ground(
+    spec: mujoco.MjSpec, name: str, x: tuple[float, float], half_width: float, top: float
+) -> None:
+    """Horizontal slab that objects rest on, from x[0] to x[1]; its upper face is at ``top``."""
+    half = (x[1] - x[0]) / 2
+    spec.worldbody.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[half, half_width, 0.05],
+        pos=[x[0] + half, 0, top - 0.05],
+        contype=0,
+        conaffinity=_GROUND,
+    )
+
+
+def cupboard_model(scene: Scene, parameters: WorldParameters) -> mujoco.MjModel:
+    """Model of ``scene``: objects ``object_<i>``, walls, shelf, ground, finger and its motors."""
+    spec = base_spec()
+    friction = parameters.friction
+    half = scene.width / 2
+    margin = 0.1
+    add_ground(spec, "shelf", (-parameters.lip, scene.depth + margin), half + margin, 0.0)
+    add_ground(spec, "floor", (-1.0, scene.depth), 1.0, -DROP)
+    walls = {
+        BACK_WALL: ((scene.depth, 0.0), math.pi),
+        "left": ((0.0, half), -math.pi / 2),
+        "right": ((0.0, -half), math.pi / 2),
+    }
+    for name, (point, normal) in walls.items():
+        add_wall(spec, name, point, normal, friction.object_wall)
+    for index, item in enumerate(scene.objects):
+        add_object(
+            spec,
+            f"object_{index}",
+            item,
+            friction_objects=friction.objects,
+            friction_shelf=friction.object_shelf,
+        )
+    _add_finger(spec, scene, parameters)
+    for name in walls:
+        # Friction of two surfaces is the greater of both, which is right but for this pair.
+        spec.add_pair(
+            name=f"finger_{name}",
+            geomname1=name,
+            geomname2=FINGER_GEOM,
+            condim=3,
+            friction=[friction.finger_wall, friction.finger_wall, 0, 0, 0],
+            solref=CONTACT_SOLREF,
+            solimp=CONTACT_SOLIMP,
+        )
+    return spec.compile()
+
+
+def _add_finger(spec: mujoco.MjSpec, scene: Scene, parameters: WorldParameters) -> None:
+    """The finger: its outline extruded, three joints at the pivot, a velocity motor on each."""
+    start = scene.start
+    outline = np.asarray(FINGER_OUTLINE)
+    z = FINGER_HEIGHT / 2
+    vertices = np.concatenate([np.insert(outline, 2, z, axis=1), np.insert(outline, 2, -z, axis=1)])
+    spec.add_mesh(name="finger", uservert=vertices.ravel().tolist())
+    body = spec.worldbody.add_body(name=FINGER_BODY, pos=[start.x, start.y, PLANE_HEIGHT])
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    body.add_joint(name="finger_x", type=slide, axis=(1, 0, 0))
+    body.add_joint(name="finger_y", type=slide, axis=(0, 1, 0))
+    body.add_joint(name="finger_yaw", type=hinge, axis=(0, 0, 1), ref=start.heading)
+    body.quat = [math.cos(start.heading / 2), 0, 0, math.sin(start.heading / 2)]
+    body.explicitinertial = True
+    body.mass = parameters.finger_mass
+    body.ipos = [0, 0, 0]
+    body.inertia = [parameters.finger_inertia] * 3
+    body.add_geom(
+        name=FINGER_GEOM,
+        type=mujoco.mjtGeom.mjGEOM_MESH,
+        meshname="finger",
+        mass=0,
+        condim=3,
+        friction=[parameters.friction.finger_object, 0, 0],
+        solref=CONTACT_SOLREF,
+        solimp=CONTACT_SOLIMP,
+        contype=_PLANAR,
+        conaffinity=_PLANAR,
+    )
+    limits = parameters.limits
+    for joint, gain, bound in (
+        ("finger_x", MOTOR_KV, limits.f_max),
+        ("finger_y", MOTOR_KV, limits.f_max),
+        ("finger_yaw", MOTOR_KW, limits.m_max),
+    ):
+        motor = spec.add_actuator(
+            name=joint,
+            target=joint,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            forcerange=[-bound, bound],
+            forcelimited=True,
+        )
+        motor.set_to_velocity(kv=gain)
