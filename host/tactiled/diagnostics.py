@@ -115,7 +115,7 @@ def message(name: str, values: dict[str, Any], recorder: Recorder | None, wall_n
             "files": stats.files,
             "written": stats.written,
             "bytes": stats.bytes_written,
-            "waiting": stats.waiting,
+            "waiting": stats.queued,
             "errors": stats.errors,
             "last_error": stats.last_error,
         } | {f"{DROPS_PREFIX}{reason}": n for reason, n in stats.dropped.items()}

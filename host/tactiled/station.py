@@ -69,6 +69,7 @@ class Station:
         self._shelf = shelf
         self._settings = settings
         self._maker: MessageMaker | None = None
+        self._warned = ""
         self._latencies: deque[float] = deque(maxlen=LATENCIES)
         self._rate_from: tuple[Instant, int] = (monotonic_now(), 0)
         self._answers: dict[int, Future[Event]] = {}
@@ -118,8 +119,6 @@ class Station:
         if before is not None:
             self.counters.update({k: v for k, v in asdict(before).items() if k not in ("cycles",)})
         self._maker = MessageMaker(calibration, self._outlet.wall)
-        if choice.warning:
-            self._outlet.announce(self.name, logging.WARNING, choice.warning)
         recorder = self._outlet.recorder
         if recorder is not None:
             text = saves(calibration).encode()
@@ -130,6 +129,13 @@ class Station:
                 {"model": identity.model, "firmware": identity.firmware} | summary,
             )
         self.send_geometry()
+
+    def _warn(self) -> None:
+        """Say once what is to be said of the calibration."""
+        choice = self.choice
+        if choice is not None and choice.warning and choice.warning != self._warned:
+            self._warned = choice.warning
+            self._say(logging.WARNING, choice.warning)
 
     def send_geometry(self) -> None:
         """Publish where the taxels are; nothing before a board has been identified."""
@@ -150,6 +156,7 @@ class Station:
                     self.pipeline.reset()
                 version = f", firmware {identity.firmware}" if identity.firmware else ""
                 self._say(logging.INFO, f"{identity}{version} found")
+                self._warn()
             case Streaming(rate):
                 self.state = "streaming"
                 self._say(logging.INFO, f"streaming at {rate:g} Hz" if rate else "streaming")
