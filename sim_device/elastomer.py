@@ -84,8 +84,9 @@ class Elastomer:
         self._compliance = 1.0 / (nominal * stiffness_factor[:, None])
         self._travel = travel
         loop = np.array([p.hysteresis_shear, p.hysteresis_shear, p.hysteresis_normal])
-        # The play lags by knee · peak each way: weighted so that the loop is loop · peak wide.
-        self._play_weight = loop / (2.0 * p.hysteresis_knee)
+        # The play lags by knee · load on the way up and leads by knee · peak on the way down; they
+        # are farthest apart at (1 - 2 knee) · peak, where the loop is to be loop · peak wide.
+        self._play_weight = loop / (2.0 * p.hysteresis_knee * (1.0 - p.hysteresis_knee))
         self._force = np.zeros((n, 3))
         self._creep = np.zeros((n, 3))
         self._play = np.zeros((n, 3))

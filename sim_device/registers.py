@@ -21,12 +21,11 @@ class Registers:
     def __init__(self, skin: SkinModel, rate: float) -> None:
         """``rate``: Hz after a boot; ValueError when the chips do not manage it."""
         self._skin = skin
+        top = _max_rate_mhz([skin.parameters.chip.setting])
+        if not MIN_RATE_MHZ <= rate * 1000 <= top:
+            raise ValueError(f"rate {rate:g} Hz: {MIN_RATE_MHZ / 1000} to {top / 1000:.0f} Hz")
         self._boot_rate_mhz = round(rate * 1000)
         self.restore()
-        if not MIN_RATE_MHZ <= self._boot_rate_mhz <= self.max_rate_mhz:
-            raise ValueError(
-                f"rate {rate:g} Hz: {MIN_RATE_MHZ / 1000} to {self.max_rate_mhz / 1000:.0f} Hz"
-            )
 
     def restore(self) -> None:
         """Settings as after a boot."""

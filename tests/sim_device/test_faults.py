@@ -1,0 +1,93 @@
+"""Fault plans from text and tables."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from sim_device.faults import FaultPlan, TaxelFault, TaxelFaultKind, Window
+from sim_device.scripts import ScriptError
+
+
+def test_plan_from_text() -> None:
+    plan = FaultPlan.parse(
+        "seed=7, flip=1e-5,loss=0.01,delay=0.5:0.1s,silence@5s+2s,silence@9s+1s,reset@8s,"
+        "stuck=left:3@2s,failed=tip:0@1s+0.5s,saturated=right:31,busoff@3.5s+0.25s"
+    )
+    assert plan == FaultPlan(
+        seed=7,
+        flip=1e-5,
+        loss=0.01,
+        delay=0.5,
+        delay_s=0.1,
+        silence=(Window(5, 2), Window(9, 1)),
+        reset=(8.0,),
+        busoff=(Window(3.5, 0.25),),
+        taxels=(
+            TaxelFault(TaxelFaultKind.STUCK, "left", 3, Window(2)),
+            TaxelFault(TaxelFaultKind.FAILED, "tip", 0, Window(1, 0.5)),
+            TaxelFault(TaxelFaultKind.SATURATED, "right", 31, Window(0)),
+        ),
+    )
+
+
+def test_plan_from_a_table_is_that_from_text() -> None:
+    table = {
+        "seed": 7,
+        "flip": 1e-5,
+        "delay": "0.5:0.1s",
+        "silence": ["5s+2s", "9s+1s"],
+        "reset": "8s",
+        "stuck": ["left:3@2s"],
+    }
+    text = "seed=7,flip=1e-5,delay=0.5:0.1s,silence@5s+2s,silence@9s+1s,reset@8s,stuck=left:3@2s"
+    assert FaultPlan.from_table(table, "board.toml: [faults]") == FaultPlan.parse(text)
+
+
+def test_no_text_is_no_fault() -> None:
+    assert FaultPlan.parse("") == FaultPlan()
+    assert not FaultPlan.parse("").touches_wire
+    assert FaultPlan.parse("loss=0.1").touches_wire
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("flip", "fault 'flip' is not understood; allowed: seed=N"),
+        ("flop=0.1", "fault 'flop=0.1' is not understood; allowed"),
+        ("flip=1.5", "fault 'flip=1.5': allowed: a probability from 0 to 1"),
+        ("flip=-1", "allowed: a probability from 0 to 1"),
+        ("loss=nan", "allowed: a probability from 0 to 1"),
+        ("loss=0.1,loss=0.2", "loss is given twice"),
+        ("seed=1,seed=1", "seed is given twice"),
+        ("seed=-1", "allowed: a whole number"),
+        ("seed=1.5", "allowed: a whole number"),
+        ("delay=0.1:2", "allowed: PROBABILITY:SECONDSs"),
+        ("silence@5s", "allowed: Ts[+]Ds"),
+        ("silence=5s+1s", "not understood"),
+        ("reset@5", "allowed: Ts, seconds after power-on"),
+        ("reset@5s+1s", "allowed: Ts, seconds after power-on"),
+        ("stuck=left", "allowed: ARRAY:TAXEL"),
+        ("stuck=left:x", "allowed: ARRAY:TAXEL"),
+        ("stuck=left:1@", "allowed: ARRAY:TAXEL"),
+        ("stuck@2s", "not understood"),
+    ],
+)
+def test_bad_text_names_the_entry_and_what_is_allowed(text: str, message: str) -> None:
+    with pytest.raises(ScriptError, match=message):
+        FaultPlan.parse(text)
+
+
+def test_bad_table_names_file_and_key() -> None:
+    with pytest.raises(ScriptError, match=r"board.toml: \[faults\]: flip: 2: allowed"):
+        FaultPlan.from_table({"flip": 2}, "board.toml: [faults]")
+    with pytest.raises(ScriptError, match="loss: given True; allowed"):
+        FaultPlan.from_table({"loss": True}, "board.toml: [faults]")
+
+
+def test_plan_refuses_figures_out_of_range() -> None:
+    with pytest.raises(ValueError, match="flip is a probability"):
+        FaultPlan(flip=math.nan)
+    with pytest.raises(ValueError, match="delay_s"):
+        FaultPlan(delay_s=math.inf)
