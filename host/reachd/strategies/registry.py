@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import cast
@@ -11,6 +12,7 @@ import numpy as np
 
 from reachd.parameter_fields import Parameters
 from reachd.seam import ArmState, Goal, Strategy, Touch, Twist
+from reachd.strategies.base import ReportsEvents, StrategyEvent
 from reachd.strategies.hybrid import HybridClock, HybridEvent
 from reachd.strategies.isolated import Burrow, Excavate, Straight
 from tactile_bus.instant import Instant
@@ -53,17 +55,37 @@ def load_strategy(spec: str, parameters: Parameters, rng: np.random.Generator) -
     return strategy
 
 
-def ask(
-    strategy: Strategy, touch: Touch, arm: ArmState, goal: Goal, now: Instant
-) -> tuple[Twist | None, str | None]:
-    """One step of a strategy: (twist, None), or (None, what went wrong) whatever it did."""
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a strategy said: twist and activity, what it decided, or how it failed (``failure``)."""
+
+    twist: Twist | None
+    activity: str
+    events: tuple[StrategyEvent, ...] = ()
+    failure: str | None = None
+
+
+def begin(strategy: Strategy, goal: Goal, now: Instant) -> str | None:
+    """Start a reach; returns what went wrong, None when nothing did."""
+    try:
+        strategy.start(goal, now)
+    except Exception as error:  # noqa: BLE001 - a plug-in may raise anything
+        return f"{type(error).__name__}: {error}"
+    return None
+
+
+def ask(strategy: Strategy, touch: Touch, arm: ArmState, goal: Goal, now: Instant) -> Answer:
+    """One step of a strategy, whatever it does: it never raises."""
     try:
         twist = strategy.step(touch, arm, goal, now)
-    except Exception as error:  # noqa: BLE001 - a plug-in may raise anything, and must not end motion control
-        return None, f"{type(error).__name__}: {error}"
+        activity = str(strategy.activity)
+        events = strategy.take_events() if isinstance(strategy, ReportsEvents) else ()
+    except Exception as error:  # noqa: BLE001 - a plug-in may raise anything
+        return Answer(None, "failed", failure=f"{type(error).__name__}: {error}")
     if not isinstance(twist, Twist):
-        return None, f"it returned {type(twist).__name__}, not a Twist"
-    return twist, None
+        said = type(twist).__name__
+        return Answer(None, "failed", failure=f"it returned {said}, not a Twist")
+    return Answer(twist, activity, events)
 
 
 def _offered() -> tuple[EntryPoint, ...]:
