@@ -85,12 +85,14 @@ def crc32c_each(packets: Sequence[bytes]) -> NDArray[np.uint32]:
     values = np.frombuffer(b"".join(packets), dtype=np.uint8)
     if smallest == largest:
         index = values.reshape(len(sizes), largest) + _OFFSETS[-largest:]
-        whole: NDArray[np.uint32] = np.bitwise_xor.reduce(_TABLE.take(index), axis=1)
-        return whole ^ _CONSTANTS[largest]
+        parts: NDArray[np.uint32] = np.bitwise_xor.reduce(_TABLE.take(index), axis=1)
+        parts ^= _CONSTANTS[largest]
+        return parts
     ends = np.cumsum(sizes)
     distance = np.repeat(ends - 1, sizes)
     distance -= np.arange(len(values))
     distance <<= 8
     distance += values
-    parts: NDArray[np.uint32] = np.bitwise_xor.reduceat(_TABLE.take(distance), ends - sizes)
-    return parts ^ _CONSTANTS.take(sizes)
+    parts = np.bitwise_xor.reduceat(_TABLE.take(distance), ends - sizes)
+    parts ^= _CONSTANTS.take(sizes)
+    return parts
