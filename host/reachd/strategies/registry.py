@@ -77,14 +77,14 @@ def begin(strategy: Strategy, goal: Goal, now: Instant) -> str | None:
 def ask(strategy: Strategy, touch: Touch, arm: ArmState, goal: Goal, now: Instant) -> Answer:
     """One step of a strategy, whatever it does: it never raises."""
     try:
-        twist = strategy.step(touch, arm, goal, now)
+        said = strategy.step(touch, arm, goal, now)
+        if not isinstance(said, Twist):
+            raise TypeError(f"step() returned {type(said).__name__}, not a Twist")
+        twist = Twist(float(said.vx), float(said.vy), float(said.omega))
         activity = str(strategy.activity)
         events = strategy.take_events() if isinstance(strategy, ReportsEvents) else ()
     except Exception as error:  # noqa: BLE001 - a plug-in may raise anything
         return Answer(None, "failed", failure=f"{type(error).__name__}: {error}")
-    if not isinstance(twist, Twist):
-        said = type(twist).__name__
-        return Answer(None, "failed", failure=f"it returned {said}, not a Twist")
     return Answer(twist, activity, events)
 
 

@@ -1,0 +1,240 @@
+"""The states of a trial: idle → homing → reaching → resetting → idle. Pure.
+
+Each cycle of the control loop: ``step`` says what is wanted, the gate decides, ``observe`` is told.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+from reachd.homing import Pose, home_twist
+from reachd.outcome import Onsets, Outcome, Reason, Trial
+from reachd.parameter_fields import Parameters
+from reachd.primitives import aim
+from reachd.safety import Decision, Intervention
+from reachd.seam import ZERO, ArmState, Goal, Strategy, Touch, Twist
+from reachd.strategies import StrategyEvent, ask, begin
+from tactile_bus.instant import Instant, seconds_between
+
+HOMING_LIMIT = 60.0
+"""s that homing or resetting may take: half a turn at 0.1 rad/s and the way across the shelf."""
+
+
+class State(StrEnum):
+    """The paper's trial workflow."""
+
+    IDLE = "idle"
+    HOMING = "homing"
+    REACHING = "reaching"
+    RESETTING = "resetting"
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What is wanted now: for the gate, and ``events`` for the log.
+
+    ``wanted`` is None with the reason in ``failure`` when the strategy failed. ``goal`` is set
+    while reaching.
+    """
+
+    wanted: Twist | None
+    goal: Goal | None = None
+    failure: str | None = None
+    events: tuple[StrategyEvent, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What the supervisor is at. ``elapsed`` in s since the state began; ``distance`` in m."""
+
+    state: State
+    activity: str
+    elapsed: float
+    goal: Goal | None
+    distance: float
+    text: str
+    outcome: Outcome | None
+
+
+class Supervisor:
+    """Runs one trial after another with one strategy.
+
+    ``home``: pose from which every reach starts; None to start wherever the arm is, and to stay
+    there on a reset. ``auto_reset``: go home after a reach without being asked.
+    """
+
+    def __init__(
+        self,
+        strategy: Strategy,
+        parameters: Parameters,
+        home: Pose | None = None,
+        *,
+        auto_reset: bool = False,
+    ) -> None:
+        self._strategy = strategy
+        self._parameters = parameters
+        self._home = home
+        self._auto_reset = auto_reset
+        self._state = State.IDLE
+        self._since = Instant(0)
+        self._activity = "idle"
+        self._text = ""
+        self._goal: Goal | None = None
+        self._returning = False
+        self._trial: Trial | None = None
+        self._outcome: Outcome | None = None
+        self._onsets = Onsets()
+
+    @property
+    def state(self) -> State:
+        """State of the trial."""
+        return self._state
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """Outcome of the last reach; None before it and as soon as another goal is accepted."""
+        return self._outcome
+
+    def request_goal(self, goal: Goal, now: Instant) -> str | None:
+        """Begin a trial towards ``goal`` (of ``goals.make_goal``); returns why not."""
+        if self._state is not State.IDLE:
+            return f"a goal is accepted when idle, not when {self._state}: stop and reset first"
+        self._goal = goal
+        self._outcome = None
+        self._enter(State.HOMING, "homing", now)
+        return None
+
+    def request_stop(self, now: Instant, text: str = "stopped by the operator") -> str | None:
+        """End whatever moves; returns why there is nothing to stop."""
+        if self._state is State.IDLE:
+            return "nothing to stop: idle"
+        if self._state is State.REACHING:
+            self._finish(Reason.STOPPED, text, now)
+        elif self._state is State.HOMING:
+            self._idle(text, now)
+        self._returning = False
+        return None
+
+    def request_reset(self, now: Instant) -> str | None:
+        """After a reach: go home and be ready for another goal; returns why not."""
+        if self._state is not State.RESETTING:
+            return f"a reset follows a reach; the state is {self._state}"
+        self._enter(State.RESETTING, "returning", now)
+        self._returning = True
+        return None
+
+    def status(self, now: Instant) -> Status:
+        """What is going on."""
+        trial = self._trial
+        return Status(
+            state=self._state,
+            activity=self._activity,
+            elapsed=seconds_between(self._since, now),
+            goal=self._goal,
+            distance=math.nan if trial is None else trial.distance,
+            text=self._text,
+            outcome=self._outcome,
+        )
+
+    def step(self, touch: Touch | None, arm: ArmState | None, now: Instant) -> Command:
+        """What is wanted in this cycle; zero as long as an input has never come."""
+        if self._state is State.HOMING and arm is not None:
+            twist = self._towards_home(arm)
+            if twist is not None:
+                return self._in_time(twist, now)
+            failure = self._begin_reach(now)
+            if failure is not None:
+                return Command(None, failure=failure)
+        if self._state is State.REACHING:
+            return self._reach(touch, arm, now)
+        if self._state is State.RESETTING and self._returning and arm is not None:
+            twist = self._towards_home(arm)
+            if twist is not None:
+                return self._in_time(twist, now)
+            self._idle("ready for another goal", now)
+        return Command(ZERO)
+
+    def observe(self, decision: Decision, now: Instant) -> tuple[Intervention, ...]:
+        """Take in what the gate made of it; returns the interventions that have just set in.
+
+        A latch ends a reach with its reason and stops homing and resetting.
+        """
+        if self._trial is not None and self._state is State.REACHING:
+            self._trial.onsets.update(decision.interventions)
+        if decision.held is not None:
+            text = next(
+                (i.text for i in decision.interventions if i.code is decision.held), ""
+            ) or str(decision.held)
+            if self._state is State.REACHING:
+                self._finish(Reason.HELD, text, now)
+            elif self._state is State.HOMING:
+                self._idle(text, now)
+            self._returning = False
+        return self._onsets.update(decision.interventions)
+
+    def _enter(self, state: State, activity: str, now: Instant) -> None:
+        self._state, self._activity, self._since = state, activity, now
+
+    def _idle(self, text: str, now: Instant) -> None:
+        self._enter(State.IDLE, "idle", now)
+        self._goal = None
+        self._text = text
+        self._returning = False
+
+    def _finish(self, reason: Reason, text: str, now: Instant) -> None:
+        """Close the trial and wait, holding still, to be reset."""
+        if self._trial is not None:
+            self._outcome = self._trial.end(reason, text, now)
+        self._text = text
+        self._enter(State.RESETTING, "waiting for a reset", now)
+        # Not after a stop or a latch: whoever ended the motion wants none.
+        self._returning = self._auto_reset and reason in (Reason.REACHED, Reason.TIMEOUT)
+
+    def _towards_home(self, arm: ArmState) -> Twist | None:
+        return None if self._home is None else home_twist(arm, self._home, self._parameters)
+
+    def _in_time(self, twist: Twist, now: Instant) -> Command:
+        """``twist``, or standing still when going home takes too long."""
+        if seconds_between(self._since, now) < HOMING_LIMIT:
+            return Command(twist)
+        text = f"not home after {HOMING_LIMIT:g} s: free the arm and bring it home by hand"
+        if self._state is State.HOMING:
+            self._idle(text, now)
+        self._text = text
+        self._returning = False
+        return Command(ZERO)
+
+    def _begin_reach(self, now: Instant) -> str | None:
+        """Leave homing; returns how the strategy failed to start."""
+        goal = self._goal
+        if goal is None:
+            raise RuntimeError("homing without a goal")
+        self._trial = Trial(now)
+        self._enter(State.REACHING, "starting", now)
+        return begin(self._strategy, goal, now)
+
+    def _reach(self, touch: Touch | None, arm: ArmState | None, now: Instant) -> Command:
+        trial, goal, p = self._trial, self._goal, self._parameters
+        if trial is None or goal is None:
+            raise RuntimeError("reaching without a goal")
+        elapsed = seconds_between(trial.began, now)
+        if arm is not None:
+            distance = aim(arm, goal, p.tip_length).distance
+            trial.see(touch, arm, distance)
+            judged = p.success_during_excavation or not self._activity.startswith("excavate")
+            if distance <= goal.radius and judged:
+                text = f"reached within {distance * 1e3:.1f} mm after {elapsed:.2f} s"
+                self._finish(Reason.REACHED, text, now)
+                return Command(ZERO)
+        if elapsed >= goal.time_limit:
+            text = f"not reached within {goal.time_limit:g} s, {trial.distance * 1e3:.1f} mm short"
+            self._finish(Reason.TIMEOUT, text, now)
+            return Command(ZERO)
+        if arm is None or touch is None:
+            return Command(ZERO, goal)
+        answer = ask(self._strategy, touch, arm, goal, now)
+        self._activity = answer.activity
+        trial.hear(answer.events)
+        return Command(answer.twist, goal, answer.failure, answer.events)
