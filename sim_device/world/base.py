@@ -24,6 +24,10 @@ MERGE_RADIUS = 0.003
 corner of an edge apart, and corners wander by v_max × a control period = 0.5 mm."""
 
 
+class WorldError(RuntimeError):
+    """The physics diverged or overflowed: this trial is worth nothing."""
+
+
 @dataclass(frozen=True, slots=True)
 class FingerContact:
     """One place where a body presses on the finger.
@@ -84,7 +88,8 @@ class World(Protocol):
     def step(self, dt: float, twist: Twist) -> None:
         """Advance ``dt`` s, the pivot's motors asking for ``twist``.
 
-        ``dt`` is a multiple of `PHYSICS_STEP`, else ValueError, as where ``twist`` is not finite.
+        ``dt`` is a multiple of `PHYSICS_STEP`, else ValueError, as where ``twist`` is not finite;
+        WorldError where the engine gives up.
         """
         ...
 
@@ -101,12 +106,16 @@ class World(Protocol):
         ...
 
     def poses(self) -> Float:
-        """(n, 3) x, y m and yaw rad of each object in ``cupboard``; NaN once it has fallen off."""
+        """(n, 3) x, y m and yaw rad of each object in ``cupboard``, fallen ones included."""
+        ...
+
+    def on_shelf(self) -> NDArray[np.bool_]:
+        """(n,) whether each object still stands on the shelf."""
         ...
 
     @property
     def ejected(self) -> int:
-        """Objects pushed past the front edge of the shelf."""
+        """Objects that were pushed past the front edge and fell."""
         ...
 
     def kinetic_energy(self) -> float:

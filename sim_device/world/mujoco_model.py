@@ -27,7 +27,7 @@ PLANE_HEIGHT: Final = 0.06
 SUPPORT_RADIUS: Final = 0.005
 """m, of the sphere an object rests on."""
 
-DROP: Final = 0.3
+DROP: Final = 1.0
 """m, from the shelf to the floor in front of it, where what fell lies still and costs nothing."""
 
 MOTOR_KV: Final = 600.0

@@ -1,0 +1,232 @@
+"""The cupboard in MuJoCo: the engine that every published figure comes from."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_device.world.base import (
+    PHYSICS_STEP,
+    WALL,
+    FingerContact,
+    FingerState,
+    Float,
+    WorldError,
+    merge_contacts,
+    substeps,
+)
+from sim_device.world.mujoco_model import FINGER_GEOM, cupboard_model, yaw_inertia
+from sim_device.world.parameters import WorldParameters, world_parameters
+from sim_device.world.plates import settled
+from sim_device.world.scenes import Scene
+from tactile_bus.arm_types import Twist
+
+_FALLEN = -0.02
+"""m below the shelf at which an object counts as fallen; contacts give way by less than 1 mm."""
+
+_FATAL = tuple(
+    int(w)
+    for w in (
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+        mujoco.mjtWarning.mjWARN_CONTACTFULL,
+        mujoco.mjtWarning.mjWARN_CNSTRFULL,
+    )
+)
+
+# Otherwise MuJoCo prints, and writes MUJOCO_LOG.TXT wherever the process happens to stand.
+mujoco.set_mju_user_warning(logging.getLogger(__name__).debug)
+
+_Touches = tuple[NDArray[np.int32], Float, Float, Float, NDArray[np.int32], Float, tuple[float, ...]]
+
+
+class MujocoWorld:
+    """`World` on a planar MuJoCo model of ``scene``.
+
+    ``parameters``: None for the set that the scene names. Objects that overlap a wall are first
+    moved out of it, see `settled`.
+    """
+
+    def __init__(self, scene: Scene, parameters: WorldParameters | None = None) -> None:
+        parameters = parameters or world_parameters(scene.parameters)
+        self._scene = scene
+        start = replace(scene, objects=settled(scene, parameters))
+        self._model = model = cupboard_model(start, parameters)
+        self._data = data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        n = len(scene.objects)
+        self._initial = np.array([[o.x, o.y, o.yaw] for o in start.objects]).reshape(n, 3)
+        self._mass = np.array([[o.mass, o.mass, yaw_inertia(o)] for o in scene.objects])
+        self._finger_mass = (parameters.finger_mass,) * 2 + (parameters.finger_inertia,)
+        self._finger_geom = model.geom(FINGER_GEOM).id
+        self._body_of_geom = np.full(model.ngeom, WALL, dtype=np.int64)
+        for index in range(n):
+            self._body_of_geom[model.geom(f"object_{index}").id] = index
+        # Views: MuJoCo never moves these arrays.
+        self._qpos, self._qvel, self._ctrl = data.qpos, data.qvel, data.ctrl
+        self._finger_qpos, self._finger_qvel = data.qpos[-3:], data.qvel[-3:]
+        self._finger_push = data.qfrc_constraint[-3:]
+        self._objects_qpos = data.qpos[: 4 * n].reshape(n, 4)
+        self._objects_qvel = data.qvel[: 4 * n].reshape(n, 4)
+        self._start = scene.start
+        self._steps = 0
+        self._work = 0.0
+        self._count = 1
+        self._wrench = (0.0, 0.0, 0.0)
+        self._touches: list[_Touches] = []
+        self._contacts: tuple[FingerContact, ...] | None = ()
+
+    @property
+    def scene(self) -> Scene:
+        """What it was built from."""
+        return self._scene
+
+    @property
+    def time(self) -> float:
+        """Simulated s since it was built."""
+        return self._steps * PHYSICS_STEP
+
+    @property
+    def model(self) -> Any:
+        """The ``mujoco.MjModel``, for viewers."""
+        return self._model
+
+    @property
+    def data(self) -> Any:
+        """The ``mujoco.MjData``, for viewers."""
+        return self._data
+
+    def step(self, dt: float, twist: Twist) -> None:
+        """Advance ``dt`` s, see `World.step`."""
+        count = substeps(dt)
+        if not (math.isfinite(twist.vx) and math.isfinite(twist.vy) and math.isfinite(twist.omega)):
+            raise ValueError(f"{twist} is not finite")
+        model, data = self._model, self._data
+        self._ctrl[:] = (twist.vx, twist.vy, twist.omega)
+        self._touches.clear()
+        self._contacts = None
+        total_x = total_y = total_m = 0.0
+        before = self._finger_qvel.tolist()
+        for _ in range(count):
+            pose = (*self._finger_qpos.tolist(),)
+            mujoco.mj_step(model, data)
+            after = self._finger_qvel.tolist()
+            push = self._finger_push.tolist()
+            # By momentum, what contacts did not give the finger, its motors did.
+            for inertia, v0, v1, force in zip(self._finger_mass, before, after, push, strict=True):
+                self._work += (inertia * (v1 - v0) - PHYSICS_STEP * force) * (v0 + v1) / 2
+            before = after
+            total_x += push[0]
+            total_y += push[1]
+            total_m += push[2]
+            if push[0] or push[1] or push[2]:
+                self._keep_touches(pose)
+        self._steps += count
+        self._count = count
+        self._wrench = (total_x / count, total_y / count, total_m / count)
+        warnings = data.warning
+        if any(warnings[kind].number for kind in _FATAL):
+            raise WorldError(f"physics gave up at {self.time:.3f} s of {self._scene.source} scene")
+
+    def _keep_touches(self, pose: tuple[float, ...]) -> None:
+        """Copy what `contacts` will need of this physics step; it may never be asked."""
+        contact = self._data.contact
+        self._touches.append(
+            (
+                contact.geom.copy(),
+                contact.pos.copy(),
+                contact.frame.copy(),
+                contact.dist.copy(),
+                contact.efc_address.copy(),
+                self._data.efc_force.copy(),
+                pose,
+            )
+        )
+
+    def limit_wrench(self, f_max: float, m_max: float) -> None:
+        """Bound the motors, see `World.limit_wrench`."""
+        if not (0 < f_max < math.inf and 0 < m_max < math.inf):
+            raise ValueError(f"wrench limits {f_max} N and {m_max} N·m are not finite and positive")
+        bound = np.array([f_max, f_max, m_max])
+        self._model.actuator_forcerange[:] = np.stack([-bound, bound], axis=1)
+
+    def contacts(self) -> tuple[FingerContact, ...]:
+        """Contacts on the finger, forces averaged over the last step."""
+        if self._contacts is None:
+            self._contacts = self._merged()
+        return self._contacts
+
+    def _merged(self) -> tuple[FingerContact, ...]:
+        """Contacts from the touches kept of each physics step."""
+        rows, bodies = [], []
+        for geoms, position, frames, distance, address, forces, pose in self._touches:
+            is_first = geoms[:, 0] == self._finger_geom
+            index = np.flatnonzero((is_first | (geoms[:, 1] == self._finger_geom)) & (address >= 0))
+            if not len(index):
+                continue
+            other = np.where(is_first, geoms[:, 1], geoms[:, 0])[index]
+            # Normals point from the first geom to the second, forces act on the second.
+            sign = np.where(is_first, 1.0, -1.0)[index, None]
+            frame = frames.reshape(-1, 3, 3)[index]
+            force = forces[address[index, None] + np.arange(3)]
+            planar = np.einsum("ki,kij->kj", force, frame)[:, :2] * -sign
+            normal = frame[:, 0, :2] * sign
+            # Half of the depth from the middle of the overlap to the finger's own surface.
+            place = position[index, :2] - normal * distance[index, None] / 2
+            c, s = math.cos(pose[2]), math.sin(pose[2])
+            to_ee = np.array([[c, -s], [s, c]])
+            origin = (pose[0] + self._start.x, pose[1] + self._start.y)
+            rows.append(np.hstack([(place - origin) @ to_ee, normal @ to_ee, planar @ to_ee]))
+            bodies.append(self._body_of_geom[other])
+        if not rows:
+            return ()
+        return tuple(merge_contacts(np.concatenate(rows), np.concatenate(bodies), self._count))
+
+    def finger(self) -> FingerState:
+        """Where the finger is, how it moves and what pushes it."""
+        x, y, heading = self._finger_qpos.tolist()
+        fx, fy, mz = self._wrench
+        return FingerState(
+            x=x + self._start.x,
+            y=y + self._start.y,
+            heading=heading,
+            twist=Twist(*self._finger_qvel.tolist()),
+            fx=fx,
+            fy=fy,
+            mz=mz,
+        )
+
+    def poses(self) -> Float:
+        """(n, 3) x, y m and yaw rad of each object."""
+        poses: Float = self._initial + self._objects_qpos[:, [0, 1, 3]]
+        return poses
+
+    def on_shelf(self) -> NDArray[np.bool_]:
+        """(n,) whether each object still stands on the shelf."""
+        standing: NDArray[np.bool_] = self._objects_qpos[:, 2] > _FALLEN
+        return standing
+
+    @property
+    def ejected(self) -> int:
+        """Objects that were pushed past the front edge and fell."""
+        return int(np.count_nonzero(~self.on_shelf()))
+
+    def kinetic_energy(self) -> float:
+        """J, of finger and objects in the plane."""
+        objects = float((self._mass * self._objects_qvel[:, [0, 1, 3]] ** 2).sum())
+        finger = sum(
+            m * v * v for m, v in zip(self._finger_mass, self._finger_qvel.tolist(), strict=True)
+        )
+        return (objects + finger) / 2
+
+    @property
+    def motor_work(self) -> float:
+        """J that the motors have put in since it was built."""
+        return self._work
