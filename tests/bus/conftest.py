@@ -1,0 +1,171 @@
+"""Messages of every kind, free ports, and a disk that fails when told to."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tactile_bus import topics
+from tactile_bus.mcap_file import DiskStorage
+from tactile_bus.messages import MSG, codec, diagnostic_status, header, log_message
+from tactile_bus.recorder import Recorder, RecorderSettings
+from tactile_bus.session import BusConfig, close_session, open_session
+
+WALL_NS = 1_700_000_000_123_456_789
+
+
+def example_messages() -> dict[topics.Topic, Any]:
+    """One message of every topic, with values that tell fields apart."""
+    head = header(WALL_NS, "ee")
+    vector, point = MSG.Vector3(0.5, -1.5, 2.25), MSG.Point(0.125, 0.25, -0.5)
+    f32, u8, u16 = np.float32, np.uint8, np.uint16
+    return {
+        topics.FEATURES: MSG.ContactFeatures(
+            head, 11, 12, 0.5, 7, True, ["tare", "few taxels"], True, 1.5, 2, point, 3.5,
+            MSG.Wrench(vector, vector), 0.75, 0.25, 3, 4,
+            [MSG.ContactPatch(1, 2, 3, 1.5, 0.5, vector, point)],
+        ),
+        topics.FORCES: MSG.TaxelForces(
+            head, 11, 12, 0.5, 7, np.array([2, 1], u16), np.arange(9, dtype=f32),
+            np.array([0, 1, 32], u8), True, False,
+        ),
+        topics.FIELD: MSG.TaxelField(
+            head, 11, 12, 7, np.array([1], u16), np.array([1, 2, 3], f32), np.array([25.5], f32)
+        ),
+        topics.AMBIENT: MSG.AmbientField(
+            head, 11, 7, "consensus", np.arange(9, dtype=f32), np.ones(1, f32),
+            np.zeros(1, f32), np.full(1, 0.5, f32), np.array([True]),
+        ),
+        topics.GEOMETRY: MSG.SkinGeometry(
+            head, "0011223344556677", "finger", ["left"], np.array([1], u8), np.array([1], u16),
+            np.array([1], u16), np.arange(3, dtype=f32), np.arange(3, dtype=f32),
+            np.arange(2, dtype=f32),
+        ),
+        topics.RAW: MSG.RawChunk(
+            head, 12, 1, np.array([0x1234], np.uint32), np.array([3], u8), np.array([1, 2, 3], u8)
+        ),
+        topics.DIAGNOSTICS: MSG.DiagnosticArray(
+            header(WALL_NS, ""), [diagnostic_status("b0", 1, "ok", "0011", {"drops.crc": 5})]
+        ),
+        topics.LOG: log_message(WALL_NS, 30, "b0", "grüße"),
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def messages() -> dict[topics.Topic, Any]:
+    return example_messages()
+
+
+@pytest.fixture(scope="session")
+def payloads(messages: dict[topics.Topic, Any]) -> dict[topics.Topic, bytes]:
+    return {topic: codec().encode(topic, message) for topic, message in messages.items()}
+
+
+@pytest.fixture
+def free_port() -> Callable[[], int]:
+    def find() -> int:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port: int = probe.getsockname()[1]
+            return port
+
+    return find
+
+
+@pytest.fixture
+def bus(free_port: Callable[[], int]) -> Iterator[Callable[..., Any]]:
+    """``bus(listen=port)``, ``bus(connect=port)``: sessions that are closed after the test."""
+    sessions = []
+
+    def join(listen: int | None = None, connect: int | None = None) -> Any:
+        config = BusConfig(
+            listen=() if listen is None else (f"tcp/127.0.0.1:{listen}",),
+            connect=() if connect is None else (f"tcp/127.0.0.1:{connect}",),
+        )
+        sessions.append(open_session(config))
+        return sessions[-1]
+
+    yield join
+    for session in sessions:
+        close_session(session)
+
+
+@pytest.fixture
+def until() -> Callable[..., None]:
+    """``until(condition)``: wait for it, or fail."""
+
+    def wait(condition: Callable[[], object], timeout: float = 15.0) -> None:
+        deadline = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < deadline, "waited in vain"
+            time.sleep(0.01)
+
+    return wait
+
+
+class FragileDisk(DiskStorage):
+    """A disk that takes ``room`` more bytes (None: all), fails with ``error``, or hangs."""
+
+    def __init__(self) -> None:
+        self.room: int | None = None
+        self.error = errno.ENOSPC
+        self.free_bytes = 1 << 40
+        self.moving = threading.Event()
+        self.moving.set()
+        self.syncs = 0
+
+    def open(self, path: Path) -> int:
+        self.moving.wait()
+        if self.room == 0:
+            raise OSError(self.error, os.strerror(self.error))
+        return super().open(path)
+
+    def write(self, fd: int, data: bytes | memoryview) -> int:
+        self.moving.wait()
+        if self.room is None:
+            return super().write(fd, data)
+        taken = min(len(data), self.room)
+        if taken == 0:
+            raise OSError(self.error, os.strerror(self.error))
+        self.room -= taken
+        return super().write(fd, data[:taken])
+
+    def sync(self, fd: int) -> None:
+        self.moving.wait()
+        self.syncs += 1
+        super().sync(fd)
+
+    def free(self, directory: Path) -> int:
+        return self.free_bytes
+
+
+@pytest.fixture
+def disk() -> FragileDisk:
+    return FragileDisk()
+
+
+@pytest.fixture
+def record(disk: FragileDisk) -> Iterator[Callable[..., Recorder]]:
+    """``record(path, **settings)``: a recorder on ``disk`` with quick flushes, closed at last."""
+    recorders = []
+
+    def start(path: Path, **settings: Any) -> Recorder:
+        quick = {"flush_period": 0.05, "retry_seconds": 0.05, "min_free_bytes": 0} | settings
+        recorders.append(Recorder(path, RecorderSettings(**quick), storage=disk))
+        return recorders[-1]
+
+    yield start
+    disk.room = None
+    disk.free_bytes = 1 << 40
+    disk.moving.set()
+    for recorder in recorders:
+        recorder.close(5)
