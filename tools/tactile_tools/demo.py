@@ -134,7 +134,7 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
         raise RuntimeError(f"tactiled ended with exit code {done.returncode}; see above")
     series = read_boards(options.out)
     board = series["finger"]
-    time = np.asarray(board.time)
+    time = np.asarray(board.feature_time)
     applied = _applied(press, time + (board.start_ns - power_on) * 1e-9)
     _summarise(board, applied)
     from tactile_tools.plot import draw
@@ -163,15 +163,18 @@ def _applied(press: Path, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _summarise(board: BoardSeries, applied: NDArray[np.float64]) -> None:
     """Print what was felt beside what was done."""
-    felt = board.normal_force()
+    felt = board.contact_force()
     plane = np.stack([np.asarray(m.plane).reshape(-1, 3, 3)[..., 0] for m in board.ambient])
     swing = float(np.ptp(plane, axis=0).max())
-    print(f"\n{len(board.time)} cycles; the ambient field swung by {swing:.0f} µT and was removed.")
+    print(
+        f"\n{len(board.features)} cycles; the ambient field turned by {swing:.0f} µT "
+        "and was removed."
+    )
     for index, (name, _) in enumerate(board.array_slices()):
         top = int(applied[:, index].argmax())
         idle = felt[applied[:, index] == 0, index]
         print(
             f"  {name:6} pressed with {applied[top, index]:5.2f} N, "
             f"felt {felt[top, index]:5.2f} N; "
-            f"sum over its taxels while untouched: {np.sqrt(np.mean(idle**2)):.3f} N rms"
+            f"{np.sqrt(np.mean(idle**2)):.3f} N rms while untouched"
         )

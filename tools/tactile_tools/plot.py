@@ -19,6 +19,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 SHEAR_ARROW_MM_PER_N = 4.0
 CIRCLE_AREA_PER_N = 320.0  # points², so that 1 N is a circle about as wide as the pitch
+SHOWN_FROM_N = 0.1  # noise of a taxel is about 0.03 N
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -76,8 +77,11 @@ def draw(
     from matplotlib import pyplot as plt
 
     time = np.asarray(board.time)
-    normal = board.normal_force()
-    moment = int(np.abs(time - at).argmin()) if at is not None else int(normal.sum(1).argmax())
+    contact = board.contact_force()
+    felt = np.asarray(board.feature_time)
+    if at is None:
+        at = float(felt[contact.sum(axis=1).argmax()]) if len(felt) else float(time[0])
+    moment = int(np.abs(time - at).argmin())
     arrays = board.array_slices()
     figure = plt.figure(figsize=(13, 11), layout="constrained")
     figure.suptitle(
@@ -90,7 +94,7 @@ def draw(
     for index, (label, taxels) in enumerate(arrays):
         _taxel_map(figure.add_subplot(maps[index]), board, moment, label, taxels)
     forces = figure.add_subplot(rows[1])
-    _forces(forces, time, normal, [n for n, _ in arrays], float(time[moment]), applied)
+    _forces(forces, felt, contact, [n for n, _ in arrays], at, applied)
     _ambient(figure.add_subplot(rows[2], sharex=forces), board, [n for n, _ in arrays])
     _timing(figure.add_subplot(rows[3], sharex=forces), board)
     figure.savefig(out, dpi=110)
@@ -101,7 +105,7 @@ def _taxel_map(axes: Axes, board: BoardSeries, moment: int, label: str, taxels: 
     surface = np.asarray(board.geometry.surface).reshape(-1, 2)[taxels] * 1e3
     force = board.force[moment][taxels]
     healthy = np.isfinite(force).all(axis=1)
-    normal = np.clip(-force[:, 2], 0.0, None)
+    normal = np.where(-force[:, 2] > SHOWN_FROM_N, -force[:, 2], 0.0)
     axes.scatter(surface[healthy, 0], surface[healthy, 1], s=6, color="0.75", zorder=1)
     axes.scatter(surface[~healthy, 0], surface[~healthy, 1], s=40, color="crimson", marker="x")
     axes.scatter(
@@ -112,7 +116,7 @@ def _taxel_map(axes: Axes, board: BoardSeries, moment: int, label: str, taxels: 
         alpha=0.45,
         zorder=2,
     )
-    strong = healthy & (np.linalg.norm(np.nan_to_num(force[:, :2]), axis=1) > 0.1)
+    strong = healthy & (np.linalg.norm(np.nan_to_num(force[:, :2]), axis=1) > SHOWN_FROM_N)
     if strong.any():
         axes.quiver(
             *surface[strong].T,
@@ -129,6 +133,21 @@ def _taxel_map(axes: Axes, board: BoardSeries, moment: int, label: str, taxels: 
     axes.set_ylim(surface[:, 1].min() - pad, surface[:, 1].max() + pad)
     axes.set_aspect("equal")
     total = float(normal[healthy].sum())
+    axes.scatter(
+        [surface[:, 0].max() + pad * 0.3],
+        [surface[:, 1].min() - pad * 0.4],
+        s=CIRCLE_AREA_PER_N,
+        facecolors="none",
+        edgecolors="0.4",
+    )
+    axes.annotate(
+        "1 N",
+        (surface[:, 0].max() + pad * 0.3, surface[:, 1].min() - pad * 0.4),
+        ha="center",
+        va="center",
+        fontsize=7,
+        color="0.3",
+    )
     axes.set_title(f"{label}: {total:.2f} N at {board.time[moment]:.2f} s", fontsize=10)
     axes.set_xlabel("along the skin, mm")
     axes.set_ylabel("mm")
@@ -137,17 +156,17 @@ def _taxel_map(axes: Axes, board: BoardSeries, moment: int, label: str, taxels: 
 def _forces(
     axes: Axes,
     time: Any,
-    normal: Any,
+    contact: Any,
     labels: list[str],
     moment: float,
     applied: tuple[Any, Any] | None,
 ) -> None:
     for index, label in enumerate(labels):
-        axes.plot(time, normal[:, index], color=COLOURS[index % 6], lw=1.2, label=label)
+        axes.plot(time, contact[:, index], color=COLOURS[index % 6], lw=1.2, label=label)
     if applied is not None:
         axes.plot(*applied, color="black", ls="--", lw=1.0, label="really applied")
     axes.axvline(moment, color="0.6", lw=0.8, ls=":")
-    axes.set_ylabel("normal force, N")
+    axes.set_ylabel("contact force, N\n(normal, summed)")
     axes.legend(loc="upper right", ncols=5, fontsize=8)
     axes.grid(alpha=0.25)
 

@@ -8,14 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.reader import NonSeekingReader
 from numpy.typing import NDArray
 
-from tactile_bus.messages import codec
-from tactile_bus.topics import AMBIENT, FEATURES, FORCES, GEOMETRY, Topic
+from tactile_bus.log_reader import read_messages
+from tactile_bus.log_records import LogError
+from tactile_bus.messages import DecodeError, codec
+from tactile_bus.topics import AMBIENT, FEATURES, FORCES, GEOMETRY, Topic, find_topic
 
 Float = NDArray[np.float64]
+
+WANTED = frozenset({AMBIENT, FEATURES, FORCES, GEOMETRY})
 
 MAX_POINTS = 200_000
 """Cycles kept for a plot: over half an hour at 100 Hz; no picture shows more."""
@@ -49,26 +51,27 @@ class BoardSeries:
         names = list(self.geometry.array_name)
         return [(n, slice(a, b)) for n, a, b in zip(names, ends, ends[1:], strict=False)]
 
-    def normal_force(self) -> Float:
-        """(cycles, arrays) N: sum of normal forces of each array, pushes only."""
-        force = np.asarray(self.force)
-        normal = np.clip(np.nan_to_num(-force[..., 2]), 0.0, None)
-        return np.stack([normal[:, s].sum(axis=1) for _, s in self.array_slices()], axis=1)
+    def contact_force(self) -> Float:
+        """(features, arrays) N: sum of the normal forces of each array's contact patches."""
+        force = np.zeros((len(self.features), len(self.array_slices())))
+        for row, features in enumerate(self.features):
+            for patch in features.patches:
+                force[row, patch.array] += patch.normal_force
+        return force
 
 
-def messages(path: Path) -> Iterator[tuple[str, Any]]:
-    """Yield (key, message) of a log in file order, also of one that was cut off."""
+def messages(path: Path) -> Iterator[tuple[Topic, str, Any]]:
+    """Yield (topic, name, message) of a log in file order, also of one that was cut off."""
     decode = codec().decode
+    found: dict[str, tuple[Topic, str] | None] = {}
     try:
-        with path.open("rb") as stream:
-            reader = NonSeekingReader(stream, validate_crcs=False)
-            for schema, channel, message in reader.iter_messages(log_time_order=False):
-                if schema is not None:
-                    yield channel.topic, decode(schema.name, message.data)
-    except (McapError, EOFError) as error:
-        raise LogUnreadableError(
-            f"{path} is damaged or no MCAP log ({error}); try `tactile log recover {path}` first"
-        ) from error
+        for channel, record in read_messages(path):
+            if channel.topic not in found:
+                found[channel.topic] = find_topic(channel.topic)
+            if (known := found[channel.topic]) is not None and known[0] in WANTED:
+                yield *known, decode(known[0], record.data)
+    except (LogError, DecodeError) as error:
+        raise LogUnreadableError(str(error)) from error
     except OSError as error:
         raise LogUnreadableError(f"{path}: {error.strerror}") from error
 
@@ -77,32 +80,23 @@ def read_boards(path: Path) -> dict[str, BoardSeries]:
     """Return the series of every board in a log, by board name; raises LogUnreadableError."""
     boards: dict[str, BoardSeries] = {}
     start: int | None = None
-
-    def board_of(key: str, topic: Topic) -> BoardSeries | None:
-        head, _, tail = topic.template.partition("{name}")
-        name = key[len(head) : len(key) - len(tail)]
-        if not (key.startswith(head) and key.endswith(tail)):
-            return None
-        return boards.setdefault(name, BoardSeries(name))
-
-    for key, message in messages(path):
-        if board := board_of(key, GEOMETRY):
+    for topic, name, message in messages(path):
+        board = boards.setdefault(name, BoardSeries(name))
+        if topic == GEOMETRY:
             board.geometry = message
             continue
-        captured = getattr(message, "captured_ns", None)
-        if captured is None:
-            continue
+        captured = message.captured_ns
         if start is None:
             start = captured
         now = (captured - start) * 1e-9
-        if (board := board_of(key, FORCES)) and len(board.time) < MAX_POINTS:
+        if topic == FORCES and len(board.time) < MAX_POINTS:
             board.time.append(now)
             board.force.append(np.asarray(message.force, float).reshape(-1, 3))
             board.latency.append((message.received_ns - captured) * 1e-9)
-        elif (board := board_of(key, FEATURES)) and len(board.feature_time) < MAX_POINTS:
+        elif topic == FEATURES and len(board.feature_time) < MAX_POINTS:
             board.feature_time.append(now)
             board.features.append(message)
-        elif (board := board_of(key, AMBIENT)) and len(board.ambient_time) < MAX_POINTS:
+        elif topic == AMBIENT and len(board.ambient_time) < MAX_POINTS:
             board.ambient_time.append(now)
             board.ambient.append(message)
     for board in boards.values():
