@@ -28,6 +28,9 @@ RESTARTS_AFTER = 3
 LEARNING = 2 * BUCKET
 """Frames from which the first guess of the period is made; until then arrivals are the stamps."""
 
+MIN_PERIOD = 5e-4
+"""s: four times the fastest rate of the chip. A shorter period is that of a backlog being read."""
+
 UNLEARNT = 0.05
 """s of uncertainty until then, at least: the period of the slowest board seen (ReSkin, 20 Hz)."""
 
@@ -86,25 +89,29 @@ class ArrivalClock:
 
     def _learn(self, host: float) -> None:
         """Guess the period by least squares once enough frames came, then sort them by it."""
-        self._learning.append(host)
-        n = len(self._learning)
+        heard = self._learning
+        heard.append(host)
+        n = len(heard)
         if n < LEARNING:
             return
+        self._learning = []
         centred = [k - (n - 1) / 2 for k in range(n)]
-        slope = sum(c * h for c, h in zip(centred, self._learning, strict=True))
+        slope = sum(c * h for c, h in zip(centred, heard, strict=True))
         slope /= sum(c * c for c in centred)
+        if slope < MIN_PERIOD:
+            return
         self._envelope = LowerEnvelope(BUCKET, BUCKETS, slope)
-        for index, earlier in enumerate(self._learning):
+        for index, earlier in enumerate(heard):
             self._envelope.add(index, earlier)
         self._index = n - 1
-        self._learning.clear()
 
     def _follow(self, host: float, envelope: LowerEnvelope) -> tuple[float, float]:
         """Jitter-free arrival and its uncertainty, both s; numbering moves on after a loss."""
         period = self.period
+        if period < MIN_PERIOD:
+            return self._start_anew(host)
         late = host - envelope.at(self._index)
-        if period > 0:
-            self._late.append(late / period)
+        self._late.append(late / period)
         if len(self._late) == LATE_RUN:
             if max(self._late) < -LATE:
                 return self._start_anew(host)

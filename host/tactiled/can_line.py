@@ -96,6 +96,7 @@ class CanLine:
         if isinstance(chunk.payload, bytes):
             raise TypeError("a CAN bus brings frames, not bytes")
         self._frames += len(chunk.payload)
+        heard: list[LineEvent] = []
         out: list[LineEvent] = []
         for received in self._decoder.feed(chunk.payload):
             message, node = received.message, received.board
@@ -106,12 +107,12 @@ class CanLine:
                     self.strangers += 1
                     continue
                 out += self._meet(node, chunk.received)
-            if self._known:
-                link = self._links[node]
-                out += [LineEvent(node, event) for event in link.receive(message, chunk.received)]
+            if self._known and not out and not self._early:
+                heard += self._hear(node, message, chunk.received)
             else:
+                # Whoever listens must first be told of the board, which it is when this returns.
                 self._early.append((node, message, chunk.received))
-        return out
+        return heard + out
 
     def tick(self, now: Instant) -> list[LineEvent]:
         """Look for boards, drive their links."""
@@ -123,7 +124,9 @@ class CanLine:
         out: list[LineEvent] = []
         if not self._known and self._known_at is not None and now >= self._known_at:
             out += self._take_up(now)
-        if self._known:
+        elif self._known:
+            while self._early:
+                out += self._hear(*self._early.popleft())
             for node, link in self._links.items():
                 out += [LineEvent(node, event) for event in link.tick(now)]
         if not self._links and now >= max(after(self._since, NOTHING_AFTER), self._diagnose_from):
@@ -158,16 +161,14 @@ class CanLine:
         return []
 
     def _take_up(self, now: Instant) -> list[LineEvent]:
-        """Put the boards met so far into service, and hear what they said meanwhile."""
+        """Put the boards met so far into service; what they said meanwhile is heard next."""
         self._known = True
-        out = [LineEvent(None, Found(tuple(sorted(self._links)), late=False))]
         for link in self._links.values():
             link.connect(now)
-        for node, message, arrival in self._early:
-            link = self._links[node]
-            out += [LineEvent(node, event) for event in link.receive(message, arrival)]
-        self._early.clear()
-        return out
+        return [LineEvent(None, Found(tuple(sorted(self._links)), late=False))]
+
+    def _hear(self, node: int, message: Message, arrival: Instant) -> list[LineEvent]:
+        return [LineEvent(node, event) for event in self._links[node].receive(message, arrival)]
 
     def _diagnose(self) -> Diagnosed:
         if not self._frames:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import sys
 import threading
@@ -61,7 +62,17 @@ def _run(settings: Settings, console: Console, stopping: threading.Event) -> int
         with Status(console, daemon.ports, daemon.recorder) as status:
             trouble = _watch(daemon, status, stopping)
     finally:
-        daemon.stop()
+        clean = daemon.stop()
+    code = _conclude(daemon, trouble)
+    if not clean:
+        log.warning("a thread did not end in time; leaving without it")
+        logging.shutdown()
+        os._exit(code)
+    return code
+
+
+def _conclude(daemon: Daemon, trouble: str | None) -> int:
+    """Say how it ended; the exit status."""
     if daemon.failure is not None:
         thread, cause = daemon.failure
         print(f"tactiled: thread {thread} failed: {cause}", file=sys.stderr)

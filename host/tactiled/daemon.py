@@ -199,14 +199,19 @@ class Daemon:
             recorder.attach(settings.config_path.name, "application/toml", text)
         return recorder
 
-    def stop(self) -> None:
-        """End in order: boards, readers, pipeline, log (at most 1 s), bus."""
+    def stop(self) -> bool:
+        """End in order: boards, pipeline, readers, log (at most 1 s), bus.
+
+        False when a thread is still inside a driver or zenoh: the interpreter must then not be
+        taken down under it, which would abort the process.
+        """
         self._stopping.set()
         self._wake.ring()
         if self._thread.is_alive():
             self._thread.join(JOIN_TIMEOUT)
+        clean = not self._thread.is_alive()
         for port in self.ports:
-            port.reader.stop()
+            clean &= port.reader.stop()
         if self.recorder is not None and not self.recorder.close():
             log.error("the log was not closed in time; see `tactile log recover`")
         for service in self._services:
@@ -215,8 +220,9 @@ class Daemon:
         if self._outlet is not None:
             self._outlet.close()
         if self._session is not None:
-            close_session(self._session)
+            clean &= close_session(self._session)
             self._session = None
+        return clean
 
     def trouble(self) -> str | None:
         """Why a port has not come into service and will not by itself; None: all is well yet."""

@@ -23,6 +23,15 @@ from tactiled.events import (
 )
 from tactiled.link import RELINK, SILENCE, Admission, State
 
+BACKLOG_GAP = 1e-3
+"""s between arrivals, `BACKLOG_GAPS` times running, that show that what had piled up before the
+port was opened has been read: no such board is faster than 500 Hz."""
+
+BACKLOG_GAPS = 3
+
+BACKLOG_LIMIT = 0.5
+"""s after the first frame at which it is taken as read in any case."""
+
 
 class FloatLink:
     """State machine of one float board. ``serial_number``: of the USB port, for it has no other.
@@ -42,6 +51,10 @@ class FloatLink:
         self._shape: tuple[int, int] | None = None
         self._last_sample = Instant(0)
         self._silent = False
+        self._first: Instant | None = None
+        self._heard = Instant(0)
+        self._fresh = False
+        self._gaps = 0
 
     @property
     def silence_limit(self) -> float:
@@ -52,7 +65,8 @@ class FloatLink:
         """The line is up."""
         self.state = State.IDENTIFYING
         self.clock.restart()
-        self._silent = False
+        self._silent = self._fresh = False
+        self._first, self._gaps = None, 0
 
     def disconnect(self) -> None:
         """The line is down."""
@@ -60,6 +74,9 @@ class FloatLink:
 
     def receive(self, message: FloatSamples, arrival: Instant) -> list[Event]:
         """Take one frame whose last byte came at ``arrival``."""
+        if not self._fresh and self._is_backlog(arrival):
+            self.counters["backlog"] += 1
+            return []
         events: list[Event] = []
         shape = (1, len(message.temperature_c))
         if self.state is State.IDENTIFYING or shape != self._shape:
@@ -101,6 +118,18 @@ class FloatLink:
         """Have a refused board judged again."""
         if self.state is State.REFUSED:
             self.state = State.IDENTIFYING
+
+    def _is_backlog(self, arrival: Instant) -> bool:
+        """Whether a frame may have waited: with no clock on board nobody knows how long."""
+        first, heard = self._first, self._heard
+        self._heard = arrival
+        if first is None:
+            self._first = arrival
+            return True
+        self._gaps = self._gaps + 1 if seconds_between(heard, arrival) >= BACKLOG_GAP else 0
+        waited = seconds_between(first, arrival)
+        self._fresh = self._gaps >= BACKLOG_GAPS or waited >= BACKLOG_LIMIT
+        return not self._fresh
 
     def _introduce(self, shape: tuple[int, int]) -> list[Event]:
         before, self._shape = self.identity, shape

@@ -26,6 +26,9 @@ REOPEN_SLOWEST = 0.5
 PACE = 0.002
 """s between looks whether the pipeline has caught up with a recording."""
 
+JOIN_TIMEOUT = 0.5
+"""s for the thread to end; closing the port wakes it."""
+
 BITS_PER_BYTE = 10
 """On a UART: start bit, eight data bits, stop bit."""
 
@@ -74,12 +77,13 @@ class PortReader:
         """Begin to read."""
         self._thread.start()
 
-    def stop(self) -> None:
-        """Close the port and end the thread."""
+    def stop(self) -> bool:
+        """Close the port and end the thread; False when it does not end."""
         self._stopping.set()
         self.transport.close()
         if self._thread.is_alive():
-            self._thread.join(1.0)
+            self._thread.join(JOIN_TIMEOUT)
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         try:
