@@ -105,7 +105,7 @@ class Magnetometers:
     def sense(self, field_ut: Float, temperature_c: float) -> Float:
         """Noiseless, unrounded field (N, 3) µT in chip axes of ``field_ut`` (N, 3) in ``ee``."""
         warmer = temperature_c - self.parameters.reference_c
-        seen: Float = np.matmul(self._view, field_ut[:, :, None])[:, :, 0]
+        seen: Float = np.einsum("nij,nj->ni", self._view, field_ut)
         seen *= 1.0 + self._sensitivity_drift * warmer
         seen += self._offset_drift * warmer
         return seen

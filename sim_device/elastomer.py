@@ -13,6 +13,9 @@ from sim_device.parameters import ElastomerParameters
 
 Float = NDArray[np.float64]
 
+CALIBRATION_DWELL = 2.0
+"""s that a calibration rig waits at each load: about as long as a contact in use lasts."""
+
 _HERTZ_VARIANCE = 0.2
 """Variance per axis of Hertz's pressure sqrt(1 - r²/a²) over a²."""
 
@@ -112,11 +115,14 @@ class Elastomer:
         return self._displace(effective)
 
     def settled(self, force: Float) -> Float:
-        """Displacement (N, 3) m on the centre line of the loop, with half of the creep done.
+        """Displacement (N, 3) m of recovered rubber `CALIBRATION_DWELL` after ``force`` came on.
 
-        Changes no state: what a calibration rig sees on average.
+        What a calibration rig sees, which loads and never unloads before it reads; changes no
+        state.
         """
-        return self._displace(force * (1.0 + 0.5 * self._parameters.creep))
+        p = self._parameters
+        crept = -p.creep * math.expm1(-CALIBRATION_DWELL / p.creep_time)
+        return self._displace(force * (1.0 + crept - self._play_weight * p.hysteresis_knee))
 
     def _displace(self, effective: Float) -> Float:
         displacement: Float = effective * self._compliance

@@ -14,6 +14,9 @@ Float = NDArray[np.float64]
 AttitudeScript = Callable[[float], Float]
 """Seconds since power-on to the rotation (3, 3) from ``ee`` to world axes."""
 
+TemperatureScript = Callable[[float], float]
+"""Seconds since power-on to the board's temperature in °C."""
+
 
 @dataclass(frozen=True, slots=True)
 class EnvironmentParameters:
@@ -61,13 +64,20 @@ def still(_seconds: float) -> Float:
 
 
 class Environment:
-    """Surroundings over time. ``attitude``: script used while a board is given no attitude."""
+    """Surroundings over time. ``attitude``: script used while a board is given no attitude.
+
+    ``temperature``: script of the board's °C; left out, it warms up as the parameters say.
+    """
 
     def __init__(
-        self, parameters: EnvironmentParameters | None = None, attitude: AttitudeScript = still
+        self,
+        parameters: EnvironmentParameters | None = None,
+        attitude: AttitudeScript = still,
+        temperature: TemperatureScript | None = None,
     ) -> None:
         p = self.parameters = parameters or EnvironmentParameters()
         self.attitude = attitude
+        self.temperature = temperature or self._warming
         flat, down = p.field_ut * math.cos(p.inclination), p.field_ut * math.sin(p.inclination)
         self._field = np.array([flat * math.cos(p.heading), flat * math.sin(p.heading), -down])
         # No sources inside the skin: the gradient is symmetric and has no trace (Maxwell).
@@ -75,14 +85,16 @@ class Environment:
 
     def at(self, seconds: float, attitude: Float | None = None) -> Surroundings:
         """Surroundings ``seconds`` after power-on; ``attitude`` (3, 3) overrides the script."""
-        p = self.parameters
-        warmed = -math.expm1(-max(seconds, 0.0) / p.self_heating_time)
         return Surroundings(
             self.attitude(seconds) if attitude is None else attitude,
             self._field,
             self._gradient,
-            p.room_c + p.self_heating_k * warmed,
+            self.temperature(seconds),
         )
+
+    def _warming(self, seconds: float) -> float:
+        p = self.parameters
+        return p.room_c - p.self_heating_k * math.expm1(-max(seconds, 0.0) / p.self_heating_time)
 
 
 def rotation_about(axis: Float, angle: float) -> Float:

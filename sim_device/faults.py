@@ -83,7 +83,8 @@ class FaultPlan:
         Entries, parted by commas: ``seed=N``; ``NAME=PROBABILITY`` for flip, byteloss,
         byteinsert, loss, duplicate, reorder, splice; ``delay=PROBABILITY:SECONDSs``;
         ``silence@Ts+Ds``, ``busoff@Ts+Ds``, ``reset@Ts``; ``stuck|saturated|failed=ARRAY:TAXEL``
-        with an optional ``@Ts`` or ``@Ts+Ds``. ScriptError names the entry and what is allowed.
+        with an optional ``@Ts`` or ``@Ts+Ds`` (``nan`` is ``failed``). ScriptError names the
+        entry and what is allowed.
         """
         entries = [e.strip() for e in text.split(",")]
         return _collect([(e, f"fault {e!r}") for e in entries if e])
@@ -123,6 +124,7 @@ PROBABILITIES = (
     "splice",
     "delay",
 )
+_TAXEL_FAULTS = {**{kind.value: kind for kind in TaxelFaultKind}, "nan": TaxelFaultKind.FAILED}
 TIMED = ("silence", "reset", "busoff")
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -135,7 +137,7 @@ _TAXEL = re.compile(
 _FORMS = (
     "allowed: seed=N; flip, byteloss, byteinsert, loss, duplicate, reorder, splice = probability "
     "from 0 to 1; delay=PROBABILITY:SECONDSs; silence@Ts+Ds; busoff@Ts+Ds; reset@Ts; "
-    "stuck, saturated, failed = ARRAY:TAXEL@Ts+Ds"
+    "stuck, saturated, failed (or nan) = ARRAY:TAXEL@Ts+Ds"
 )
 
 
@@ -156,8 +158,8 @@ def _collect(entries: list[tuple[str, str]]) -> FaultPlan:
             )
         elif mark != "=":
             raise ScriptError(f"{label} is not understood; {_FORMS}")
-        elif name in set(TaxelFaultKind):
-            taxels.append(_taxel_fault(TaxelFaultKind(name), rest, label))
+        elif name in _TAXEL_FAULTS:
+            taxels.append(_taxel_fault(_TAXEL_FAULTS[name], rest, label))
         elif name in figures or (name == "seed" and seed is not None):
             raise ScriptError(f"{label}: {name} is given twice; give it once")
         elif name == "seed":

@@ -32,7 +32,7 @@ class _Wire(ABC, Generic[Unit]):
         self._rng = np.random.default_rng([plan.seed, 1])
         self._count: Counter[str] = Counter()
         self._waiting: tuple[Unit, str] | None = None
-        self._delayed: deque[tuple[float, Unit, Unit | None]] = deque()
+        self._delayed: deque[tuple[float, Unit, tuple[Unit, ...]]] = deque()
         self._release = 0.0
 
     @property
@@ -48,8 +48,8 @@ class _Wire(ABC, Generic[Unit]):
             self._send(frame, seconds)
         out = []
         while self._delayed and self._delayed[0][0] <= seconds:
-            _, frame, original = self._delayed.popleft()
-            self._count["intact" if self._arrives(frame, original) else "damaged"] += 1
+            _, frame, originals = self._delayed.popleft()
+            self._count["intact" if self._arrives(frame, originals) else "damaged"] += 1
             out.append(frame)
         return out
 
@@ -66,9 +66,10 @@ class _Wire(ABC, Generic[Unit]):
             self._waiting = None
             if why == "splice":
                 count["spliced"] += 1
-                # Two frames went in and one comes out; the other counts as damaged here.
+                # Two frames went in and one comes out; the other counts as damaged here. The one
+                # may still be whole: frames that begin alike, cut where they are alike.
                 count["damaged"] += 1
-                self._queue(self._splice(first, frame), seconds, None)
+                self._queue(self._splice(first, frame), seconds, (first, frame))
             else:
                 count["reordered"] += 1
                 self._deliver(frame, seconds)
@@ -84,9 +85,9 @@ class _Wire(ABC, Generic[Unit]):
             self._deliver(frame, seconds)
 
     def _deliver(self, frame: Unit, seconds: float) -> None:
-        self._queue(self._damage(frame), seconds, frame)
+        self._queue(self._damage(frame), seconds, (frame,))
 
-    def _queue(self, frame: Unit, seconds: float, original: Unit | None) -> None:
+    def _queue(self, frame: Unit, seconds: float, originals: tuple[Unit, ...]) -> None:
         due = seconds
         if self._chance(self._plan.delay):
             self._count["delayed"] += 1
@@ -96,7 +97,7 @@ class _Wire(ABC, Generic[Unit]):
         if len(self._delayed) == MAX_DELAYED:
             self._delayed.popleft()
             self._count["lost"] += 1
-        self._delayed.append((self._release, frame, original))
+        self._delayed.append((self._release, frame, originals))
 
     def _chance(self, probability: float) -> bool:
         return probability > 0 and bool(self._rng.random() < probability)
@@ -122,8 +123,8 @@ class _Wire(ABC, Generic[Unit]):
         """Head of ``first`` run into the tail of ``second``."""
 
     @abstractmethod
-    def _arrives(self, frame: Unit, original: Unit | None) -> bool:
-        """Whether the host can make out the ``original`` in what comes, ``frame``."""
+    def _arrives(self, frame: Unit, originals: tuple[Unit, ...]) -> bool:
+        """Whether the host can make out one of the ``originals`` in what comes, ``frame``."""
 
 
 COUNTS = (
@@ -177,14 +178,14 @@ class SerialWire(_Wire[bytes]):
         tail = int(self._rng.integers(1, len(second)))
         return first[:head] + second[tail:]
 
-    def _arrives(self, frame: bytes, original: bytes | None) -> bool:
+    def _arrives(self, frame: bytes, originals: tuple[bytes, ...]) -> bool:
         if not self._delimited:
-            return frame == original
+            return frame in originals
         segments = frame.split(b"\0")
         # The first runs on from what came before without its zero; the last has no zero yet.
         whole = segments[self._unfinished : -1]
         self._unfinished = bool(segments[-1]) or (self._unfinished and len(segments) == 1)
-        return original is not None and original[:-1] in whole
+        return any(original[:-1] in whole for original in originals)
 
 
 class CanWire(_Wire[CanFrame]):
@@ -222,5 +223,5 @@ class CanWire(_Wire[CanFrame]):
         size = FD_SIZE if first.fd else CLASSIC_SIZE
         return replace(first, data=(first.data[:head] + second.data[tail:])[:size])
 
-    def _arrives(self, frame: CanFrame, original: CanFrame | None) -> bool:
-        return frame == original
+    def _arrives(self, frame: CanFrame, originals: tuple[CanFrame, ...]) -> bool:
+        return frame in originals

@@ -49,7 +49,7 @@ class MagnetArray:
 
         ``strength``: factor on every moment.
         """
-        offset = self._offset - displacement.T[:, self._magnet]
+        offset = self._offset - displacement.take(self._magnet, axis=0).T
         x, y, z = offset
         mx, my, mz = self._moment
         r2 = x * x + y * y + z * z

@@ -122,6 +122,15 @@ class ElastomerParameters:
     hysteresis_time: float = 5.0
     """s, time constant with which the rubber forgets its peak load."""
 
+    def __post_init__(self) -> None:
+        """Refuse rubber that does not yield, and a play as wide as its peak."""
+        if not (self.normal_stiffness > 0 and self.shear_stiffness > 0 and self.spread > 0):
+            raise ValueError("stiffnesses and spread must be above 0")
+        if not 0 < self.hysteresis_knee < 0.5:
+            raise ValueError(f"hysteresis_knee {self.hysteresis_knee}: above 0, below 0.5")
+        if not 0 <= self.full_reach < self.no_reach:
+            raise ValueError("full_reach must be less than no_reach")
+
 
 @dataclass(frozen=True, slots=True)
 class ChipParameters:

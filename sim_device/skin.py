@@ -103,7 +103,7 @@ class SkinModel:
         return self.chips.sense(field, surroundings.temperature_c)
 
     def settled_field_ut(self, force: Float, temperature_c: float) -> Float:
-        """Noiseless field (N, 3) µT in taxel axes under a steady ``force`` (N, 3) N, no ambient.
+        """Noiseless field (N, 3) µT in taxel axes some time under ``force`` (N, 3) N, no ambient.
 
         In the axes that a host gets by undoing the designed yaw of each chip; see
         `Elastomer.settled`. Changes no state.
@@ -192,7 +192,7 @@ def _fit(
 
 def _turn(matrices: Float, vectors: Float) -> Float:
     """Each (n, 3, 3) matrix times its (n, 3) vector."""
-    turned: Float = np.matmul(matrices, vectors[:, :, None])[:, :, 0]
+    turned: Float = np.einsum("nij,nj->ni", matrices, vectors)
     return turned
 
 

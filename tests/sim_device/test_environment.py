@@ -59,6 +59,11 @@ def test_board_warms_up() -> None:
     assert environment.at(300).temperature_c == pytest.approx(23 + 4 * (1 - math.exp(-1)))
 
 
+def test_temperature_may_be_scripted() -> None:
+    environment = Environment(temperature=lambda seconds: 20 + 2 * seconds)
+    assert environment.at(10).temperature_c == 40
+
+
 @pytest.mark.parametrize(
     ("text", "seconds", "axis", "degrees"),
     [

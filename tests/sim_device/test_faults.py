@@ -45,6 +45,10 @@ def test_plan_from_a_table_is_that_from_text() -> None:
     assert FaultPlan.from_table(table, "board.toml: [faults]") == FaultPlan.parse(text)
 
 
+def test_nan_is_a_failed_read() -> None:
+    assert FaultPlan.parse("nan=tip:1@2s") == FaultPlan.parse("failed=tip:1@2s")
+
+
 def test_no_text_is_no_fault() -> None:
     assert FaultPlan.parse("") == FaultPlan()
     assert not FaultPlan.parse("").touches_wire

@@ -170,6 +170,31 @@ def test_factory_calibration_knows_rest_field_and_drift(calibrated) -> None:
     assert not calibration.nominal
 
 
+@pytest.mark.parametrize(("hold_s", "bound"), [(0.3, 0.05), (2.0, 0.045), (10.0, 0.06)])
+@pytest.mark.parametrize("newton", [1.0, 5.0])
+def test_calibrated_force_of_a_real_press(calm, newton: float, hold_s: float, bound: float) -> None:
+    """Creep, hysteresis, curvature and noise together, over a hundred averaged samples."""
+    model = build_skin("finger", 4)
+    calibration = nominal_calibration(model, "00").arrays[0]
+    geometry = model.geometry.arrays[0]
+    contact = Contact(
+        geometry.position[11], geometry.rotation[11] @ np.array([0, 0, -newton]), 1e-3
+    )
+    at = calm.at(0)
+    rest, pressed = [], []
+    for i in range(100):
+        rest.append(model.sample(Instant(i * MS), [], at).counts * model.chips.lsb_ut)
+    for step in range(round(hold_s * 100)):
+        model.sample(Instant((110 + 10 * step) * MS), [contact], at)
+    end = 110 + round(hold_s * 1000)
+    for i in range(100):
+        reading = model.sample(Instant((end + i) * MS), [contact], at)
+        pressed.append(reading.counts * model.chips.lsb_ut)
+    felt = (np.mean(pressed, axis=0) - np.mean(rest, axis=0))[:32].ravel()
+    normal = -(calibration.newton_per_ut @ felt).reshape(-1, 3)[:, 2]
+    assert normal[11] == pytest.approx(-model.true_force[11, 2], rel=bound)
+
+
 def test_calibration_measures_its_own_board_only() -> None:
     ours, theirs = factory_calibration("anyskin", 1), factory_calibration("anyskin", 2)
     assert ours.serial_number == identity("anyskin", 1).unique_id.hex()
