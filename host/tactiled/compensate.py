@@ -79,6 +79,4 @@ class Off:
 
 def outside_plane(theta: Float, layout: Layout) -> Float:
     """(A, 3, 3) of `Ambient.plane` ([a, component, value or slope per m]) from ``theta``."""
-    plane = theta.copy()
-    plane[:, :, 1:] /= layout.scale[:, None, None]
-    return plane
+    return theta * layout.plane_scale

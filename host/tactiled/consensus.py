@@ -35,6 +35,8 @@ MODEL_ERROR_UT = 1.5
 MIN_SUPPORT = 0.4
 """Least fraction of an array's healthy taxels that must agree. Half of them may be in contact;
 chance and crosstalk take a tenth more."""
+FOLLOW_SUPPORT = 0.65
+"""Support from which a plane has no rival on arrays of nine taxels and more."""
 MIN_INLIERS = 3
 """Two taxels agree by chance."""
 MAX_RESIDUAL_RATIO = 1.5
@@ -63,7 +65,7 @@ class Fit:
 
     ``theta``: (A, 3, 3) µT, [a, component in ``ee``, coefficient]. ``support``, ``residual_ut``,
     ``valid``: (A,) as in `Ambient`. ``common``: (3,) µT in ``ee`` that the arrays with a valid fit
-    share; NaN when there is none.
+    share; NaN when there is none. ``whole``: every array is valid.
     """
 
     theta: Float
@@ -71,6 +73,7 @@ class Fit:
     residual_ut: Float
     valid: Bool
     common: Float
+    whole: bool
 
 
 class Consensus:
@@ -96,6 +99,7 @@ class Consensus:
         self._propose = np.ascontiguousarray(propose, np.float32)
         self._places = taxels_first.astype(np.float32)
         self._rows = np.arange(arrays)
+        self._counts: list[int] = layout.counts.tolist()
         few = layout.counts < PLANE_TAXELS
         self._stiff = np.zeros((arrays, 3, 3))
         # the constant's 1e-9 keeps an array without any weight invertible; `_judge` refuses it
@@ -117,17 +121,32 @@ class Consensus:
         """Fit of one cycle; see `Compensator.update` for the arguments."""
         weight = healthy.astype(np.float64)
         theta, score = self._vote(field_ee, healthy)
-        if len(theta) > 1 and (score > self._doubtful).any():
+        if len(theta) > 1 and np.count_nonzero(score > self._doubtful):
             self._prefer_common(theta, score, field_ee, weight)
         theta = self._refine(theta, field_ee, weight, FIRST_REACH**2 * self._variance)
         target = self._target(theta, field_ee, forces)
         theta = self._refine(theta, target, weight, LAST_REACH**2 * self._variance, shrink=True)
         return self._judge(theta, target, healthy)
 
+    def follow(self, theta: Float, field_ee: Float, forces: Float, healthy: Bool) -> Fit | None:
+        """Fit of a cycle that continues the earlier fit ``theta``; None when a vote is needed.
+
+        Taken only where the vote could not come out otherwise: two planes share no more than
+        three taxels of an array, so one borne out by `FOLLOW_SUPPORT` of them has no rival.
+        """
+        target = self._target(theta, field_ee, forces)
+        weight = healthy.astype(np.float64)
+        theta = self._refine(theta, target, weight, LAST_REACH**2 * self._variance, shrink=True)
+        fit = self._judge(theta, target, healthy)
+        return fit if fit.whole and fit.support.min() >= FOLLOW_SUPPORT else None
+
     def check(self, theta: Float, field_ee: Float, forces: Float, healthy: Bool) -> Fit:
         """How far the present cycle bears out the earlier fit ``theta``."""
         target = self._target(theta, field_ee, forces)
         return self._judge(theta, target, healthy)
+
+    def _all(self, healthy: Bool) -> bool:
+        return int(np.count_nonzero(healthy)) == self._layout.taxels
 
     def _target(self, theta: Float, field_ee: Float, forces: Float) -> Float:
         """Fields without neighbours' contacts, given about where the ambient field is."""
@@ -151,7 +170,7 @@ class Consensus:
         squared += away[2]
         np.minimum(squared, np.float32(self._gate), out=squared)
         score = (healthy.astype(np.float32)[:, None, :] @ squared)[:, 0]
-        if not np.array_equal(healthy, self._layout.real):
+        if not self._all(healthy):
             sick = self._layout.real & ~healthy
             score += 1e12 * (self._uses @ sick[:, :, None])[..., 0]
         best = score.argmin(axis=1)
@@ -170,7 +189,7 @@ class Consensus:
         inside = 1.0 - np.square(flat - common[:, None]).sum(axis=0) / gate
         np.maximum(inside, 0.0, out=inside)
         inside *= flat_weight
-        total = inside.sum()
+        total = float(inside.sum())
         if total > 0:
             common = flat @ inside / total
         squared_now = np.square(flat - common[:, None]).sum(axis=0)
@@ -199,7 +218,7 @@ class Consensus:
             leverage = np.einsum("akn,akn->an", inverse @ self._design, self._design).max(axis=1)
             over = leverage - MAX_LEVERAGE
             over[self._few] = 0.0
-            if over.max() > 0:
+            if np.count_nonzero(over > 0):
                 ridge = np.minimum(np.maximum(over, 0.0), 1.0) * self._variance * self._shrink
                 normal[:, 1, 1] += ridge
                 normal[:, 2, 2] += ridge
@@ -211,12 +230,13 @@ class Consensus:
         """Whether the taxels bear out a fit."""
         away = target - theta @ self._design
         squared = np.einsum("acn,acn->an", away, away)
-        agree = squared <= self._gate
-        agree &= healthy
-        squared *= agree
+        agree = np.empty((2, *squared.shape))
+        np.less_equal(squared, self._gate, out=agree[0], casting="unsafe")
+        agree[0] *= healthy
+        np.multiply(squared, agree[0], out=agree[1])
         # there are few arrays: plain numbers are faster from here on
-        inliers = agree.sum(axis=1).tolist()
-        sums, sound = squared.sum(axis=1).tolist(), healthy.sum(axis=1).tolist()
+        inliers, sums = agree.sum(axis=2).tolist()
+        sound = self._counts if self._all(healthy) else healthy.sum(axis=1).tolist()
         middle = theta[:, :, 0].tolist()
         limit = 3.0 * MAX_RESIDUAL_RATIO**2 * self._variance
         support = [k / h if h else 0.0 for k, h in zip(inliers, sound, strict=True)]
@@ -226,17 +246,24 @@ class Consensus:
         ]
         residual = [math.sqrt(q / (3 * max(k, 1))) for q, k in zip(sums, inliers, strict=True)]
         common = _shared(middle, inliers, valid)
-        if len(valid) > 1 and common is not None:
+        if len(valid) > 1 and common is not None and min(support) < IMPOSTOR_SUPPORT:
             for a, centre in enumerate(middle):
                 if support[a] < IMPOSTOR_SUPPORT and math.dist(centre, common) > IMPOSTOR_UT:
                     valid[a] = False
             common = _shared(middle, inliers, valid)
         return Fit(
-            theta, np.array(support), np.array(residual), np.array(valid), np.array(common or _NONE)
+            theta,
+            np.array(support),
+            np.array(residual),
+            np.array(valid),
+            np.array(common or _NONE),
+            all(valid),
         )
 
 
-def _shared(middle: list[list[float]], inliers: list[int], valid: list[bool]) -> list[float] | None:
+def _shared(
+    middle: list[list[float]], inliers: list[float], valid: list[bool]
+) -> list[float] | None:
     """Mean of the valid arrays' constants, weighted by their supporting taxels; None without."""
     weights = [k if ok else 0 for k, ok in zip(inliers, valid, strict=True)]
     total = sum(weights)

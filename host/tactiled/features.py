@@ -55,7 +55,7 @@ class FeatureExtractor:
         self._certain = self._on * CERTAIN_RATIO
         self._off = self._on * self._ratio
         self._contact = np.zeros(n, dtype=bool)
-        self._above = np.zeros(n, dtype=bool)
+        self._threshold = self._certain
         self._light_since: Instant | None = None
         self._light_until: Instant | None = None
         self._unusable = 0
@@ -70,11 +70,12 @@ class FeatureExtractor:
         self._on = np.maximum(self._minimum, self._sigmas * sigma_n)
         self._certain = self._on * CERTAIN_RATIO
         self._off = self._on * self._ratio
+        self._threshold = np.where(self._contact, self._off, self._certain)
 
     def reset(self) -> None:
         """Forget every contact."""
         self._contact = np.zeros_like(self._contact)
-        self._above = np.zeros_like(self._above)
+        self._threshold = self._certain
         self._light_since = self._light_until = None
         self._unusable = 0
 
@@ -94,11 +95,13 @@ class FeatureExtractor:
         """
         normal = -force[:, 2]
         above = normal > self._on
-        contact = above & self._above
-        contact |= normal > self._certain
-        contact |= self._contact & (normal > self._off)
-        self._above, self._contact = above, contact
+        contact = normal > self._threshold
         members = contact.nonzero()[0]
+        self._contact = contact
+        if np.count_nonzero(above) or members.size:
+            self._threshold = np.where(contact, self._off, np.where(above, self._on, self._certain))
+        else:
+            self._threshold = self._certain
         if members.size == 0:
             tip_time = self._tip_time(0.0, tip_usable, captured)
             return Features(
@@ -134,7 +137,7 @@ class FeatureExtractor:
                 )
             )
         patches.sort(key=lambda patch: -patch.normal_force)  # stable: then by first taxel
-        tip_force = sum(patch.normal_force for patch in patches if patch.side is Side.TIP)
+        tip_force = sum((p.normal_force for p in patches if p.side is Side.TIP), 0.0)
         peak_force = max(presses)
         peak = taxels[presses.index(peak_force)]
         return Features(

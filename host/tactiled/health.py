@@ -53,11 +53,11 @@ class HealthMonitor:
         health = status.copy()
         possible = np.abs(raw).max(axis=1) <= self._limit  # False for NaN too
         possible &= np.abs(temperature_c - _MIDDLE_C) <= _HALF_RANGE_C
-        if not possible.all():
+        if np.count_nonzero(possible) < possible.size:
             health[~possible] |= _OUT_OF_RANGE
         changed = (raw != self._last).any(axis=1)
         changed |= self._padding
-        if changed.all() and present.all():
+        if np.count_nonzero(changed) == changed.size and np.count_nonzero(present) == len(present):
             self._last = raw
             self._since.fill(captured)
             self._repeats.fill(0)

@@ -39,10 +39,12 @@ class Layout:
         self.design = np.zeros((self.arrays, 3, self.width))
         self.rotation = np.zeros((self.arrays, 3, 3, self.width))
         self.scale = np.ones(self.arrays)
+        self.plane_scale = np.ones((self.arrays, 1, 3))  # to slopes per m
         for a, array in enumerate(arrays):
             flat = array.surface - array.surface.mean(axis=0)
             spread = float(np.sqrt((flat**2).mean()))
             self.scale[a] = spread if spread > 0 else 1.0
+            self.plane_scale[a, 0, 1:] = 1.0 / self.scale[a]
             self.design[a, 0, : array.taxels] = 1.0
             self.design[a, 1:, : array.taxels] = flat.T / self.scale[a]
             self.rotation[a, :, :, : array.taxels] = array.rotation.transpose(1, 2, 0)

@@ -26,6 +26,7 @@ class ConsensusCompensator:
         self._period = round(period_s * NS_PER_S)
         self._tracker = FieldTracker(layout, "consensus", borrows=True)
         self._fitted: Instant | None = None
+        self._sound = False  # the last fit was valid on every array: it can be followed
 
     def set_noise(self, noise_ut: Float) -> None:
         """Noise of one sample, (3,) µT rms in chip axes."""
@@ -35,12 +36,17 @@ class ConsensusCompensator:
         """Forget every plane."""
         self._tracker.reset()
         self._fitted = None
+        self._sound = False
 
     def update(self, field_ee: Float, forces: Float, healthy: Bool, captured: Instant) -> Estimate:
         """Estimate for one cycle."""
         if self._fitted is None or captured - self._fitted >= self._period:
-            fit = self._consensus.fit(field_ee, forces, healthy)
-            self._fitted = captured
+            fit = None
+            if self._sound:
+                fit = self._consensus.follow(self._tracker.theta, field_ee, forces, healthy)
+            if fit is None:
+                fit = self._consensus.fit(field_ee, forces, healthy)
+            self._fitted, self._sound = captured, fit.whole
             return self._tracker.take(fit, captured)
         fit = self._consensus.check(self._tracker.theta, field_ee, forces, healthy)
         return self._tracker.take(fit, captured, fresh=False)

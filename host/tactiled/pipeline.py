@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tactile_bus.calibration_types import BoardCalibration
 from tactile_bus.instant import NS_PER_S, Instant
-from tactiled.blocks import Cycle, SampleBlock, TaxelHealth
+from tactiled.blocks import Ambient, Cycle, SampleBlock, TaxelHealth
 from tactiled.compensate import Compensator, Estimate
 from tactiled.features import FeatureExtractor
 from tactiled.force_model import ForceModel
@@ -47,6 +47,8 @@ class BoardPipeline:
         self._theta = np.zeros((layout.arrays, 3, 3))
         self._tare: Tare | None = None
         self._tare_initial = False
+        self._tare_peak = 0.0
+        self._unrested: Bool | None = None  # taxels whose rest field is not known
         self._tare_report: TareReport | None = None
         self._feature_due: Instant | None = None
         self._health: NDArray[np.uint8] = np.full(layout.taxels, TaxelHealth.MISSING, np.uint8)
@@ -54,6 +56,15 @@ class BoardPipeline:
         self._track = None if settings.rest_tracking_s is None else settings.rest_tracking_s
         self._last_captured: Instant | None = None
         self._apply_noise(self._noise)
+        nothing = Ambient(
+            method=settings.method,
+            plane=np.zeros((layout.arrays, 3, 3)),
+            support=np.zeros(layout.arrays),
+            residual_ut=np.zeros(layout.arrays),
+            age=np.full(layout.arrays, np.inf),
+            valid=np.zeros(layout.arrays, dtype=bool),
+        )
+        self._unknown = Estimate(nothing.plane, nothing, np.zeros(layout.arrays, dtype=bool))
         automatic = settings.auto_tare
         self._rest_known = not (calibration.nominal if automatic is None else automatic)
         if not self._rest_known:
@@ -83,7 +94,8 @@ class BoardPipeline:
         """Begin a tare: the mean field of the next cycles becomes the rest field.
 
         It ends by itself within ten times ``tare_s``; `tare_report` then says what it did. It is
-        refused, and nothing changed, when the skin is touched or moves.
+        refused, and nothing changed, when the field moves or a taxel bears more than
+        ``tare_limit_n``; less than that cannot be told from the drift that taring is there for.
         """
         self._begin_tare(initial=not self._rest_known)
 
@@ -112,41 +124,51 @@ class BoardPipeline:
         blocks = [block for block in group.blocks if block is not None]
         captured = min(block.captured for block in blocks)
         health = self._monitor.update(raw, temperature, status, present, captured)
-        healthy = (health == 0) & layout.real
+        if self._unrested is not None:
+            health[self._unrested] |= np.uint8(TaxelHealth.OUT_OF_RANGE)
         field = model.taxel_field(raw, temperature)
-        whole = bool(healthy.sum() == layout.taxels)
-        if not whole:
+        masked = int(np.count_nonzero(health))
+        healthy = layout.real
+        if masked:
+            healthy = layout.real & (health == 0)
             # what an unhealthy taxel reads must not leak into its neighbours' forces
             np.copyto(field, model.plane_field(self._theta), where=~healthy[:, None])
         if self._tare is not None:
             field = self._advance_tare(field, healthy, bool(present.all()), captured, group)
         forces = model.forces(field)
-        estimate = self._compensator.update(model.field_in_ee(field), forces, healthy, captured)
-        self._theta = estimate.theta
-        if estimate.ambient.method != "off":
-            forces = forces - model.plane_forces(estimate.theta)
-        if not whole:
-            np.copyto(forces, np.nan, where=~healthy[:, None])
+        if self._rest_known:
+            in_ee = model.field_in_ee(field)
+            estimate = self._compensator.update(in_ee, forces, healthy, captured)
+            self._theta = estimate.theta
+            if self.settings.method != "off":
+                forces -= model.plane_forces(estimate.theta)
+            if masked:
+                np.copyto(forces, np.nan, where=~healthy[:, None])
+        else:
+            estimate = self._unknown
+            masked = layout.taxels
+            forces.fill(np.nan)
         force = layout.flat_vectors(forces)
-        self._health = flat_health = layout.flat(health)
+        self._health = layout.flat(health)
         reasons, valid = self._reasons(estimate, healthy, present)
-        tip_usable = self._tip_usable(estimate, present)
-        features = self._features.update(
-            force, layout.taxels - int(healthy.sum()), reasons, valid, tip_usable, captured
-        )
+        tip_usable = valid or self._tip_usable(estimate, present)
+        features = self._features.update(force, masked, reasons, valid, tip_usable, captured)
+        if self._tare is not None:
+            self._tare_peak = max(self._tare_peak, features.peak_force)
         if self._track is not None and valid and not reasons:
             self._follow_rest(field, estimate, healthy, captured)
         self._last_captured = captured
-        shown = field if whole else np.where(healthy[:, None], field, np.nan)
+        if masked and self._rest_known:
+            np.copyto(field, np.nan, where=~healthy[:, None])
         return Cycle(
             sequence=group.sequence,
             captured=captured,
             received=max(block.received for block in blocks),
             uncertainty=max(block.uncertainty for block in blocks),
             temperature_c=gather_temperature(group),
-            field_ut=layout.flat_vectors(shown),
+            field_ut=layout.flat_vectors(field),
             force=force,
-            health=flat_health,
+            health=self._health,
             ambient=estimate.ambient,
             features=features,
             calibrated=not self.calibration.nominal,
@@ -179,15 +201,16 @@ class BoardPipeline:
         if not self._rest_known:
             reasons.append("taring")
             valid = False
-        if not present.all():
+        if np.count_nonzero(present) < len(present):
             reasons += [f"array {self._names[a]} missing" for a in np.flatnonzero(~present)]
             valid = False
-        masked = 1.0 - healthy.sum(axis=1) / self._layout.counts
-        for a in np.flatnonzero((masked > self.settings.masked_limit) & present):
-            reasons.append(f"taxels masked: {self._names[a]} {masked[a]:.0%}")
-            valid = False
+        if healthy is not self._layout.real:
+            masked = 1.0 - healthy.sum(axis=1) / self._layout.counts
+            for a in np.flatnonzero((masked > self.settings.masked_limit) & present):
+                reasons.append(f"taxels masked: {self._names[a]} {masked[a]:.0%}")
+                valid = False
         ambient = estimate.ambient
-        if not ambient.valid.all():
+        if self._rest_known and np.count_nonzero(ambient.valid) < len(present):
             for a in np.flatnonzero(~ambient.valid & present):
                 name = self._names[a]
                 if estimate.borrowed[a]:
@@ -211,17 +234,22 @@ class BoardPipeline:
         shape = (self._layout.arrays, 3, self._layout.width)
         self._tare = Tare(shape, self.settings.tare_s, self._noise)
         self._tare_initial = initial
+        self._tare_peak = 0.0
 
     def _advance_tare(
         self, field: Float, healthy: Bool, whole: bool, captured: Instant, group: Group
     ) -> Float:
         """Take one cycle into the tare; its field over the rest field now in force."""
-        tare = self._tare
+        tare, layout = self._tare, self._layout
         if tare is None or not tare.add(field, healthy, whole, captured):
             return field
         trouble = tare.trouble()
-        if trouble is None and not self._tare_initial and self._features.contact.any():
-            trouble = "the skin is touched: lift it off everything"
+        limit = self.settings.tare_limit_n
+        if trouble is None and not self._tare_initial and self._tare_peak > limit:
+            trouble = (
+                f"a taxel bears {self._tare_peak:.1f} N, more than the {limit:g} N that drift may "
+                "look like: lift the skin off everything"
+            )
         if trouble is not None:
             self._end_tare(False, f"tare refused: {trouble}", 0.0, self._noise, group.sequence)
             if not self._rest_known:
@@ -231,8 +259,9 @@ class BoardPipeline:
         self._model.rest += shift
         noise = tare.noise()
         largest = float(np.abs(shift).max())
-        left = self._layout.taxels - int(tare.healthy.sum())
-        kept = f"; {left} unhealthy taxels keep theirs" if left else ""
+        left = layout.taxels - int(tare.healthy.sum())
+        kept = "stay masked" if self._tare_initial else "keep theirs"
+        kept = f"; {left} unhealthy taxels {kept}" if left else ""
         self._end_tare(
             True,
             f"tared over {tare.cycles} cycles: rest fields moved by up to {largest:.1f} µT{kept}",
@@ -241,6 +270,9 @@ class BoardPipeline:
             group.sequence,
         )
         self._rest_known = True
+        if self._tare_initial:
+            unrested = layout.real & ~tare.healthy
+            self._unrested = unrested if unrested.any() else None
         self._compensator.reset()
         self._features.reset()
         self._theta = np.zeros_like(self._theta)

@@ -24,6 +24,7 @@ class PipelineSettings:
     ``tip_light_n``: N, least and greatest tip force that is a light contact (paper, Table II).
     ``frozen_after_s``: s of unchanging counts after which a taxel is frozen; None: never.
     ``range_limit_ut``: µT beyond which a chip's reading is impossible. ``tare_s``: s averaged.
+    ``tare_limit_n``: N on one taxel beyond which a tare is refused as a contact.
     ``auto_tare``: tare at the start; None: when the calibration is nominal, its rest unknown.
     ``rest_tracking_s``: s, time constant at which untouched taxels' rest follows; None: never.
     ``hold_s``: s that features stay valid on a held field after the fit lost its support.
@@ -42,6 +43,7 @@ class PipelineSettings:
     frozen_after_s: float | None = 0.5
     range_limit_ut: float = 50_000.0
     tare_s: float = 0.5
+    tare_limit_n: float = 1.0
     auto_tare: bool | None = None
     rest_tracking_s: float | None = None
     hold_s: float = 1.5
@@ -64,6 +66,7 @@ class PipelineSettings:
             ("frozen_after_s", self.frozen_after_s, 0.01, 3600),
             ("range_limit_ut", self.range_limit_ut, 100, 1e7),
             ("tare_s", self.tare_s, 0.02, 60),
+            ("tare_limit_n", self.tare_limit_n, 0.01, 1000),
             ("rest_tracking_s", self.rest_tracking_s, 0.1, 1e6),
             ("hold_s", self.hold_s, 0, 3600),
             ("masked_limit", self.masked_limit, 0, 1),

@@ -17,6 +17,7 @@ from tactiled.consensus import Fit
 from tactiled.layout import Layout
 
 Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 
 OFFSET_MEMORY_S = 30.0
 """s that an array's own offset from the board's constant is remembered while it borrows: chips
@@ -30,6 +31,9 @@ class FieldTracker:
         self._layout = layout
         self._method = method
         self._borrows = borrows and layout.arrays > 1
+        self._zero_age = np.zeros(layout.arrays)
+        self._none = np.zeros(layout.arrays, dtype=bool)
+        self._zero_age.flags.writeable = self._none.flags.writeable = False
         self.reset()
 
     def reset(self) -> None:
@@ -42,24 +46,28 @@ class FieldTracker:
 
     def take(self, fit: Fit, captured: Instant, fresh: bool = True) -> Estimate:
         """Estimate of a cycle from its fit; ``fresh`` False: only a check of the earlier planes."""
+        if fresh and fit.whole:
+            self.theta = fit.theta
+            self._common[:] = fit.common
+            self._fitted_at.fill(captured)
+            self._ever.fill(True)
+            return self._estimate(fit, fit.theta, fit.valid, self._zero_age, self._none)
         valid = fit.valid if fresh else fit.valid & self._ever
-        if fresh:
-            if valid.all():
-                self.theta = fit.theta
-                self._common[:] = fit.common
-                self._fitted_at[:] = captured
-                self._ever[:] = True
-            elif valid.any():
-                self.theta = np.where(valid[:, None, None], fit.theta, self.theta)
-                self._common[valid] = fit.common
-                self._fitted_at[valid] = captured
-                self._ever |= valid
+        if fresh and valid.any():
+            self.theta = np.where(valid[:, None, None], fit.theta, self.theta)
+            self._common[valid] = fit.common
+            self._fitted_at[valid] = captured
+            self._ever |= valid
         age = (captured - self._fitted_at) / NS_PER_S
         age[~self._ever] = np.inf
-        theta = self.theta
-        borrowed = np.zeros(len(valid), dtype=bool)
-        if self._borrows and fresh and valid.any() and not valid.all():
+        if self._borrows and fresh and valid.any():
             theta, borrowed = self._borrow(fit, valid, age)
+            return self._estimate(fit, theta, valid, age, borrowed)
+        return self._estimate(fit, self.theta, valid, age, self._none)
+
+    def _estimate(
+        self, fit: Fit, theta: Float, valid: Bool, age: Float, borrowed: Bool
+    ) -> Estimate:
         ambient = Ambient(
             method=self._method,
             plane=outside_plane(theta, self._layout),
@@ -70,9 +78,7 @@ class FieldTracker:
         )
         return Estimate(theta, ambient, borrowed)
 
-    def _borrow(
-        self, fit: Fit, valid: NDArray[np.bool_], age: Float
-    ) -> tuple[Float, NDArray[np.bool_]]:
+    def _borrow(self, fit: Fit, valid: Bool, age: Float) -> tuple[Float, Bool]:
         """Planes in which the arrays without a fit of their own follow the rest of the board."""
         theta = self.theta.copy()
         for a in np.flatnonzero(~valid):
