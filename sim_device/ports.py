@@ -18,8 +18,10 @@ from collections import Counter, deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sensor_proto import can_errors
+from sensor_proto.can_errors import BusState
 from sensor_proto.canseg import CanFrame
-from sim_device.can_wire import CanWire
+from sim_device.bus_timing import TimedBus
 from sim_device.slcan import SlcanAdapter
 from tactile_bus.can_bus import DEFAULT_BITRATE, CanSpec, from_message, open_bus, to_message
 from tactile_bus.instant import Instant
@@ -37,6 +39,10 @@ can drop the oldest, and a late reader would get stale samples."""
 
 READ_LIMIT = 4_096
 """Bytes taken from a host in one go; what is left comes with the next."""
+
+BUS_QUEUE = 64
+"""Frames that wait for the bus before boards hold back: 10 ms at 1 Mbit/s, so that the next clock
+reply is never far behind, and the bus never idle between two ticks."""
 
 MAX_FRAMES = 256
 """Frames taken from a bus in one go."""
@@ -76,9 +82,14 @@ class PtyPort:
         return self._master >= 0
 
     @property
-    def backlog(self) -> int:
-        """Bytes not yet taken by the terminal."""
-        return self._backlog_bytes
+    def ready(self) -> bool:
+        """Whether the terminal has taken all that was sent; a board waits until then."""
+        return not self._backlog
+
+    @property
+    def unread(self) -> int:
+        """Bytes that no host has read yet."""
+        return self._backlog_bytes + (_waiting(self._slave) if self.is_open else 0)
 
     def fileno(self) -> int:
         """Descriptor that is readable when a host has written; −1 while closed."""
@@ -161,17 +172,17 @@ class SlcanPort:
     def __init__(self, link: str | Path, fd: bool = True) -> None:
         self.pty = PtyPort(link)
         self.adapter = SlcanAdapter(fd=fd)
-        self.wire = CanWire()
+        self.bus = TimedBus()
 
     @property
     def losses(self) -> dict[str, int]:
         """What the terminal, the adapter and the bus dropped."""
-        return self.pty.losses | self.adapter.losses | {"bus_overrun": self.wire.dropped_frames}
+        return self.pty.losses | self.adapter.losses | {"bus_overrun": self.bus.dropped_frames}
 
     @property
-    def backlog(self) -> int:
-        """Bytes and frames still on their way."""
-        return self.pty.backlog + self.wire.waiting
+    def ready(self) -> bool:
+        """Whether boards find the bus free enough to send more."""
+        return self.pty.ready and self.bus.waiting < BUS_QUEUE
 
     def fileno(self) -> int:
         """Descriptor that is readable when the host has written."""
@@ -192,15 +203,21 @@ class SlcanPort:
         return tuple(frames)
 
     def send(self, frames: tuple[CanFrame, ...], now: Instant) -> None:
-        """Put a board's frames on the bus."""
+        """Put a board's frames on the bus; a board's bus-off (error frames) befalls the adapter."""
+        data = []
+        for frame in frames:
+            if frame.error:
+                self._suffer(frame)
+            else:
+                data.append(frame)
         if self.adapter.is_open:
-            self.wire.push(frames, now)
+            self.bus.push(data, now)
         self.flush(now)
 
     def flush(self, now: Instant) -> None:
         """Pass on the frames that have gone over the bus by ``now``."""
         bitrate = self.adapter.bitrate or DEFAULT_BITRATE
-        frames = self.wire.pop(now, bitrate, self.adapter.data_bitrate)
+        frames = self.bus.pop(now, bitrate, self.adapter.data_bitrate)
         if frames:
             self.adapter.deliver(frames, now)
         self._answer()
@@ -209,6 +226,11 @@ class SlcanPort:
         """Begin or end a bus-off; see `SlcanAdapter.set_bus_off`."""
         self.adapter.set_bus_off(fault)
         self._answer()
+
+    def _suffer(self, frame: CanFrame) -> None:
+        state = can_errors.told_state(frame)
+        if state is not None:
+            self.adapter.set_bus_off(state is BusState.BUS_OFF)
 
     def _answer(self) -> None:
         self.pty.send(self.adapter.take_output())
@@ -231,9 +253,9 @@ class PythonCanPort:
         return dict(self._counts)
 
     @property
-    def backlog(self) -> int:
-        """Nothing waits here."""
-        return 0
+    def ready(self) -> bool:
+        """Always: nothing waits here."""
+        return True
 
     def fileno(self) -> int:
         """Descriptor to poll; −1 where the driver has none."""

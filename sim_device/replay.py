@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sensor_proto.anyskin import MAX_FIELD_UT, MAX_MAGNETOMETERS, encode_anyskin
+from sensor_proto.anyskin import MAX_FIELD_UT, encode_anyskin
+from sensor_proto.anyskin_search import MAX_MAGNETOMETERS
 from sensor_proto.packets import FloatSamples
 from tactile_bus.instant import Instant, after
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from sensor_proto import can_errors, slcan
 from sensor_proto.can_errors import BusState
 from sensor_proto.canseg import CanFrame
-from sim_device.can_wire import MAX_QUEUED, CanWire, frame_seconds
+from sim_device.bus_timing import MAX_QUEUED, TimedBus, frame_seconds
 from sim_device.slcan import MAX_OUTPUT, SlcanAdapter
 from tactile_bus.instant import Instant
 
@@ -279,21 +279,21 @@ def test_frame_times_are_those_of_the_literature() -> None:
 
 
 def test_the_bus_carries_one_frame_at_a_time_lowest_identifier_first() -> None:
-    wire = CanWire()
+    bus = TimedBus()
     low, high = CanFrame(1, bytes(8)), CanFrame(9, bytes(8))
-    wire.push([high, high, low], Instant(0))
-    assert wire.pop(Instant(159_000), 1_000_000, 1) == ()
-    assert wire.pop(Instant(161_000), 1_000_000, 1) == (low,)
-    assert wire.pop(Instant(1_000_000), 1_000_000, 1) == (high, high)
-    assert wire.load(Instant(1_000_000)) == pytest.approx(0.48)
-    assert wire.load(Instant(2_000_000)) == 0
+    bus.push([high, high, low], Instant(0))
+    assert bus.pop(Instant(159_000), 1_000_000, 1) == ()
+    assert bus.pop(Instant(161_000), 1_000_000, 1) == (low,)
+    assert bus.pop(Instant(1_000_000), 1_000_000, 1) == (high, high)
+    assert bus.load(Instant(1_000_000)) == pytest.approx(0.48)
+    assert bus.load(Instant(2_000_000)) == 0
 
 
 def test_a_bus_that_is_too_slow_drops_whole_batches_and_counts_them() -> None:
-    wire = CanWire()
+    bus = TimedBus()
     batch = [CanFrame(1, bytes(8))] * 100
     for _ in range(10):
-        wire.push(batch, Instant(0))
-    assert wire.waiting <= MAX_QUEUED + len(batch)
-    assert wire.dropped_frames == 1000 - wire.waiting
-    assert wire.waiting % 100 == 0
+        bus.push(batch, Instant(0))
+    assert bus.waiting <= MAX_QUEUED + len(batch)
+    assert bus.dropped_frames == 1000 - bus.waiting
+    assert bus.waiting % 100 == 0

@@ -29,7 +29,7 @@ def frame_seconds(frame: CanFrame, bitrate: int, data_bitrate: int) -> float:
     return 58 / bitrate + data_bits / data_bitrate
 
 
-class CanWire:
+class TimedBus:
     """Frames wait here for their turn: lowest identifier first, then first come.
 
     ``load``: share of time the bus was busy since it was last asked for.

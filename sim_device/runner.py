@@ -1,0 +1,313 @@
+"""Boards in real time: what comes from the ports goes to the boards, and back, on a fixed grid."""
+
+from __future__ import annotations
+
+import select
+from collections.abc import Callable, Sequence
+from typing import Generic, Protocol, TypeVar
+
+from sensor_proto.canseg import CanFrame
+from sim_device.faults import Window
+from sim_device.ports import PtyPort, PythonCanPort, SlcanPort
+from sim_device.replay import ReplayBoard
+from tactile_bus.instant import Instant, after, monotonic_now, seconds_between
+
+TICK = 0.001
+"""s between two looks at every board, the period of a USB frame: no sample waits longer."""
+
+STATUS_PERIOD = 0.5
+"""s between two calls of the status function."""
+
+LONGEST_WAIT = 0.5
+"""s that a board waits for a full port at most; then it goes on, and its queue drops the oldest."""
+
+DRAIN_TIME = 2.0
+"""s that the last frames of a replay wait for their reader."""
+
+Payload = TypeVar("Payload", bytes, tuple[CanFrame, ...])
+
+
+class Board(Protocol[Payload]):
+    """A simulated board; see `sim_device.firmware`."""
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What it counted."""
+
+    def receive(self, data: Payload, now: Instant, /) -> None:
+        """Take what came from the host."""
+
+    def tick(self, now: Instant, /) -> Payload:
+        """What goes to the host."""
+
+
+MakeBoard = Callable[[float], Board[Payload]]
+"""Makes the board afresh, powered so many seconds after the start of the simulation."""
+
+
+class Station(Protocol):
+    """One port with what is on it."""
+
+    @property
+    def sent(self) -> int:
+        """Messages (serial) or frames (CAN) given to the port."""
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """What was lost at the port and at the boards."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether there will be nothing to do any more."""
+
+    def fileno(self) -> int:
+        """Descriptor to wait on; −1 for none."""
+
+    def open(self) -> None:
+        """Open the port."""
+
+    def close(self) -> None:
+        """Close the port."""
+
+    def service(self, now: Instant) -> None:
+        """Pass everything on that is due."""
+
+
+class SerialStation:
+    """A board on a pseudo-terminal. ``unplugged``: windows of time without power and port."""
+
+    def __init__(
+        self, port: PtyPort, make_board: MakeBoard[bytes], unplugged: Sequence[Window] = ()
+    ) -> None:
+        self.port = port
+        self.board: Board[bytes] = make_board(0.0)
+        self.sent = 0
+        self._make_board = make_board
+        self._unplugged = tuple(unplugged)
+        self._start: Instant | None = None
+        self._feeder = _Feeder[bytes]()
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """Of port and board."""
+        return self.port.losses | _only_losses(self.board.counters)
+
+    @property
+    def finished(self) -> bool:
+        """Never: a board runs until it is stopped."""
+        return False
+
+    def fileno(self) -> int:
+        """Of the port."""
+        return self.port.fileno()
+
+    def open(self) -> None:
+        """Open the port."""
+        self.port.open()
+
+    def close(self) -> None:
+        """Close the port."""
+        self.port.close()
+
+    def service(self, now: Instant) -> None:
+        """Unplug or plug in when it is time, then pass bytes on."""
+        if self._start is None:
+            self._start = now
+        elapsed = seconds_between(self._start, now)
+        if any(w.covers(elapsed) for w in self._unplugged):
+            self.port.close()
+            return
+        if not self.port.is_open:
+            self.board = self._make_board(elapsed)
+            self._feeder = _Feeder()
+            self.port.open()
+        data = self.port.receive()
+        if data:
+            self.board.receive(data, now)
+        self.port.flush()
+        out = self._feeder.tick(self.board, self.port.ready, now)
+        if out:
+            self.sent += 1
+            self.port.send(out)
+
+
+class CanStation:
+    """Boards on one CAN bus."""
+
+    def __init__(
+        self,
+        port: SlcanPort | PythonCanPort,
+        make_boards: Sequence[MakeBoard[tuple[CanFrame, ...]]],
+    ) -> None:
+        self.port = port
+        self.boards = [make(0.0) for make in make_boards]
+        self.sent = 0
+        self._feeders = [_Feeder[tuple[CanFrame, ...]]() for _ in self.boards]
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """Of the port and all boards together."""
+        total = dict(self.port.losses)
+        for board in self.boards:
+            for reason, count in _only_losses(board.counters).items():
+                total[reason] = total.get(reason, 0) + count
+        return total
+
+    @property
+    def finished(self) -> bool:
+        """Never."""
+        return False
+
+    def fileno(self) -> int:
+        """Of the port."""
+        return self.port.fileno()
+
+    def open(self) -> None:
+        """Open the port."""
+        self.port.open()
+
+    def close(self) -> None:
+        """Close the port."""
+        self.port.close()
+
+    def service(self, now: Instant) -> None:
+        """Pass frames on; boards hear the host, not one another."""
+        frames = self.port.receive()
+        for board in self.boards if frames else ():
+            board.receive(frames, now)
+        self.port.flush(now)
+        for board, feeder in zip(self.boards, self._feeders, strict=True):
+            out = feeder.tick(board, self.port.ready, now)
+            if out:
+                self.sent += len(out)
+                self.port.send(out, now)
+
+
+class ReplayStation:
+    """A recording on a pseudo-terminal; it begins when somebody reads, so that nothing is lost."""
+
+    def __init__(self, port: PtyPort, board: ReplayBoard) -> None:
+        self.port = port
+        self.board = board
+        self._ended: Instant | None = None
+        self._now = Instant(0)
+
+    @property
+    def sent(self) -> int:
+        """Frames sent."""
+        return self.board.sent
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """Of the port."""
+        return self.port.losses
+
+    @property
+    def finished(self) -> bool:
+        """Whether the last frame was read, or nobody read it for `DRAIN_TIME`."""
+        if self._ended is None:
+            return False
+        return self.port.unread == 0 or seconds_between(self._ended, self._now) > DRAIN_TIME
+
+    def fileno(self) -> int:
+        """Of the port."""
+        return self.port.fileno()
+
+    def open(self) -> None:
+        """Open the port."""
+        self.port.open()
+
+    def close(self) -> None:
+        """Close the port."""
+        self.port.close()
+
+    def service(self, now: Instant) -> None:
+        """Send the frames that are due; begin once the bait has been read."""
+        self._now = now
+        self.port.receive()  # whatever a host asks: such boards do not listen
+        out = self.board.tick(now)
+        self.port.send(out)
+        if not self.board.started and not out and self.port.unread == 0:
+            self.board.start(now)
+        if self.board.finished and self._ended is None:
+            self._ended = now
+
+
+class Runner:
+    """Serves stations on an absolute grid of `TICK` until told to stop."""
+
+    def __init__(self, stations: Sequence[Station]) -> None:
+        self.stations = tuple(stations)
+
+    def open(self) -> None:
+        """Open every port, or none: raises what the first that fails raises."""
+        opened: list[Station] = []
+        try:
+            for station in self.stations:
+                station.open()
+                opened.append(station)
+        except BaseException:
+            for station in opened:
+                station.close()
+            raise
+
+    def close(self) -> None:
+        """Close every port; links are taken away."""
+        for station in self.stations:
+            station.close()
+
+    def run(
+        self,
+        stopping: Callable[[], bool],
+        duration: float | None = None,
+        on_status: Callable[[float], None] | None = None,
+    ) -> None:
+        """Serve until ``stopping()``, for ``duration`` s, or until every station has finished.
+
+        ``on_status``: called with the seconds since the start every `STATUS_PERIOD`.
+        """
+        start = tick = monotonic_now()
+        status = start
+        while not stopping():
+            now = monotonic_now()
+            elapsed = seconds_between(start, now)
+            if duration is not None and elapsed >= duration:
+                return
+            for station in self.stations:
+                station.service(now)
+            if all(station.finished for station in self.stations):
+                return
+            if on_status is not None and now >= status:
+                on_status(elapsed)
+                status = after(now, STATUS_PERIOD)
+            tick = after(tick, TICK)
+            if tick < now:
+                tick = now  # late: what was missed is made up by the boards, not by extra ticks
+            self._wait(seconds_between(monotonic_now(), tick))
+
+    def _wait(self, seconds: float) -> None:
+        descriptors = [fd for station in self.stations if (fd := station.fileno()) >= 0]
+        select.select(descriptors, [], [], max(0.0, seconds))
+
+
+class _Feeder(Generic[Payload]):
+    """Lets a board wait while its port is full, but not for ever."""
+
+    def __init__(self) -> None:
+        self._last: Instant | None = None
+
+    def tick(self, board: Board[Payload], ready: bool, now: Instant) -> Payload | None:
+        """What the board sends; None while it waits."""
+        waited = self._last is None or seconds_between(self._last, now) >= LONGEST_WAIT
+        if not ready and not waited:
+            return None
+        self._last = now
+        return board.tick(now)
+
+
+LOSS_COUNTERS = ("overruns", "lost", "silenced", "damaged", "rx_errors")
+"""Counters of a board that stand for something lost, on purpose or not."""
+
+
+def _only_losses(counters: dict[str, int]) -> dict[str, int]:
+    return {name: counters[name] for name in LOSS_COUNTERS if counters.get(name)}
