@@ -166,8 +166,7 @@ class LogWriter:
             self._fail(error)
 
     def finish(self) -> None:
-        """Flush and finish the file; ``state`` is closed unless something stayed unwritten."""
-        self.flush(last=True)
+        """Finish the file after the last flush; ``state`` is closed unless something went wrong."""
         try:
             self._end_file()
         except OSError as error:
@@ -288,7 +287,9 @@ class LogWriter:
         """Leave the file that cannot be written on, and try another one later."""
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         remedy = "make room" if full else "check the disk; trying another file"
-        self._leave("disk_full" if full else "io_error", f"{self.path}: {error.strerror}", remedy)
+        self._leave(
+            "disk_full" if full else "io_error", f"{self.path}: {error.strerror or error}", remedy
+        )
 
     def _stop_for_space(self) -> None:
         """Close the file while there is still room to close it in order."""

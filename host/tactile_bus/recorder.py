@@ -213,7 +213,7 @@ class Recorder:
                 if time.monotonic() >= next_flush:
                     self._writer.flush()
                     next_flush = time.monotonic() + period - POLL
-            self._take()
+            self._drain()
             self._writer.finish()
         except Exception as error:  # thread boundary: a dead writer must be seen, not guessed
             log.exception("log writer failed; nothing more is logged")
@@ -238,6 +238,20 @@ class Recorder:
             for item in batch:
                 self._writer.add(item)
             time.sleep(0)
+
+    def _drain(self) -> None:
+        """Write all that is queued. A file that fails gets one successor, then the rest is lost."""
+        failures = 0
+        while failures < 2:
+            self._take()
+            self._writer.flush(last=True)
+            if self._writer.blocked:
+                failures += 1
+                continue
+            failures = 0
+            with self._lock:
+                if not self._queue:
+                    return
 
     def _count_unwritten(self) -> None:
         """At the end: what is still in hand is lost."""

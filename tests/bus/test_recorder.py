@@ -1,0 +1,420 @@
+"""The recorder: bounded, never blocking, and nothing lost without a trace."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import resource
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tactile_bus import topics
+from tactile_bus.instant import WallClock
+from tactile_bus.log_info import LogInfo, info
+from tactile_bus.log_reader import read_messages
+from tactile_bus.messages import MAX_PAYLOAD
+from tactile_bus.recorder import Recorder, RecorderError, RecorderSettings
+
+BASE_NS = 1_700_000_000_000_000_000
+
+
+def logs(directory: Path) -> list[LogInfo]:
+    return [info(path) for path in sorted(directory.glob("*.mcap"))]
+
+
+def sequences(directory: Path) -> dict[str, list[int]]:
+    """Sequence numbers in all logs of a directory, by channel, repeats taken out."""
+    found = defaultdict(list)
+    for path in sorted(directory.glob("*.mcap")):
+        for channel, message in read_messages(path):
+            if message.sequence not in found[channel.topic]:
+                found[channel.topic].append(message.sequence)
+    return found
+
+
+def holes(numbers: list[int], handed_over: int) -> int:
+    return handed_over - len(set(numbers))
+
+
+def test_a_message_is_readable_within_a_flush_though_none_follows(
+    tmp_path: Path, record: Any, payloads: Any, until: Any
+) -> None:
+    recorder = record(tmp_path / "a.mcap")
+    recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
+    until(lambda: recorder.stats.written == 1)
+    # The file is still open: what a kill at this moment would leave.
+    found = info(tmp_path / "a.mcap")
+    assert found.messages == 1
+    assert not found.closed
+
+
+def test_every_flush_reaches_the_disk(
+    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any
+) -> None:
+    recorder = record(tmp_path / "a.mcap")
+    before = disk.syncs
+    recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
+    until(lambda: recorder.stats.written == 1)
+    assert disk.syncs > before
+
+
+def test_the_flush_period_cannot_be_set_above_half_a_second(tmp_path: Path) -> None:
+    from tactile_bus.config import ConfigError, parse_toml
+
+    with pytest.raises(
+        ConfigError, match=r"flush_period = 5\.0; allowed: seconds, above 0, at most"
+    ):
+        parse_toml("flush_period = 5.0", RecorderSettings)
+
+
+def test_close_writes_what_is_queued_and_says_so(
+    tmp_path: Path, record: Any, payloads: Any
+) -> None:
+    recorder = record(tmp_path / "a.mcap", flush_period=0.5)
+    for i in range(1000):
+        recorder.write(topics.FORCES, "b0", payloads[topics.FORCES], BASE_NS + i, BASE_NS + i)
+    assert recorder.close(10)
+    stats = recorder.stats
+    assert (stats.state, stats.written, stats.queued, stats.dropped) == ("closed", 1000, 0, {})
+    found = info(tmp_path / "a.mcap")
+    assert found.whole
+    assert found.messages == 1000
+
+
+def test_what_comes_after_close_is_counted(tmp_path: Path, record: Any, payloads: Any) -> None:
+    recorder = record(tmp_path / "a.mcap")
+    recorder.close(10)
+    recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
+    assert recorder.stats.dropped == {"closed": 1}
+
+
+def test_a_full_queue_drops_the_oldest_and_the_log_shows_where(
+    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any
+) -> None:
+    recorder = record(tmp_path / "a.mcap", queue_messages=50)
+    disk.moving.clear()  # a disk that hangs
+    for i in range(400):
+        for topic in (topics.FORCES, topics.RAW):
+            recorder.write(topic, "b0", payloads[topic], BASE_NS + i, BASE_NS + i)
+    dropped = recorder.stats.dropped["queue_full"]
+    assert dropped > 0
+    disk.moving.set()
+    until(lambda: recorder.stats.queued == 0)
+    for i in range(400, 410):
+        recorder.write(topics.RAW, "b0", payloads[topics.RAW], BASE_NS + i, BASE_NS + i)
+    assert recorder.close(10)
+    assert recorder.stats.dropped == {"queue_full": dropped}
+    found = info(tmp_path / "a.mcap")
+    gaps = [gap for gap in found.gaps if gap.reason == "queue_full"]
+    assert sum(gap.messages for gap in gaps) == dropped
+    by_channel = defaultdict(int)
+    for gap in gaps:
+        for name, count in gap.channels.items():
+            by_channel[name] += count
+    assert sum(by_channel.values()) == dropped
+    # The same loss, message by message: numbers that are not there.
+    assert {c.topic: c.missing for c in found.channels} == dict(by_channel)
+    numbers = sequences(tmp_path)
+    assert (
+        sum(
+            holes(numbers[t.channel("b0")], n) for t, n in ((topics.FORCES, 400), (topics.RAW, 410))
+        )
+        == dropped
+    )
+    # The newest survive.
+    assert numbers["/tactile/b0/raw"][-1] == 409
+    times = [m.log_ns for c, m in read_messages(tmp_path / "a.mcap") if c.topic.endswith("forces")]
+    missing = sorted(set(range(BASE_NS, BASE_NS + 400)) - set(times))
+    assert gaps[0].first_ns <= missing[0]
+    assert gaps[-1].last_ns >= missing[-1]
+
+
+def test_the_queue_is_bounded_in_bytes_too(tmp_path: Path, record: Any, disk: Any) -> None:
+    recorder = record(tmp_path / "a.mcap", queue_bytes=10_000, chunk_bytes=1)
+    disk.moving.clear()
+    for i in range(100):
+        recorder.write(topics.RAW, "b0", bytes(5000), BASE_NS + i, BASE_NS + i)
+    stats = recorder.stats
+    assert stats.dropped["queue_full"] >= 90
+    assert stats.queued <= 4  # two queued, and what the writer holds
+
+
+def test_writing_never_waits_for_a_hanging_disk(
+    tmp_path: Path, record: Any, payloads: Any, disk: Any
+) -> None:
+    recorder = record(tmp_path / "a.mcap", queue_messages=100)
+    disk.moving.clear()
+    done = threading.Event()
+
+    def write() -> None:
+        for i in range(5000):
+            recorder.write(topics.FORCES, "b0", payloads[topics.FORCES], BASE_NS + i, BASE_NS)
+        recorder.attach("x", "text/plain", b"x")
+        recorder.metadata("y", {"z": "1"})
+        done.set()
+
+    threading.Thread(target=write, daemon=True).start()
+    assert done.wait(20)
+    assert not recorder.close(0.2)  # it says that it could not
+
+
+def test_a_full_disk_is_loud_and_the_next_file_tells_of_it(
+    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any, caplog: Any
+) -> None:
+    recorder = record(tmp_path)
+    data = payloads[topics.FORCES]
+    recorder.write(topics.FORCES, "b0", data, BASE_NS, BASE_NS)
+    until(lambda: recorder.stats.written == 1)
+    with caplog.at_level(logging.ERROR):
+        disk.room = 100  # the next chunk does not fit: part of it is written, then ENOSPC
+        for i in range(1, 50):
+            recorder.write(topics.FORCES, "b0", data, BASE_NS + i, BASE_NS + i)
+        until(lambda: recorder.stats.state == "disk_full")
+    assert "No space left on device" in caplog.text
+    assert "make room" in caplog.text
+    assert "No space left on device" in recorder.stats.last_error
+    disk.room = None
+    until(lambda: recorder.stats.written == 50)
+    assert recorder.stats.state == "recording"
+    assert recorder.close(10)
+    first, *later = logs(tmp_path)
+    assert later
+    assert first.messages == 1  # nothing of the chunk that did not fit
+    assert first.damage_count == 0
+    assert [g.reason for g in later[-1].gaps] == ["disk_full"]
+    assert str(first.path) in later[-1].gaps[0].detail
+    # The chunk in hand was kept, so nothing is missing at all.
+    assert recorder.stats.dropped == {}
+    assert sequences(tmp_path)["/tactile/b0/forces"] == list(range(50))
+    assert all(found.whole for found in later)
+
+
+def test_what_a_full_disk_costs_is_counted(
+    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any
+) -> None:
+    recorder = record(tmp_path, queue_messages=20)
+    data = payloads[topics.FORCES]
+    recorder.write(topics.FORCES, "b0", data, BASE_NS, BASE_NS)
+    until(lambda: recorder.stats.written == 1)
+    disk.room = 0
+    recorder.write(topics.FORCES, "b0", data, BASE_NS + 1, BASE_NS + 1)
+    until(lambda: recorder.stats.state == "disk_full")
+    for i in range(2, 100):
+        recorder.write(topics.FORCES, "b0", data, BASE_NS + i, BASE_NS + i)
+    assert recorder.stats.dropped == {"disk_full": 78}
+    disk.room = None
+    until(lambda: recorder.stats.queued == 0)
+    assert recorder.close(10)
+    found = logs(tmp_path)
+    assert sum(gap.messages for log in found for gap in log.gaps) == 78
+    assert holes(sequences(tmp_path)["/tactile/b0/forces"], 100) == 78
+
+
+def test_an_io_error_ends_the_file_and_the_next_goes_on(
+    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any
+) -> None:
+    recorder = record(tmp_path)
+    disk.error = errno.EIO
+    disk.room = 0
+    recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
+    until(lambda: recorder.stats.state == "io_error")
+    assert recorder.stats.errors >= 1
+    disk.room = None
+    until(lambda: recorder.stats.written == 1)
+    assert recorder.close(10)
+    assert [g.reason for log in logs(tmp_path) for g in log.gaps] == ["io_error"]
+
+
+def test_a_disk_that_stays_full_to_the_end_is_admitted(
+    tmp_path: Path, record: Any, payloads: Any, disk: Any
+) -> None:
+    recorder = record(tmp_path)
+    disk.room = 0
+    for i in range(5):
+        recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS + i, BASE_NS)
+    assert not recorder.close(10)
+    stats = recorder.stats
+    assert stats.written == 0
+    assert stats.dropped == {"disk_full": 5}
+
+
+def test_logging_stops_while_there_is_still_room_and_resumes(
+    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any, caplog: Any
+) -> None:
+    recorder = record(tmp_path, min_free_bytes=1 << 30)
+    recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
+    until(lambda: recorder.stats.written == 1)
+    disk.free_bytes = (1 << 30) - 1
+    with caplog.at_level(logging.ERROR):
+        until(lambda: recorder.stats.state == "low_space")
+    assert "logs stop at 1.07" in caplog.text
+    assert logs(tmp_path)[0].whole  # closed in order
+    size = sum(path.stat().st_size for path in tmp_path.iterdir())
+    recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS + 1, BASE_NS)
+    time.sleep(0.3)
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) == size
+    disk.free_bytes = 1 << 40
+    until(lambda: recorder.stats.written == 2)
+    assert recorder.close(10)
+    assert [g.reason for g in logs(tmp_path)[-1].gaps] == ["low_space"]
+
+
+def test_files_split_by_size_and_each_stands_alone(
+    tmp_path: Path, record: Any, payloads: Any, until: Any
+) -> None:
+    recorder = record(tmp_path, split_bytes=6000, flush_period=0.03)
+    recorder.attach("cal.toml", "application/toml", b"x = 1\n")
+    recorder.metadata("board:b0", {"serial_number": "0011"})
+    recorder.write(topics.GEOMETRY, "b0", payloads[topics.GEOMETRY], BASE_NS, BASE_NS)
+    count = 0
+    while recorder.stats.files < 4:
+        count += 1
+        data = os.urandom(300)
+        recorder.write(topics.RAW, "b0", data, BASE_NS + count, BASE_NS + count)
+        time.sleep(0.002)
+    assert recorder.close(10)
+    found = logs(tmp_path)
+    assert len(found) >= 4
+    for number, log in enumerate(found):
+        assert log.whole
+        assert log.size < 6000 + 4000  # split_bytes, and the summary
+        assert log.metadata["board:b0"] == {"serial_number": "0011"}
+        assert log.metadata["file"]["file"] == str(number)
+        assert log.attachments == {"cal.toml": ("application/toml", 6)}
+        if log.messages:
+            geometry = [c for c in log.channels if c.topic.endswith("geometry")]
+            assert [c.messages for c in geometry] == [1]
+        assert all(channel.missing == 0 for channel in log.channels)
+    assert len({log.metadata["file"]["set"] for log in found}) == 1
+    assert sequences(tmp_path)["/tactile/b0/raw"] == list(range(count))
+
+
+def test_files_split_by_time(tmp_path: Path, record: Any, payloads: Any, until: Any) -> None:
+    recorder = record(tmp_path, split_seconds=0.15)
+    deadline = time.monotonic() + 20
+    while recorder.stats.files < 3:
+        assert time.monotonic() < deadline
+        recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
+        time.sleep(0.01)
+    assert recorder.close(10)
+    assert all(log.whole for log in logs(tmp_path))
+
+
+def test_a_changed_geometry_is_the_one_repeated(
+    tmp_path: Path, record: Any, payloads: Any, until: Any
+) -> None:
+    recorder = record(tmp_path, split_seconds=0.1)
+    old, new = payloads[topics.GEOMETRY], payloads[topics.GEOMETRY] + b"\0"
+    recorder.write(topics.GEOMETRY, "b0", old, BASE_NS, BASE_NS)
+    recorder.write(topics.GEOMETRY, "b0", new, BASE_NS + 1, BASE_NS)
+    until(lambda: recorder.stats.written == 2)
+    time.sleep(0.15)
+    recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS + 5, BASE_NS)
+    until(lambda: recorder.stats.files == 2)
+    assert recorder.close(10)
+    rows = [(c.topic, m.data) for c, m in read_messages(sorted(tmp_path.glob("*.mcap"))[1])]
+    assert rows[0] == ("/tactile/b0/geometry", new)
+
+
+def test_retention_keeps_the_newest_and_the_current(
+    tmp_path: Path, record: Any, until: Any
+) -> None:
+    stranger = tmp_path / "holiday.mcap"
+    stranger.write_bytes(b"not ours")
+    recorder = record(tmp_path, split_bytes=3000, max_files=3, flush_period=0.03)
+    deadline = time.monotonic() + 30
+    count = 0
+    while recorder.stats.files < 7:
+        assert time.monotonic() < deadline
+        recorder.write(topics.RAW, "b0", os.urandom(300), BASE_NS + count, BASE_NS)
+        count += 1
+        time.sleep(0.002)
+        assert Path(recorder.stats.path).exists() or recorder.stats.queued
+    assert recorder.close(10)
+    kept = sorted(tmp_path.glob("tactile_*.mcap"))
+    assert len(kept) <= 3
+    assert kept[-1] == Path(recorder.stats.path)
+    assert all(info(path).whole for path in kept)
+    assert stranger.exists()
+
+
+def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"precious")
+    with pytest.raises(RecorderError, match="exists and is not overwritten"):
+        Recorder(path, RecorderSettings(min_free_bytes=0))
+    assert path.read_bytes() == b"precious"
+
+
+def test_a_place_that_cannot_be_written_is_named_with_a_remedy(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for place in (tmp_path / "file" / "logs", Path("/proc/logs")):
+        with pytest.raises(RecorderError, match="name a directory that this user may write to"):
+            Recorder(place, RecorderSettings(min_free_bytes=0))
+
+
+def test_a_disk_without_room_is_refused_at_the_start(tmp_path: Path, disk: Any) -> None:
+    disk.free_bytes = 5 << 20
+    with pytest.raises(RecorderError, match=r"0.01 GB free .* logs stop at 1.07"):
+        Recorder(tmp_path, storage=disk)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_use_is_refused(tmp_path: Path, record: Any) -> None:
+    recorder = record(tmp_path / "a.mcap")
+    with pytest.raises(ValueError, match="65536 allowed"):
+        recorder.write(topics.RAW, "b0", bytes(MAX_PAYLOAD + 1), 0, 0)
+    with pytest.raises(ValueError, match="is no name"):
+        recorder.write(topics.RAW, "b/0", b"", 0, 0)
+
+
+def test_stamps_follow_the_offset_taken_once(tmp_path: Path, record: Any) -> None:
+    recorder = record(tmp_path / "a.mcap")
+    recorder.close(10)
+    offset = int(info(tmp_path / "a.mcap").metadata["software"]["clock_offset_ns"])
+    assert abs(offset - WallClock.take().offset_ns) < 60e9
+
+
+def test_a_real_file_size_limit_is_met_like_a_full_disk(tmp_path: Path) -> None:
+    """The kernel refuses bytes in the middle of a write: RLIMIT_FSIZE in a process of its own."""
+    limit = 40_000
+    code = textwrap.dedent("""
+        import os, sys, time
+        from pathlib import Path
+        from tactile_bus import topics
+        from tactile_bus.recorder import Recorder, RecorderSettings
+        settings = RecorderSettings(min_free_bytes=0, flush_period=0.05, retry_seconds=0.05)
+        recorder = Recorder(Path(sys.argv[1]), settings)
+        for i in range(400):
+            recorder.write(topics.RAW, "b0", os.urandom(300), 10**18 + i, 10**18 + i)
+            time.sleep(0.001)
+        closed = recorder.close(10)
+        stats = recorder.stats
+        print(closed, stats.written, stats.errors, sum(stats.dropped.values()))
+    """)
+    result = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+    )
+    closed, written, errors, dropped = result.stdout.split()
+    assert (closed, int(written), int(dropped)) == ("True", 400, 0)
+    assert int(errors) >= 2
+    assert "File too large" in result.stderr
+    found = logs(tmp_path)
+    assert len(found) >= 3
+    assert all(log.size <= limit for log in found)
+    assert not any(log.damage_count for log in found)
+    assert sequences(tmp_path)["/tactile/b0/raw"] == list(range(400))
