@@ -46,6 +46,7 @@ def make_parser() -> argparse.ArgumentParser:
     """Parser of the command line."""
     parser = argparse.ArgumentParser(
         prog="tactiled",
+        usage="tactiled --port P | --can SPEC | --mcap FILE | --config FILE [option ...]",
         description="Reads taxel boards and publishes and logs calibrated forces and contact "
         "features.",
         epilog=EPILOG,

@@ -86,7 +86,7 @@ class Status:
             table.add_row(
                 Text(station.name, "bold"),
                 Text(cells.pop("state"), style),
-                *(Text(f"{k} {v}" if v else "") for k, v in cells.items()),
+                *(Text(f"{k} {v}" if v else "", no_wrap=True) for k, v in cells.items()),
             )
         if self._recorder is not None:
             good = self._recorder.stats.state == "recording"
