@@ -6,18 +6,15 @@ chunk, found by its header; everything passed over is reported as `Damage`, neve
 
 from __future__ import annotations
 
-import os
-import re
-import stat
 import struct
 import zlib
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO
 
 from tactile_bus import mcap_file as op
+from tactile_bus.log_bytes import CHUNK_FIXED, WINDOW, LogBytes, Progress
 from tactile_bus.log_records import (
     ATTACHMENT_HEAD,
     U32,
@@ -49,13 +46,7 @@ MAX_RECORD = 16 << 20
 MAX_DAMAGES = 1000
 """Places reported one by one; beyond that they are only counted."""
 
-WINDOW = 1 << 20
-"""Bytes read at once while looking for the next chunk."""
-
-CHUNK_START = re.compile(rb"(?=\x06.{4}\x00{4})", re.DOTALL)
-CHUNK_FIXED = 40  # bytes of a chunk record but for its compression's name and its data
 FOOTER_SIZE = 9 + 20
-Progress = Callable[[int, int], None]
 
 
 @dataclass(slots=True)
@@ -80,18 +71,17 @@ class LogReader:
     bytes_damaged: int = 0
     messages_lost: int = 0
     lost_unknown: int = 0
-    _file: BinaryIO | None = None
-    _data_end: int = 0
+    _bytes: LogBytes = field(init=False)
     _lost_chunk: Damage | None = None
+    _summary_checked: bool = False  # its definitions hold: those amid the data have no checksum
+
+    def __post_init__(self) -> None:
+        """Prepare; the file is opened on entering the context."""
+        self._bytes = LogBytes(self.path, self.progress)
 
     def __enter__(self) -> LogReader:
-        try:
-            if not stat.S_ISREG(os.stat(self.path).st_mode) and not self.path.is_dir():
-                raise LogError(f"{self.path} is no file but a device or a pipe")
-            self._file = open(self.path, "rb")
-            self.size = os.fstat(self._file.fileno()).st_size
-        except OSError as error:
-            raise LogError(f"{self.path}: {error.strerror}") from error
+        self._bytes.open()
+        self.size = self._bytes.size
         return self
 
     def __exit__(
@@ -100,23 +90,16 @@ class LogReader:
         error: BaseException | None,
         at: TracebackType | None,
     ) -> None:
-        if self._file is not None:
-            self._file.close()
+        self._bytes.close()
 
     def read_at(self, position: int, size: int) -> bytes:
         """Bytes of the file; fewer at its end. `LogError` when the disk fails."""
-        if self._file is None:
-            raise ValueError("the log is not open")
-        try:
-            self._file.seek(position)
-            return self._file.read(size)
-        except OSError as error:
-            raise LogError(f"{self.path}: {error.strerror} at byte {position}") from error
+        return self._bytes.read_at(position, size)
 
     def events(self) -> Iterator[Event]:
         """Everything readable, in the order of the file."""
         position = self._start()
-        while position < self._data_end:
+        while position < self._bytes.end:
             if self.progress is not None:
                 self.progress(position, self.size)
             try:
@@ -154,14 +137,14 @@ class LogReader:
     def check_structure(self) -> None:
         """`LogError` unless the records follow one another soundly; chunks are not unpacked."""
         position = self._start()
-        while position < self._data_end and not self.damage_count:
+        while position < self._bytes.end and not self.damage_count:
             opcode, length = op.RECORD.unpack(self.read_at(position, 9).ljust(9, b"\0"))
             after = position + 9 + length
-            if (opcode == op.CHUNK and self._chunk_head(position) is None) or (
+            if (opcode == op.CHUNK and self._bytes.chunk_head(position) is None) or (
                 not 0 < opcode <= op.DATA_END and opcode < 0x80
             ):
                 raise LogError(f"{self.path}: no record at byte {position}")
-            if opcode == op.DATA_END or after > self._data_end:
+            if opcode == op.DATA_END or after > self._bytes.end:
                 break
             position = after
         if self.damage_count:
@@ -171,10 +154,10 @@ class LogReader:
         """Where the first record is; finds out whether the file was finished, and how it ends."""
         if self.size == 0:
             raise LogError(f"{self.path} is empty: its writer ended before the first byte")
-        self._data_end = self.size
+        self._bytes.end = self.size
         magic = self.read_at(0, 8)
         if magic != op.MAGIC:
-            first = self._find_chunk(0)
+            first = self._bytes.find_chunk(0)
             if op.MAGIC.startswith(magic):
                 raise LogError(f"{self.path} is cut off after {self.size} bytes: nothing to read")
             if first is None:
@@ -194,7 +177,7 @@ class LogReader:
         length = self.size - 12 - start  # all that its checksum covers
         if start == 0:
             self.closed = True
-            self._data_end = self.size - FOOTER_SIZE - 8
+            self._bytes.end = self.size - FOOTER_SIZE - 8
             return
         if not 8 <= start <= self.size - FOOTER_SIZE - 8 or length > MAX_CHUNK:
             return
@@ -203,7 +186,11 @@ class LogReader:
             self._damaged(Damage(start, length, "the checksum of the summary is wrong"))
             return
         self.closed = True
-        self._data_end = start
+        self._bytes.end = start
+        self._take_definitions(start, summary)
+        self._summary_checked = crc != 0
+
+    def _take_definitions(self, start: int, summary: bytes) -> None:
         at = 0
         while at + 9 <= len(summary):
             opcode, size = op.RECORD.unpack_from(summary, at)
@@ -225,14 +212,14 @@ class LogReader:
             self._settle_lost_chunk()
         if opcode == op.CHUNK:
             return self._chunk(position, length)
-        if after > self._data_end:
+        if after > self._bytes.end:
             raise BadRecordError("cut off within a record")
         if opcode == op.MESSAGE_INDEX:
             self._message_index(length)
         elif opcode == op.ATTACHMENT:
             return after, self._attachment(position, length)
         elif opcode == op.DATA_END:
-            if length != 4 or (self.closed and after != self._data_end):
+            if length != 4 or (self.closed and after != self._bytes.end):
                 raise BadRecordError("an end mark amid the data")
             return self._after_end_mark(position, after), None
         elif opcode in (op.HEADER, op.SCHEMA, op.CHANNEL, op.METADATA, op.MESSAGE):
@@ -245,11 +232,11 @@ class LogReader:
 
     def _after_end_mark(self, position: int, after: int) -> int:
         """An end mark without a summary that fits: the file was cut off while being finished."""
-        if not self.closed and self._find_chunk(after) is not None:
+        if not self.closed and self._bytes.find_chunk(after) is not None:
             raise BadRecordError("an end mark amid the data")
         if not self.closed:
             self._damaged(Damage(position, self.size - position, "cut off within the summary", 0))
-        return self._data_end
+        return self._bytes.end
 
     def _small(self, opcode: int, position: int, body: bytes) -> Event | None:
         if opcode == op.MESSAGE:
@@ -266,35 +253,37 @@ class LogReader:
         return None
 
     def _define(self, opcode: int, body: bytes) -> None:
-        """Take up a schema or a channel."""
+        """Take up a schema or a channel, unless the summary has it already."""
         if opcode == op.SCHEMA:
             schema = parse_schema(body)
-            self.schemas[schema.number] = schema
+            if not (self._summary_checked and schema.number in self.schemas):
+                self.schemas[schema.number] = schema
         else:
             channel = parse_channel(body)
-            self.channels[channel.number] = channel
+            if not (self._summary_checked and channel.number in self.channels):
+                self.channels[channel.number] = channel
 
     def _chunk(self, position: int, length: int) -> tuple[int, Event | None]:
-        head = self._chunk_head(position)
+        head = self._bytes.chunk_head(position)
         if head is None:
             raise BadRecordError("a chunk whose sizes do not agree")
         after = position + 9 + length
         place = position + 9 + CHUNK_FIXED + len(head.compression)
-        if after > self._data_end:
-            if self._find_chunk(position + 1) is not None:
+        if after > self._bytes.end:
+            if self._bytes.find_chunk(position + 1) is not None:
                 raise BadRecordError("a chunk that is longer than the file")
-            rest = self.read_at(place, self._data_end - place)
+            rest = self.read_at(place, self._bytes.end - place)
             self._damaged(
                 Damage(
                     position,
-                    self._data_end - position,
+                    self._bytes.end - position,
                     "cut off within a chunk",
                     None,
                     head.start_ns,
                     head.end_ns,
                 )
             )
-            return self._data_end, Block(position, unpack_start(rest, head), False)
+            return self._bytes.end, Block(position, unpack_start(rest, head), False)
         if head.size > MAX_CHUNK or length > MAX_CHUNK:
             self._lose_chunk(position, after, head, f"a chunk of {head.size} bytes")
             return after, None
@@ -348,10 +337,14 @@ class LogReader:
         return AttachmentRecord(name, media_type, log_ns, create_ns, start, size)
 
     def _skip(self, position: int, reason: str) -> int:
-        """Pass over what cannot be read, to the next chunk or the end of the data."""
+        """Pass over what cannot be read: one record where its length leads to another, or else
+        all up to the next chunk or the end of the data."""
         self._settle_lost_chunk()
-        found = self._find_chunk(position + 1)
-        after = self._data_end if found is None else found
+        head = self.read_at(position, 9)
+        after = position + 9 + op.RECORD.unpack(head)[1] if len(head) == 9 else self._bytes.end
+        if not self._bytes.plausible(after):
+            found = self._bytes.find_chunk(position + 1)
+            after = self._bytes.end if found is None else found
         self._damaged(Damage(position, after - position, reason))
         return after
 
@@ -362,40 +355,6 @@ class LogReader:
         self.lost_unknown += damage.messages is None
         if len(self.damages) < MAX_DAMAGES:
             self.damages.append(damage)
-
-    def _chunk_head(self, position: int) -> ChunkHead | None:
-        """Header of a chunk at ``position``, or None when its sizes do not agree."""
-        raw = self.read_at(position, 9 + CHUNK_FIXED + 4)
-        if len(raw) < 9 + CHUNK_FIXED or raw[0] != op.CHUNK:
-            return None
-        (length,) = U64.unpack_from(raw, 1)
-        start, end, size, crc = op.CHUNK_HEAD.unpack_from(raw, 9)
-        (name_length,) = U32.unpack_from(raw, 37)
-        name = raw[41 : 41 + name_length]
-        if name_length > 4 or name not in (b"", b"lz4", b"zstd"):
-            return None
-        if len(raw) < 41 + name_length + 8:
-            return None
-        (data_length,) = U64.unpack_from(raw, 41 + name_length)
-        if data_length + CHUNK_FIXED + name_length != length:
-            return None
-        return ChunkHead(start, end, size, crc, name.decode(), data_length)
-
-    def _find_chunk(self, position: int) -> int | None:
-        """Offset of the first whole, plausible chunk at or after ``position``."""
-        while position < self._data_end:
-            window = self.read_at(position, WINDOW + 16)
-            for match in CHUNK_START.finditer(window):
-                at = position + match.start()
-                head = self._chunk_head(at)
-                if head is not None:
-                    end = at + 9 + CHUNK_FIXED + len(head.compression) + head.data_length
-                    if end <= self._data_end:
-                        return at
-            if self.progress is not None:
-                self.progress(position, self.size)
-            position += WINDOW
-        return None
 
 
 def read_messages(

@@ -93,7 +93,7 @@ class _Copy:
         self._report = report
         self._file: McapFile | None = None
         self._compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
-        self._channels: dict[int, ChannelRecord] = {}
+        self._channels: set[int] = set()
         self._schemas: set[int] = set()
 
     def take(self, event: Block | MetadataRecord | AttachmentRecord) -> None:
@@ -139,9 +139,10 @@ class _Copy:
         report = self._report
         for message in self._reader.messages(event):
             channel = self._reader.channels.get(message.channel)
-            if channel is None or not self._define(file, channel):
+            if channel is None:
                 report.orphans += 1
                 continue
+            self._define(file, channel)
             chunk.add(
                 message.channel,
                 message.sequence,
@@ -156,18 +157,14 @@ class _Copy:
         report.start_ns = min(report.start_ns or chunk.start_ns, chunk.start_ns)
         report.end_ns = max(report.end_ns or chunk.end_ns, chunk.end_ns)
 
-    def _define(self, file: McapFile, channel: ChannelRecord) -> bool:
-        """Have the target know the channel; False when its schema is lost."""
+    def _define(self, file: McapFile, channel: ChannelRecord) -> None:
+        """Have the target know the channel; without a type when its schema is lost."""
         if channel.number in self._channels:
-            return True
-        if channel.schema and channel.schema not in self._schemas:
-            schema = self._reader.schemas.get(channel.schema)
-            if schema is None:
-                return False
+            return
+        schema = self._reader.schemas.get(channel.schema)
+        if schema is not None and schema.number not in self._schemas:
             file.add_schema(schema.number, schema.name, schema.encoding, schema.data)
             self._schemas.add(schema.number)
-        file.add_channel(
-            channel.number, channel.schema, channel.topic, channel.encoding, channel.metadata
-        )
-        self._channels[channel.number] = channel
-        return True
+        number = 0 if schema is None else schema.number
+        file.add_channel(channel.number, number, channel.topic, channel.encoding, channel.metadata)
+        self._channels.add(channel.number)
