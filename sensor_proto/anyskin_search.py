@@ -35,6 +35,10 @@ TINY_C = 1e-3
 """Half of all bit patterns are floats below 1; a temperature in steps of 1/45.2 °C never is this
 close to nought, save nought itself."""
 
+AFTER_END = 0.04
+"""Worth of CR LF right before a frame: decides only between claims whose temperatures are equally
+good, of which the least difference is one in twenty."""
+
 Flags = NDArray[np.bool_]
 
 
@@ -100,9 +104,12 @@ class Search:
         if known:
             # What comes before was taken up to the end of a frame.
             after_end |= starts == 0
-        summed = np.where(np.arange(depth) < fits[:, None], shares, 0.0).sum(axis=1)
-        score = fits - 1 + summed / fits + 0.5 * after_end
-        enough = score >= 1.0 if known else shares.min(axis=1) > 0.5
+        likely = np.where(np.arange(depth) < fits[:, None], shares, 0.0).sum(axis=1) / fits
+        score = fits + likely + AFTER_END * after_end
+        if known:
+            enough = (fits > 1) | (likely == 1.0) | (after_end & (likely > 0.5))
+        else:
+            enough = shares.min(axis=1) > 0.5
         # Part of a damaged frame can end like a whole one; its first readings give it away.
         enough &= after_end | (shares[:, 0] == 1.0)
         chosen = np.flatnonzero(enough)

@@ -1,0 +1,96 @@
+"""The fuzzer itself: it accepts nothing wrongly, repeats exactly, and would notice a fault."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sensor_proto import packet
+from tactile_tools import fuzz
+from tactile_tools.fuzz_can import KINDS as CAN_KINDS
+from tactile_tools.fuzz_messages import random_messages
+from tactile_tools.fuzz_serial import KINDS as SERIAL_KINDS
+
+
+@pytest.fixture
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fuzz, "BLOCK", 1500)
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_none_of_some_thousand_spoilt_frames_is_accepted_wrongly() -> None:
+    done: list[int] = []
+    result = fuzz.run_fuzz(12_000, seed=3, progress=done.append)
+    assert result["touched"] == sum(done) >= 12_000
+    assert result["wrong"] == 0
+    assert result["sent"] == result["accepted"] + result["lost"]
+    assert result["accepted"] > result["touched"] / 10  # the line still carries traffic
+    assert result["blocks_beyond_allowed_loss"] == 0
+    for medium, kinds in (("serial", SERIAL_KINDS), ("can", CAN_KINDS)):
+        totals = result["media"][medium]
+        assert set(totals["kinds"]) == set(kinds)
+        assert totals["counters"]["accepted"] == totals["accepted"]
+        assert totals["counters"]["crc"] > 100  # much of it gets as far as the CRC
+
+
+def test_a_seed_says_everything() -> None:
+    first, second, other = (fuzz.run_fuzz(800, seed=s) for s in (1, 1, 2))
+    for result in (first, second, other):
+        del result["seconds"]
+    assert first == second != other
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_a_decoder_without_a_crc_would_be_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(packet, "intact", lambda packets: [True] * len(packets))
+    result = fuzz.run_fuzz(6000, seed=1)
+    assert result["media"]["serial"]["wrong"] > 50
+    assert result["media"]["can"]["wrong"] > 20
+
+
+def test_messages_of_every_type_are_sent() -> None:
+    import numpy as np
+
+    kinds = {type(m) for m in random_messages(np.random.default_rng(0), 60)}
+    assert len(kinds) == 13
+
+
+@pytest.mark.parametrize("arguments", [(0, 1, 1), (10, -1, 1), (10, 1, 0)])
+def test_misuse_is_refused(arguments: tuple[int, int, int]) -> None:
+    frames, seed, jobs = arguments
+    with pytest.raises(ValueError, match="at least"):
+        fuzz.run_fuzz(frames, seed, jobs=jobs)
+
+
+def run(*words: str) -> int:
+    parser = argparse.ArgumentParser()
+    fuzz.add_parser(parser.add_subparsers())
+    options = parser.parse_args(["fuzz", *words])
+    code: Any = options.func(options)
+    return int(code)
+
+
+def test_the_command_writes_its_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "fuzz.json"
+    assert run("--frames", "500", "--seed", "4", "--jobs", "1", "--json", str(out)) == 0
+    assert json.loads(out.read_text())["wrong"] == 0
+    assert "0 accepted wrongly" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [["--frames", "0"], ["--jobs", "x"], ["--seed", "-1"]])
+def test_bad_arguments_exit_with_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as error:
+        run(*words)
+    assert error.value.code == 2
+    assert words[0] in capsys.readouterr().err
+
+
+def test_a_missing_directory_is_named_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("--json", str(tmp_path / "absent" / "fuzz.json")) == 2
+    assert "absent" in capsys.readouterr().err
