@@ -25,8 +25,9 @@ from tactile_bus.instant import Instant, after, seconds_between
 
 Effect = Literal["ignored", "limited", "stopped", "latched", "refused"]
 
-CONFIRMED_WITHIN = 1.0 + 1e-6
-"""A limit read back may differ from the one sent by the rounding of a 32-bit float."""
+CONFIRMED_WITHIN = 1e-3
+"""Part by which a limit read back may differ from the one sent: arms round theirs. A lower one is
+refused too, for the arm would clip what the strategy wants without a word."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,17 +268,17 @@ class SafetyGate:
             faults.extend(self._unconfirmed(arm))
 
     def _unconfirmed(self, arm: ArmState) -> list[Intervention]:
-        """Limits that the arm does not confirm, with both values."""
-        wanted = self._settings.arm_limits
+        """Limits that the arm does not confirm as asked, with both values."""
+        ask = self._settings.arm_limits
         wrong = [
-            f"{name} is {has:g} {unit}, {most:g} wanted"
-            for name, has, most, unit in (
-                ("v_max", arm.v_max, wanted.v_max, "m/s"),
-                ("omega_max", arm.omega_max, wanted.omega_max, "rad/s"),
-                ("f_max", arm.f_max, wanted.f_max, "N"),
-                ("m_max", arm.m_max, wanted.m_max, "N·m"),
+            f"{name} is {has:g} {unit}, {asked:g} asked"
+            for name, has, asked, unit in (
+                ("v_max", arm.v_max, ask.v_max, "m/s"),
+                ("omega_max", arm.omega_max, ask.omega_max, "rad/s"),
+                ("f_max", arm.f_max, ask.f_max, "N"),
+                ("m_max", arm.m_max, ask.m_max, "N·m"),
             )
-            if not 0.0 < has <= most * CONFIRMED_WITHIN
+            if not abs(has - asked) <= CONFIRMED_WITHIN * asked
         ]
         if not wrong:
             return []

@@ -7,6 +7,7 @@ from enum import StrEnum
 
 from reachd.fields import SettingError, check_fields, number
 from reachd.workspace import Region
+from tactile_bus.arm_types import ArmLimits
 
 
 class Check(StrEnum):
@@ -55,16 +56,6 @@ MOVING_MODES = frozenset({"ready", "moving"})
 PAUSED_MODE = "stopped"
 """The driver stopped by itself because commands ceased; fresh zero commands revive it. An
 operator's stop is "estop" or "fault", which latch."""
-
-
-@dataclass(frozen=True, slots=True)
-class ArmLimits:
-    """What the arm is told never to exceed: m/s, rad/s, N, N·m."""
-
-    v_max: float
-    omega_max: float
-    f_max: float
-    m_max: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
