@@ -22,13 +22,14 @@ from tactile_bus.geometry import (
 
 Float = NDArray[np.float64]
 
-NORMAL_UT_PER_N = 115.0
-"""µT/N of a press on the nearest magnetometer (eFlesh recordings, 34 N → 3.9 mT)."""
+SENSITIVITY_UT_PER_N = {"finger": (152.0, 152.0), "anyskin": (115.0, 115.0)}
+"""µT/N of a shear and of a normal force on the nearest magnetometer.
 
-SHEAR_UT_PER_N = NORMAL_UT_PER_N * 3 * 3.8 / 8.0
-"""µT/N of a shear force: the field of a magnet 4 mm away changes 3.8 mT/mm sideways and
-8.0 mT/mm towards the chip, and a rubber pad (incompressible, E = 3 G) gives way three times as
-far in shear."""
+``anyskin``: eFlesh recordings, 34 N → 3.9 mT. ``finger``: a magnet 4 mm above its chip changes the
+field by 3.8 mT/mm sideways (8.0 towards it) and a 16 mm pad gives way by 1 mm in 25 N of shear
+(50 N of pressure). A pad is half as stiff in shear as in pressure and its magnet half as effective,
+so that the two come out alike on both.
+"""
 
 REFERENCE_C = 25.0
 ANYSKIN_PITCH = 0.008
@@ -41,10 +42,8 @@ MAX_ANYSKIN_MAGNETOMETERS = 20
 NOMINAL_MODELS = ("finger", "anyskin")
 
 
-def nominal_newton_per_ut(
-    taxels: int, normal: float = NORMAL_UT_PER_N, shear: float = SHEAR_UT_PER_N
-) -> Float:
-    """(3n, 3n) N/µT without coupling between taxels.
+def nominal_newton_per_ut(taxels: int, shear: float, normal: float) -> Float:
+    """(3n, 3n) N/µT without coupling between taxels, from µT/N of shear and normal force.
 
     Magnets point away from the chips: a press (negative z) brings them nearer and raises B_z,
     a force along +x carries them towards +x and raises B_x.
@@ -87,6 +86,7 @@ def nominal_from_descriptor(descriptor: Descriptor) -> BoardCalibration:
 
 
 def _typical(geometry: SkinGeometry, serial_number: str, what: str) -> BoardCalibration:
+    sensitivity = SENSITIVITY_UT_PER_N.get(geometry.model, SENSITIVITY_UT_PER_N["anyskin"])
     return BoardCalibration(
         serial_number=serial_number,
         model=geometry.model,
@@ -100,7 +100,7 @@ def _typical(geometry: SkinGeometry, serial_number: str, what: str) -> BoardCali
                 rest_ut=np.zeros((array.taxels, 3)),
                 drift_ut_per_k=np.zeros((array.taxels, 3)),
                 reference_c=REFERENCE_C,
-                newton_per_ut=nominal_newton_per_ut(array.taxels),
+                newton_per_ut=nominal_newton_per_ut(array.taxels, *sensitivity),
             )
             for array in geometry.arrays
         ),

@@ -29,7 +29,8 @@ INLIER_SIGMAS = 4.0
 FIRST_REACH = 6.0
 LAST_REACH = 5.0
 """Sigma at which Tukey's weight falls to zero, in the first and the last refinement: wide while
-the proposal still carries the noise of its few taxels, then just beyond the inliers."""
+the start carries noise of its own (a proposal's few taxels, the cycle before), then just beyond
+the inliers."""
 MODEL_ERROR_UT = 1.5
 """µT rms by which chips differ in a uniform field: 3 % sensitivity in 50 µT."""
 MIN_SUPPORT = 0.4
@@ -53,6 +54,8 @@ IMPOSTOR_SUPPORT = 0.75
 MAX_LEVERAGE = 1.0
 """Variance of the plane at its worst taxel over that of one sample, beyond which the free taxels
 are too few or too much to one side to tell its slope; shrinkage sets in."""
+AMPLE_WEIGHT = 0.6
+"""Mean weight of an array's taxels above which no lie of the free ones has that leverage."""
 SLOPE_UT_PER_M = 100.0
 """Spread of ambient gradients, the scale of that shrinkage: steel at arm's length makes 30."""
 
@@ -106,6 +109,7 @@ class Consensus:
         self._stiff[:, 0, 0] = 1e-9
         self._stiff[:, 1, 1] = self._stiff[:, 2, 2] = np.where(few, 1e9, 1e-9) * layout.counts
         self._few = few
+        self._ample = AMPLE_WEIGHT * layout.counts
         self._shrink = 1.0 / (layout.scale * SLOPE_UT_PER_M) ** 2
         self._variance = 1.0
         self.set_noise(np.array([4.4, 4.4, 6.7]))
@@ -136,7 +140,7 @@ class Consensus:
         """
         target = self._target(theta, field_ee, forces)
         weight = healthy.astype(np.float64)
-        theta = self._refine(theta, target, weight, LAST_REACH**2 * self._variance, shrink=True)
+        theta = self._refine(theta, target, weight, FIRST_REACH**2 * self._variance, shrink=True)
         fit = self._judge(theta, target, healthy)
         return fit if fit.whole and fit.support.min() >= FOLLOW_SUPPORT else None
 
@@ -214,7 +218,7 @@ class Consensus:
         normal += self._stiff
         right = (target * inside[:, None, :]) @ self._taxels_first
         inverse = np.linalg.inv(normal)
-        if shrink:
+        if shrink and np.count_nonzero(normal[:, 0, 0] < self._ample):
             leverage = np.einsum("akn,akn->an", inverse @ self._design, self._design).max(axis=1)
             over = leverage - MAX_LEVERAGE
             over[self._few] = 0.0
@@ -245,12 +249,9 @@ class Consensus:
             for s, k, q in zip(support, inliers, sums, strict=True)
         ]
         residual = [math.sqrt(q / (3 * max(k, 1))) for q, k in zip(sums, inliers, strict=True)]
+        if len(valid) > 1 and any(valid) and min(support) < IMPOSTOR_SUPPORT:
+            _expose(middle, inliers, support, valid)
         common = _shared(middle, inliers, valid)
-        if len(valid) > 1 and common is not None and min(support) < IMPOSTOR_SUPPORT:
-            for a, centre in enumerate(middle):
-                if support[a] < IMPOSTOR_SUPPORT and math.dist(centre, common) > IMPOSTOR_UT:
-                    valid[a] = False
-            common = _shared(middle, inliers, valid)
         return Fit(
             theta,
             np.array(support),
@@ -259,6 +260,24 @@ class Consensus:
             np.array(common or _NONE),
             all(valid),
         )
+
+
+def _expose(
+    middle: list[list[float]], inliers: list[float], support: list[float], valid: list[bool]
+) -> None:
+    """Take away the validity of presses that pass for an ambient field on their array."""
+    votes = [
+        sum(
+            k
+            for other, k, ok in zip(middle, inliers, valid, strict=True)
+            if ok and math.dist(centre, other) <= IMPOSTOR_UT
+        )
+        for centre in middle
+    ]
+    agreed = middle[max((a for a, ok in enumerate(valid) if ok), key=votes.__getitem__)]
+    for a, centre in enumerate(middle):
+        if support[a] < IMPOSTOR_SUPPORT and math.dist(centre, agreed) > IMPOSTOR_UT:
+            valid[a] = False
 
 
 def _shared(

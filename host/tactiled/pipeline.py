@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from tactile_bus.calibration_types import BoardCalibration
 from tactile_bus.instant import NS_PER_S, Instant
 from tactiled.blocks import Ambient, Cycle, SampleBlock, TaxelHealth
+from tactiled.candidates import PLANE_TAXELS
 from tactiled.compensate import Compensator, Estimate
 from tactiled.features import FeatureExtractor
 from tactiled.force_model import ForceModel
@@ -44,6 +45,8 @@ class BoardPipeline:
         self._features = FeatureExtractor(geometry, settings)
         self._names = tuple(a.name for a in geometry.arrays)
         self._tip_arrays = [i for i, a in enumerate(geometry.arrays) if a.side.name == "TIP"]
+        # a few taxels feel every contact all together: their fit cannot outlast one, see hold_s
+        self._hold = np.where(layout.counts < PLANE_TAXELS, np.inf, settings.hold_s).tolist()
         self._theta = np.zeros((layout.arrays, 3, 3))
         self._tare: Tare | None = None
         self._tare_initial = False
@@ -215,7 +218,7 @@ class BoardPipeline:
                 name = self._names[a]
                 if estimate.borrowed[a]:
                     reasons.append(f"compensation borrowed: {name}")
-                elif ambient.age[a] <= self.settings.hold_s:
+                elif ambient.age[a] <= self._hold[a]:
                     reasons.append(f"compensation held: {name}")
                 else:
                     reasons.append(f"compensation invalid: {name}")
@@ -226,7 +229,7 @@ class BoardPipeline:
         ambient = estimate.ambient
         return self._rest_known and all(
             present[a]
-            and (ambient.valid[a] or estimate.borrowed[a] or ambient.age[a] <= self.settings.hold_s)
+            and (ambient.valid[a] or estimate.borrowed[a] or ambient.age[a] <= self._hold[a])
             for a in self._tip_arrays
         )
 

@@ -27,7 +27,10 @@ class PipelineSettings:
     ``tare_limit_n``: N on one taxel beyond which a tare is refused as a contact.
     ``auto_tare``: tare at the start; None: when the calibration is nominal, its rest unknown.
     ``rest_tracking_s``: s, time constant at which untouched taxels' rest follows; None: never.
-    ``hold_s``: s that features stay valid on a held field after the fit lost its support.
+    ``hold_s``: s that features stay valid, degraded, on a held field after an array's fit lost its
+    support; the default keeps its error below 0.25 N, half the paper's least threshold, at
+    0.35 rad/s in 50 µT. Without limit on arrays of fewer than nine taxels, where every contact
+    takes the support away. The ambient field itself is marked invalid at once in any case.
     ``masked_limit``: fraction of an array's taxels beyond which features are invalid.
     ``seed``: of RANSAC's random draws.
     """

@@ -78,7 +78,7 @@ class Tare:
         if whole:
             if not self.cycles:
                 self._pivot = field.copy()
-            half = int(elapsed >= self._seconds / 2)
+            half = int(elapsed >= self._seconds / 2 and self._counts[0] >= MIN_CYCLES // 2)
             away = field - self._pivot
             self._sums[half] += away
             self._squares += away * away
