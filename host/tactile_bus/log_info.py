@@ -8,7 +8,8 @@ from typing import Any
 
 from tactile_bus.gaps import DROPPED, GAP
 from tactile_bus.instant import NS_PER_S
-from tactile_bus.log_reader import LogReader, Progress
+from tactile_bus.log_bytes import Progress
+from tactile_bus.log_reader import LogReader
 from tactile_bus.log_records import AttachmentRecord, Damage, Message, MetadataRecord
 
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"

@@ -6,6 +6,7 @@ import importlib
 import struct
 import zlib
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import zstandard
 
@@ -82,8 +83,7 @@ class Damage:
     last_ns: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
+class Message(NamedTuple):
     """One message of a log; stamps in wall-clock ns."""
 
     channel: int

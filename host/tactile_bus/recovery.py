@@ -8,7 +8,8 @@ from pathlib import Path
 
 import zstandard
 
-from tactile_bus.log_reader import LogReader, Progress
+from tactile_bus.log_bytes import Progress
+from tactile_bus.log_reader import LogReader
 from tactile_bus.log_records import (
     AttachmentRecord,
     Block,

@@ -18,8 +18,8 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from rich.table import Table
 
 from tactile_bus.instant import NS_PER_S
+from tactile_bus.log_bytes import Progress as Report
 from tactile_bus.log_info import LogInfo, info
-from tactile_bus.log_reader import Progress as Report
 from tactile_bus.log_records import Damage, LogError
 from tactile_bus.recovery import RecoveryError, RecoveryReport, recover
 
