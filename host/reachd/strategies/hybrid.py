@@ -14,7 +14,7 @@ from reachd.seam import ZERO, Touch, Twist
 from reachd.strategies.base import Moment, ReachingStrategy
 from reachd.strategies.isolated import Excavate
 from tactile_bus.geometry import Side
-from tactile_bus.instant import Instant, seconds_between
+from tactile_bus.instant import NS_PER_S, Instant, seconds_between
 
 
 def usable(touch: Touch) -> bool:
@@ -42,8 +42,8 @@ class HybridEvent(ReachingStrategy):
         super()._reset(now)
         self._previous = now
         self._mode = ""  # nothing felt yet
-        self._light_for: float | None = None  # s of light tip contact, None when there is none
-        self._dark_for = 0.0  # s since it was last felt
+        self._light_ns: int | None = None  # of light tip contact, None when there is none
+        self._dark_ns = 0  # since it was last felt
         self._reference: float | None = None  # distance (m) from which progress counts
         self._reference_at = now
 
@@ -52,7 +52,7 @@ class HybridEvent(ReachingStrategy):
         p = self._parameters
         if self._reference is None:
             self._reference = at.aim.distance
-        since_last = seconds_between(self._previous, at.now)
+        since_last = at.now - self._previous
         self._previous = at.now
         if usable(at.touch):
             self._feel(at.touch, since_last)
@@ -71,7 +71,7 @@ class HybridEvent(ReachingStrategy):
         return ZERO
 
     def _excavation_ended(self, at: Moment) -> None:
-        self._light_for = None
+        self._light_ns = None
         self._reference_at = at.now
         self._previous = at.now
         if self._parameters.progress_reference == "excavation_end":
@@ -81,17 +81,17 @@ class HybridEvent(ReachingStrategy):
         """The force that F_bur and F_excv are compared with."""
         return touch.peak_force if self._parameters.force_measure == "peak" else touch.total_force
 
-    def _feel(self, touch: Touch, elapsed: float) -> None:
+    def _feel(self, touch: Touch, elapsed_ns: int) -> None:
         """Count how long the tip has been in light contact, short gaps overlooked."""
         p = self._parameters
         if p.push_force_min <= touch.tip_force <= p.push_force_max:
-            self._light_for = 0.0 if self._light_for is None else self._light_for + elapsed
-            self._dark_for = 0.0
-        elif self._light_for is not None:
-            self._light_for += elapsed
-            self._dark_for += elapsed
-            if self._dark_for >= p.push_dropout:
-                self._light_for = None
+            self._light_ns = 0 if self._light_ns is None else self._light_ns + elapsed_ns
+            self._dark_ns = 0
+        elif self._light_ns is not None:
+            self._light_ns += elapsed_ns
+            self._dark_ns += elapsed_ns
+            if self._dark_ns >= p.push_dropout * NS_PER_S:
+                self._light_ns = None
 
     def _trigger(self, at: Moment) -> str:
         """Which of the paper's two cases holds: (2) "stall", (1) "push", or neither, ""."""
@@ -100,7 +100,7 @@ class HybridEvent(ReachingStrategy):
         gained = (self._reference or 0.0) - at.aim.distance
         if gained <= p.v_max * late and self._force(at.touch) >= p.excavate_force:
             return "stall"
-        if self._light_for is not None and self._light_for >= p.push_time:
+        if self._light_ns is not None and self._light_ns >= p.push_time * NS_PER_S:
             return "push"
         return ""
 
