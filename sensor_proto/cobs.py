@@ -6,6 +6,7 @@ Frames are without their ending zero here; `framing` adds and removes it.
 from __future__ import annotations
 
 _CODES = tuple(bytes([n]) for n in range(256))
+_RUN = b"\1" * 8  # as many zeros, stuffed: shorter runs cost more to look for than to step through
 _FULL = 254  # data bytes of the longest block; its code 255 stands for no zero after them
 
 
@@ -41,10 +42,21 @@ def decode(frame: bytes) -> bytes | None:
     at = 0
     if size <= _FULL + 1:
         # A full block cannot be followed by another here, so that no code needs removing.
-        while at < size:
+        run = frame.find(_RUN)
+        stop = size if run < 0 else run
+        while at < stop:
             code = out[at]
             out[at] = 0
             at += code
+        if at < size:
+            # Clear status bits make a long run of zeros: where a code is 1, so are those after it.
+            ones = size - at - len(frame[at:].lstrip(b"\1"))
+            out[at : at + ones] = bytes(ones)
+            at += ones
+            while at < size:
+                code = out[at]
+                out[at] = 0
+                at += code
         return bytes(out[1:]) if at == size and size else None
     surplus: list[int] = []
     while at < size:

@@ -173,7 +173,9 @@ def test_frames_lost_are_at_most_frames_touched_and_one(seed: int, n: int) -> No
     touched = (stop - 1) // size - start // size + 1
     got, lost = count_lost(wire[:start] + patch + wire[stop:], 30, n, [83, 7, 300])
     assert lost <= touched + 1
-    assert got == sorted(got)
+    # A cut of whole frames' length joins two readings to one that nothing can tell from a good one.
+    real = [i for i in got if i in range(30)]
+    assert real == sorted(set(real))
 
 
 @pytest.mark.parametrize("n", [2, 5, 20])

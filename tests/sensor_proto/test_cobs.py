@@ -45,7 +45,13 @@ def test_a_full_block_may_be_followed_by_an_empty_one(data: bytes) -> None:
 
 
 mixed = st.lists(
-    st.one_of(st.binary(max_size=20), st.just(bytes(9)), st.just(RUN), st.just(RUN[:253])),
+    st.one_of(
+        st.binary(max_size=20),
+        st.just(bytes(9)),
+        st.just(b"\1" * 12),
+        st.just(RUN),
+        st.just(RUN[:253]),
+    ),
     max_size=5,
 ).map(b"".join)
 
