@@ -29,9 +29,9 @@ from tactile_bus.instant import Instant
 if TYPE_CHECKING:
     import can
 
-BACKLOG = 16_384
-"""Bytes kept for a reader that is late: as many as a board's USB buffers hold, and at most a third
-of a second of samples."""
+BACKLOG = 4_096
+"""Bytes kept here for a reader that is late, besides those in the terminal: what a board's USB
+buffers hold. More would only reach a host that comes back as stale samples."""
 
 PTY_ROOM = 4_095
 """Bytes Linux' line discipline holds for a reader. More would pile up in the kernel where nobody
@@ -69,6 +69,7 @@ class PtyPort:
         self._master = self._slave = -1
         self._backlog: deque[bytes] = deque()
         self._backlog_bytes = 0
+        self._begun = False  # the oldest has gone in part
         self._counts: Counter[str] = Counter()
 
     @property
@@ -122,6 +123,7 @@ class PtyPort:
             self._claim = None
         self._backlog.clear()
         self._backlog_bytes = 0
+        self._begun = False
 
     def receive(self) -> bytes:
         """Bytes from the host, at most `READ_LIMIT`; empty when there are none."""
@@ -139,8 +141,10 @@ class PtyPort:
             self._backlog.append(data)
             self._backlog_bytes += len(data)
         self.flush()
-        while self._backlog_bytes > BACKLOG:
-            oldest = self._backlog.popleft()
+        # A message that has begun goes on, or the reader would take its head and the next for one.
+        while self._backlog_bytes > BACKLOG and len(self._backlog) > 1 + self._begun:
+            oldest = self._backlog[self._begun]
+            del self._backlog[self._begun]
             self._backlog_bytes -= len(oldest)
             self._counts["unread_messages"] += 1
             self._counts["unread_bytes"] += len(oldest)
@@ -158,8 +162,10 @@ class PtyPort:
                 written = 0
             self._backlog_bytes -= written
             if written < len(oldest):
+                self._begun = self._begun or written > 0
                 self._backlog.appendleft(oldest[written:])
                 return
+            self._begun = False
 
 
 class SlcanPort:

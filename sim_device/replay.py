@@ -25,6 +25,9 @@ BAIT = b"\r\n"
 """Sent before the start; once it has gone, somebody reads. A real board's first bytes are the end
 of a frame as well, for a port is opened in the midst of one."""
 
+BURST = 12
+"""Frames sent at once at high speed: of the longest, they just fit into a terminal."""
+
 MAX_ROWS = 10_000_000
 """A day at 100 Hz. A longer file is surely none of ours, and would not fit in memory."""
 
@@ -179,22 +182,21 @@ class ReplayBoard:
         """Send the first row at ``now`` and the others at their distances from it."""
         self._start = now
 
-    def next_due(self) -> Instant | None:
-        """When `tick` next has something to send; None: not before `start`, or never again."""
-        if self._start is None or self.finished:
-            return None
-        return self._due(self._row)
+    def postpone(self, seconds: float) -> None:
+        """Move all rows not yet sent by ``seconds``."""
+        if self._start is not None:
+            self._start = after(self._start, seconds)
 
     def receive(self, data: bytes, now: Instant) -> None:
         """Ignored: such boards take no commands."""
 
     def tick(self, now: Instant) -> bytes:
-        """Frames due by ``now``."""
+        """Frames due by ``now``, at most `BURST`; the others come with the next call."""
         if self._start is None:
             bait, self._baited = (b"" if self._baited else BAIT), True
             return bait
-        out = []
-        while not self.finished and self._due(self._row) <= now:
+        out: list[bytes] = []
+        while len(out) < BURST and not self.finished and self._due(self._row) <= now:
             if self._row >= len(self):
                 self._start, self._row = self._due(self._row), 0
             out.append(self._frame(self._row))

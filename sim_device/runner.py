@@ -18,11 +18,19 @@ TICK = 0.001
 STATUS_PERIOD = 0.5
 """s between two calls of the status function."""
 
-LONGEST_WAIT = 0.5
-"""s that a board waits for a full port at most; then it goes on, and its queue drops the oldest."""
+LONGEST_WAIT = 0.05
+"""s that a board waits for a full port at most; then it goes on, and the port drops the oldest, so
+that a host that comes back gets nothing older."""
+
+STALL = 0.1
+"""s of a full port after which a replay is late for good: its later rows move by as much."""
 
 DRAIN_TIME = 2.0
 """s that the last frames of a replay wait for their reader."""
+
+SETTLE_TIME = 0.25
+"""s for written bytes to show as unread: the kernel hands them over later, on a busy machine much
+later. Without this, a replay would begin before anybody reads, and end before all is read."""
 
 Payload = TypeVar("Payload", bytes, tuple[CanFrame, ...])
 
@@ -184,12 +192,16 @@ class CanStation:
 
 
 class ReplayStation:
-    """A recording on a pseudo-terminal; it begins when somebody reads, so that nothing is lost."""
+    """A recording on a pseudo-terminal. Nothing of it is lost: it begins when somebody reads, and
+    waits while nobody does."""
 
     def __init__(self, port: PtyPort, board: ReplayBoard) -> None:
         self.port = port
         self.board = board
         self._ended: Instant | None = None
+        self._full: Instant | None = None
+        self._baited: Instant | None = None
+        self._bait_seen = False
         self._now = Instant(0)
 
     @property
@@ -207,7 +219,8 @@ class ReplayStation:
         """Whether the last frame was read, or nobody read it for `DRAIN_TIME`."""
         if self._ended is None:
             return False
-        return self.port.unread == 0 or seconds_between(self._ended, self._now) > DRAIN_TIME
+        waited = seconds_between(self._ended, self._now)
+        return waited > (DRAIN_TIME if self.port.unread else SETTLE_TIME)
 
     def fileno(self) -> int:
         """Of the port."""
@@ -225,12 +238,28 @@ class ReplayStation:
         """Send the frames that are due; begin once the bait has been read."""
         self._now = now
         self.port.receive()  # whatever a host asks: such boards do not listen
+        self.port.flush()
+        if not self.port.ready:
+            self._full = self._full or now
+            return
+        if self._full is not None:
+            stalled = seconds_between(self._full, now)
+            self._full = None
+            if stalled > STALL:
+                self.board.postpone(stalled)
         out = self.board.tick(now)
         self.port.send(out)
-        if not self.board.started and not out and self.port.unread == 0:
+        if not self.board.started and self._bait_is_taken(now):
             self.board.start(now)
         if self.board.finished and self._ended is None:
             self._ended = now
+
+    def _bait_is_taken(self, now: Instant) -> bool:
+        self._baited = self._baited or now
+        if self.port.unread:
+            self._bait_seen = True
+            return False
+        return self._bait_seen or seconds_between(self._baited, now) > SETTLE_TIME
 
 
 class Runner:

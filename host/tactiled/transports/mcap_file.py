@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import logging
 import math
-import struct
 import threading
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
-
-import zstandard
-from mcap.exceptions import EndOfFile, McapError
-from mcap.records import Channel, Message, Schema
-from mcap.stream_reader import StreamReader
 
 from sensor_proto.can_errors import BusState
 from sensor_proto.canseg import CanFrame
 from tactile_bus.instant import Instant, after, monotonic_now, seconds_between
+from tactile_bus.log_reader import LogReader
+from tactile_bus.log_records import Block, ChannelRecord, LogError
 from tactile_bus.messages import DecodeError, codec
 from tactile_bus.topics import RAW
 from tactiled.blocks import Chunk
@@ -27,6 +22,7 @@ from tactiled.transports.base import (
     Medium,
     PortClosed,
     PortDenied,
+    PortGone,
     PortMissing,
     PortUnsuitable,
 )
@@ -34,20 +30,14 @@ from tactiled.transports.raw_chunk import from_raw
 
 log = logging.getLogger(__name__)
 
-RECORD_LIMIT = 64 << 20
-"""Bytes of the largest record believed: chunks are flushed every half second, far below this."""
-
-BROKEN = (McapError, ValueError, struct.error, zlib.error, zstandard.ZstdError, EOFError)
-"""What the reader raises where a file was cut off or damaged."""
-
 
 class McapTransport:
     """Raw chunks of one board of a log (`RawChunk` on ``tactile/<board>/raw``), in file order.
 
-    ``board`` None: the log's only board. ``speed``: times real time, `math.inf` for as fast as it
-    is read. Chunks keep the spacing of their stamps, divided by a finite ``speed``, from the
-    moment of opening; at `math.inf` the spacing is the recorded one. Files cut off by a kill are
-    replayed up to the break. `read` raises `EndOfLog` behind the last chunk.
+    ``board`` None: the first board in the log. ``speed``: times real time, `math.inf` for as fast
+    as it is read. Chunks keep the spacing of their stamps, divided by a finite ``speed``, from the
+    moment of opening; at `math.inf` the spacing is the recorded one. Of files that were cut off or
+    damaged, all that can be read is replayed. Behind the last chunk `read` raises `EndOfLog`.
     """
 
     def __init__(self, path: str | Path, board: str | None = None, speed: float = 1.0) -> None:
@@ -61,6 +51,7 @@ class McapTransport:
         self._closed.set()
         self._reading = threading.Lock()
         self._chunks: Iterator[Chunk] = iter(())
+        self._channels: dict[int, bool] = {}
         self._next: Chunk | None = None
         self._first = self._start = Instant(0)
         self._medium = Medium.SERIAL
@@ -100,9 +91,12 @@ class McapTransport:
             raise PortDenied(f"no permission to read {self._path}", "see its mode") from error
         except OSError as error:
             raise PortUnsuitable(f"cannot read {self._path}: {error}", "give a log") from error
-        self._closed.clear()
+        self._channels.clear()
         self._chunks = self._read_chunks()
-        self._next = next(self._chunks, None)
+        try:
+            self._next = next(self._chunks, None)
+        except LogError as error:
+            raise PortUnsuitable(str(error), "give a log that tactiled wrote") from error
         if self._next is None:
             of = "" if self._board is None else f" of board {self._board!r}"
             raise PortUnsuitable(
@@ -110,6 +104,7 @@ class McapTransport:
                 "give a log that was written with raw chunks (see `tactile log info`)",
             )
         self._medium = Medium.SERIAL if isinstance(self._next.payload, bytes) else Medium.CAN
+        self._closed.clear()
         self._first = self._next.received
         self._start = monotonic_now()
 
@@ -132,7 +127,10 @@ class McapTransport:
                 raise PortClosed(f"{self._path} was closed")
             if wait > timeout:
                 return None
-            self._next = next(self._chunks, None)
+            try:
+                self._next = next(self._chunks, None)
+            except LogError as error:
+                raise PortGone(str(error), "see whether the disk is sound") from error
             return Chunk(stamp, chunk.payload)
 
     def write(self, data: bytes | tuple[CanFrame, ...]) -> None:
@@ -146,36 +144,37 @@ class McapTransport:
             self._chunks, self._next = iter(()), None
 
     def _read_chunks(self) -> Iterator[Chunk]:
-        with self._path.open("rb") as file:
-            wanted: set[int] = set()
-            schemas: dict[int, str] = {}
-            reader = StreamReader(file, validate_crcs=True, record_size_limit=RECORD_LIMIT)
-            records = reader.records
-            while True:
-                try:
-                    record = next(records)
-                except StopIteration:
-                    return
-                except EndOfFile:
-                    log.warning("%s is cut off; replayed to the break", self._path)
-                    return
-                except BROKEN as error:
-                    self._losses.add("broken_record")
-                    log.warning("%s is damaged (%s); replayed to there", self._path, error)
-                    return
-                if isinstance(record, Schema):
-                    schemas[record.id] = record.name
-                elif isinstance(record, Channel):
-                    if schemas.get(record.schema_id) == RAW.msgtype and self._wants(record.topic):
-                        wanted.add(record.id)
-                elif isinstance(record, Message) and record.channel_id in wanted:
+        with LogReader(self._path) as reader:
+            for event in reader.events():
+                if not isinstance(event, Block):
+                    continue
+                for message in reader.messages(event):
+                    if not self._wants(message.channel, reader):
+                        continue
                     try:
-                        yield from_raw(codec().decode(RAW, record.data))
+                        yield from_raw(codec().decode(RAW, message.data))
                     except DecodeError:
                         self._losses.add("broken_message")
+            if reader.damage_count:
+                self._losses.add("damaged_places", reader.damage_count)
+            if reader.damage_count or not reader.closed:
+                log.warning("%s was cut off or damaged; replayed what could be read", self._path)
 
-    def _wants(self, topic: str) -> bool:
-        if self._board is not None:
-            return topic.endswith(RAW.key(self._board))
-        self._board = topic.removesuffix("/raw").rpartition("/")[2]
-        return True
+    def _wants(self, number: int, reader: LogReader) -> bool:
+        wanted = self._channels.get(number)
+        if wanted is None:
+            channel = reader.channels.get(number)
+            wanted = channel is not None and self._is_raw(channel, reader)
+            self._channels[number] = wanted
+        return wanted
+
+    def _is_raw(self, channel: ChannelRecord, reader: LogReader) -> bool:
+        schema = reader.schemas.get(channel.schema)
+        if schema is None or schema.name != RAW.msgtype:
+            return False
+        board = channel.topic.removesuffix("/raw").rpartition("/")[2]
+        if self._board is None:
+            self._board = board
+        elif board != self._board:
+            log.info("%s also holds raw chunks of board %r", self._path, board)
+        return board == self._board

@@ -1,0 +1,123 @@
+"""The simulator's pseudo-terminals: they never wait, and leave nothing behind."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sim_device.ports import BACKLOG, PTY_ROOM, LinkRefused, PtyPort
+from tactiled.transports.serial_port import SerialTransport
+
+KERNEL_BUFFER = 65_536
+"""Bytes that a Linux terminal takes before its line discipline shows them, on a busy machine."""
+
+
+def test_a_port_that_nobody_reads_drops_the_oldest_whole_messages_and_counts_them(
+    pty: PtyPort, read_bytes: Any
+) -> None:
+    messages = [bytes([100 + k % 100]) * 99 + b"\n" for k in range(1000)]
+    host = SerialTransport(str(pty.link))
+    host.open()
+    for message in messages:
+        pty.send(message)
+    lost = pty.losses["unread_messages"]
+    assert lost > 0
+    assert pty.losses["unread_bytes"] == 100 * lost
+    assert not pty.ready
+    got = b""
+    while chunk := read_bytes(host, 1, 0.3):
+        got += chunk
+        pty.flush()
+    lines = got.splitlines(keepends=True)
+    assert [line for line in lines if line in set(messages)] == lines  # none is broken
+    assert len(lines) == 1000 - lost
+    assert lines[0] == messages[0]  # it had already left
+    assert lines[-1] == messages[-1]
+    assert len(got) <= BACKLOG + PTY_ROOM + KERNEL_BUFFER
+    host.close()
+
+
+def test_a_host_that_comes_late_gets_nothing_that_waited_in_the_terminal(
+    pty: PtyPort, read_bytes: Any
+) -> None:
+    pty.send(b"stale")
+    host = SerialTransport(str(pty.link))
+    host.open()
+    pty.send(b"fresh")
+    assert read_bytes(host, 5) == b"fresh"
+    host.close()
+
+
+def test_hosts_may_come_and_go(pty: PtyPort, read_bytes: Any) -> None:
+    for word in (b"one", b"two"):
+        host = SerialTransport(str(pty.link))
+        host.open()
+        pty.send(word)
+        assert read_bytes(host, 3) == word
+        host.close()
+
+
+def test_a_closed_port_takes_its_link_along(tmp_path: Path) -> None:
+    port = PtyPort(tmp_path / "board0")
+    port.open()
+    assert os.path.realpath(port.link).startswith("/dev/")
+    port.close()
+    port.close()
+    assert not os.path.lexists(port.link)
+    port.send(b"abc")
+    assert port.losses == {"unplugged_bytes": 3}
+    assert port.receive() == b""
+
+
+def test_a_link_of_a_killed_run_is_replaced(tmp_path: Path) -> None:
+    link = tmp_path / "board0"
+    code = (
+        "import os, signal, sys\n"
+        "from sim_device.ports import PtyPort\n"
+        "PtyPort(sys.argv[1]).open()\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    subprocess.run([sys.executable, "-c", code, str(link)], check=False)
+    assert link.is_symlink()
+    port = PtyPort(link)
+    port.open()
+    assert link.exists()
+    port.close()
+
+
+def test_a_link_that_is_served_is_left_alone(pty: PtyPort) -> None:
+    before = os.readlink(pty.link)
+    with pytest.raises(LinkRefused, match="another simdevice") as caught:
+        PtyPort(pty.link).open()
+    assert not caught.value.foreign
+    assert os.readlink(pty.link) == before
+
+
+def test_files_that_are_not_ours_are_left_alone(tmp_path: Path) -> None:
+    file = tmp_path / "precious"
+    file.write_text("data")
+    other = tmp_path / "link"
+    other.symlink_to(file)
+    for path in (file, other):
+        with pytest.raises(LinkRefused, match="not") as caught:
+            PtyPort(path).open()
+        assert caught.value.foreign
+    assert file.read_text() == "data"
+    assert os.readlink(other) == str(file)
+
+
+def test_a_link_that_was_replaced_meanwhile_is_not_removed(pty: PtyPort) -> None:
+    pty.link.unlink()
+    pty.link.write_text("somebody else's")
+    pty.close()
+    assert pty.link.read_text() == "somebody else's"
+
+
+def test_a_folder_that_is_not_there_is_an_error_of_the_system(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        PtyPort(tmp_path / "nowhere" / "board0").open()
