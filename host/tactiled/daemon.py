@@ -136,7 +136,7 @@ class Daemon:
         reader.open(settings.wait and not replay)
         name = wanted.name
         if isinstance(transport, McapTransport):
-            name = transport.board or "board0"
+            name = reader.name = transport.board or "board0"
 
         def admit(node: int, identity: Identity) -> Refusal | None:
             return port.admit(node, identity)

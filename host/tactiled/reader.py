@@ -56,7 +56,7 @@ class PortReader:
         self.reopened = 0
         self._inbox = inbox
         self._outlet = outlet
-        self._name = name
+        self.name = name
         self._failed = failed
         self._paced = paced
         self._stopping = threading.Event()
@@ -104,7 +104,7 @@ class PortReader:
                     while self._paced and inbox.full and not self._stopping.wait(PACE):
                         pass
                     inbox.put(chunk)
-                    outlet.raw(self._name, transport.name, chunk)
+                    outlet.raw(self.name, transport.name, chunk)
         except EndOfLog:
             raise
         except PortClosed:

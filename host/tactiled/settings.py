@@ -206,18 +206,21 @@ def _ports(
         raise SettingsError(
             f"{len(names)} names for {len(given)} ports; give --name for every one, or for none"
         )
-    kinds = _each("--board", options.board or ["auto"], len(given))
-    bauds = _each("--baud", options.baud or [DEFAULT_BAUD], len(given))
+    serial = sum(medium == "serial" for medium, _ in given)
+    if not serial and set(options.board or ()) - {"auto", "tactile"}:
+        raise SettingsError(
+            f"--board {options.board[0]}: such boards are serial; give their --port"
+        )
+    kinds = iter(_each("--board", options.board or ["auto"], serial))
+    bauds = iter(_each("--baud", options.baud or [DEFAULT_BAUD], serial))
     out = []
     for i, (medium, spec) in enumerate(given):
         name = names[i] if names else f"board{i}"
         if medium == "can":
             _check_can(spec)
-            if options.board and kinds[i] not in ("auto", "tactile"):
-                raise SettingsError(f"{spec}: {kinds[i]} boards have no CAN; they are serial")
             out.append(PortSettings(name, spec, "can"))
         else:
-            out.append(PortSettings(name, spec, "serial", kinds[i], bauds[i]))
+            out.append(PortSettings(name, spec, "serial", next(kinds), next(bauds)))
     return tuple(out)
 
 
@@ -256,8 +259,8 @@ def _each(flag: str, values: list[T], ports: int) -> list[T]:
         return values * ports
     if len(values) != ports:
         raise SettingsError(
-            f"{flag} is given {len(values)} times for {ports} ports; give it once for all, or for "
-            "each in their order"
+            f"{flag} is given {len(values)} times for {ports} serial ports; give it once for all, "
+            "or for each in their order"
         )
     return values
 

@@ -1,0 +1,33 @@
+"""Between reader and pipeline: bounded, oldest first out, news of the port never lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from tactile_bus.instant import Instant
+from tactiled.blocks import Chunk
+from tactiled.inbox import Inbox, PortLost, PortOpened, Wake
+
+
+def test_the_oldest_chunks_go_and_are_counted(instant: Callable[[float], Instant]) -> None:
+    inbox = Inbox(Wake(), limit=10)
+    chunks = [Chunk(instant(k), bytes([k])) for k in range(25)]
+    inbox.put(PortOpened())
+    for chunk in chunks:
+        inbox.put(chunk)
+    inbox.put(PortLost("gone"))
+    assert inbox.full
+    assert inbox.dropped == 15
+    taken = []
+    while (item := inbox.take()) is not None:
+        taken.append(item)
+    assert taken == [PortOpened(), *chunks[15:], PortLost("gone")]
+
+
+def test_the_pipeline_is_roused_by_what_comes(instant: Callable[[float], Instant]) -> None:
+    wake = Wake()
+    inbox = Inbox(wake)
+    inbox.put(Chunk(instant(0), b"x"))
+    wake.wait(60.0)  # returns at once: it was rung before
+    assert inbox.take() is not None
+    assert inbox.take() is None

@@ -1,0 +1,96 @@
+"""Which calibration belongs to a board, and when a board is refused rather than misjudged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from sensor_proto.packets import Descriptor
+from tactile_bus.calibration import nominal, nominal_from_descriptor, save
+from tactiled.events import Identity, Refusal
+from tactiled.shelf import Choice, Shelf
+
+
+def pad(descriptor: Descriptor, serial: str = "00000000000000aa") -> Identity:
+    told = replace(descriptor, unique_id=bytes.fromhex(serial))
+    shapes = tuple((a.rows, a.columns) for a in told.arrays)
+    return Identity(serial, "pad", "1", shapes, 493.0, told)
+
+
+def skin(serial: str = "", magnetometers: int = 5) -> Identity:
+    return Identity(serial, "anyskin", "", ((1, magnetometers),), None)
+
+
+def file_of(folder: Path, descriptor: Descriptor, serial: str) -> Path:
+    calibration = nominal_from_descriptor(replace(descriptor, unique_id=bytes.fromhex(serial)))
+    path = folder / f"{serial}.cal.toml"
+    save(replace(calibration, nominal=False), path)
+    return path
+
+
+def test_files_are_matched_by_serial_number(tmp_path: Path, descriptor: Descriptor) -> None:
+    paths = [file_of(tmp_path, descriptor, s) for s in ("00000000000000bb", "00000000000000aa")]
+    chosen = Shelf(paths, strict=True).choose(pad(descriptor))
+    assert isinstance(chosen, Choice)
+    assert chosen.path == paths[1]
+    assert chosen.warning == ""
+
+
+def test_a_calibration_of_another_board_is_refused_with_both_names(
+    tmp_path: Path, descriptor: Descriptor
+) -> None:
+    path = file_of(tmp_path, descriptor, "00000000000000bb")
+    refusal = Shelf([path], strict=True).choose(pad(descriptor))
+    assert isinstance(refusal, Refusal)
+    assert "00000000000000bb" in refusal.problem
+    assert "00000000000000aa" in refusal.problem
+    assert refusal.remedy
+
+
+def test_fewer_files_than_boards_leave_the_others_on_nominal_figures(
+    tmp_path: Path, descriptor: Descriptor
+) -> None:
+    path = file_of(tmp_path, descriptor, "00000000000000bb")
+    chosen = Shelf([path], strict=False).choose(pad(descriptor))
+    assert isinstance(chosen, Choice)
+    assert chosen.calibration.nominal
+    assert "nominal" in chosen.warning
+
+
+def test_arrays_that_differ_are_refused(tmp_path: Path, descriptor: Descriptor) -> None:
+    path = file_of(tmp_path, descriptor, "00000000000000aa")
+    grown = replace(pad(descriptor), shapes=((4, 4), (1, 3)))
+    refusal = Shelf([path], strict=True).choose(grown)
+    assert isinstance(refusal, Refusal)
+    assert "4 × 4" in refusal.problem
+
+
+@pytest.mark.parametrize("magnetometers", [1, 5, 7, 20])
+def test_boards_without_a_serial_number_run_on_nominal_figures(magnetometers: int) -> None:
+    chosen = Shelf([], strict=True).choose(skin(magnetometers=magnetometers))
+    assert isinstance(chosen, Choice)
+    assert chosen.calibration.geometry.taxels == magnetometers
+
+
+def test_a_board_without_a_serial_number_takes_the_one_file_that_fits_it(tmp_path: Path) -> None:
+    path = tmp_path / "skin.cal.toml"
+    save(replace(nominal("anyskin", "USB1"), nominal=False), path)
+    chosen = Shelf([path], strict=True).choose(skin())
+    assert isinstance(chosen, Choice)
+    assert chosen.path == path
+    assert "cannot confirm" in chosen.warning
+    assert isinstance(Shelf([path], strict=True).choose(skin("USB2")), Refusal)
+
+
+def test_reloading_reads_what_the_file_says_now(tmp_path: Path, descriptor: Descriptor) -> None:
+    path = file_of(tmp_path, descriptor, "00000000000000aa")
+    shelf = Shelf([path], strict=True)
+    first = shelf.choose(pad(descriptor))
+    assert isinstance(first, Choice)
+    save(replace(first.calibration, provenance="again"), path)
+    shelf.reload()
+    second = shelf.choose(pad(descriptor))
+    assert isinstance(second, Choice)
+    assert second.calibration.hash != first.calibration.hash
