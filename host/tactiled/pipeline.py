@@ -17,7 +17,8 @@ from tactiled.health import HealthMonitor
 from tactiled.layout import Layout
 from tactiled.methods import make_compensator
 from tactiled.pipeline_settings import PipelineSettings
-from tactiled.tare import Tare, TareReport
+from tactiled.rest import RestField
+from tactiled.tare import TareReport
 
 __all__ = ["BoardPipeline", "CycleCounters", "PipelineSettings", "TareReport"]
 
@@ -48,17 +49,9 @@ class BoardPipeline:
         # a few taxels feel every contact all together: their fit cannot outlast one, see hold_s
         self._hold = np.where(layout.counts < PLANE_TAXELS, np.inf, settings.hold_s).tolist()
         self._theta = np.zeros((layout.arrays, 3, 3))
-        self._tare: Tare | None = None
-        self._tare_initial = False
-        self._tare_peak = 0.0
-        self._unrested: Bool | None = None  # taxels whose rest field is not known
-        self._tare_report: TareReport | None = None
         self._feature_due: Instant | None = None
         self._health: NDArray[np.uint8] = np.full(layout.taxels, TaxelHealth.MISSING, np.uint8)
-        self._noise = np.array(settings.noise_ut)
-        self._track = None if settings.rest_tracking_s is None else settings.rest_tracking_s
         self._last_captured: Instant | None = None
-        self._apply_noise(self._noise)
         nothing = Ambient(
             method=settings.method,
             plane=np.zeros((layout.arrays, 3, 3)),
@@ -69,9 +62,11 @@ class BoardPipeline:
         )
         self._unknown = Estimate(nothing.plane, nothing, np.zeros(layout.arrays, dtype=bool))
         automatic = settings.auto_tare
-        self._rest_known = not (calibration.nominal if automatic is None else automatic)
-        if not self._rest_known:
-            self._begin_tare(initial=True)
+        known = not (calibration.nominal if automatic is None else automatic)
+        self._rest = RestField(layout, self._model, settings, known)
+        self._apply_noise(np.array(settings.noise_ut))
+        if not known:
+            self._rest.begin(self._noise)
 
     @property
     def counters(self) -> CycleCounters:
@@ -86,12 +81,12 @@ class BoardPipeline:
     @property
     def taring(self) -> bool:
         """Whether a tare is under way."""
-        return self._tare is not None
+        return self._rest.taring
 
     @property
     def tare_report(self) -> TareReport | None:
         """What the last tare that ended did; None before the first."""
-        return self._tare_report
+        return self._rest.report
 
     def tare(self) -> None:
         """Begin a tare: the mean field of the next cycles becomes the rest field.
@@ -100,7 +95,7 @@ class BoardPipeline:
         refused, and nothing changed, when the field moves or a taxel bears more than
         ``tare_limit_n``; less than that cannot be told from the drift that taring is there for.
         """
-        self._begin_tare(initial=not self._rest_known)
+        self._rest.begin(self._noise)
 
     def reset(self) -> None:
         """The board began anew: forget sequence, contacts and fits, keep the rest field."""
@@ -110,8 +105,8 @@ class BoardPipeline:
         self._features.reset()
         self._theta = np.zeros_like(self._theta)
         self._last_captured = None
-        if self._tare is not None:
-            self._begin_tare(initial=not self._rest_known)
+        if self._rest.taring:
+            self._rest.begin(self._noise)
 
     def feed(self, block: SampleBlock) -> list[Cycle]:
         """Cycles that ``block`` ends: none, one, or two when it also ends an incomplete one."""
@@ -127,25 +122,28 @@ class BoardPipeline:
         blocks = [block for block in group.blocks if block is not None]
         captured = min(block.captured for block in blocks)
         health = self._monitor.update(raw, temperature, status, present, captured)
-        if self._unrested is not None:
-            health[self._unrested] |= np.uint8(TaxelHealth.OUT_OF_RANGE)
+        rest = self._rest
+        known = rest.known  # before: a first tare takes effect from the next cycle on
+        if known and np.count_nonzero(rest.unrested):
+            health[rest.unrested] |= np.uint8(TaxelHealth.OUT_OF_RANGE)
         field = model.taxel_field(raw, temperature)
         masked = int(np.count_nonzero(health))
+        sick = masked > 0
         healthy = layout.real
-        if masked:
+        if sick:
             healthy = layout.real & (health == 0)
             # what an unhealthy taxel reads must not leak into its neighbours' forces
             np.copyto(field, model.plane_field(self._theta), where=~healthy[:, None])
-        if self._tare is not None:
-            field = self._advance_tare(field, healthy, bool(present.all()), captured, group)
+        if rest.taring:
+            self._advance_tare(field, healthy, bool(present.all()), captured, group.sequence)
         forces = model.forces(field)
-        if self._rest_known:
+        if known:
             in_ee = model.field_in_ee(field)
             estimate = self._compensator.update(in_ee, forces, healthy, captured)
             self._theta = estimate.theta
             if self.settings.method != "off":
                 forces -= model.plane_forces(estimate.theta)
-            if masked:
+            if sick:
                 np.copyto(forces, np.nan, where=~healthy[:, None])
         else:
             estimate = self._unknown
@@ -153,15 +151,15 @@ class BoardPipeline:
             forces.fill(np.nan)
         force = layout.flat_vectors(forces)
         self._health = layout.flat(health)
-        reasons, valid = self._reasons(estimate, healthy, present)
-        tip_usable = valid or self._tip_usable(estimate, present)
+        reasons, valid = self._reasons(estimate, healthy, present, known)
+        tip_usable = valid or (known and self._tip_usable(estimate, present))
         features = self._features.update(force, masked, reasons, valid, tip_usable, captured)
-        if self._tare is not None:
-            self._tare_peak = max(self._tare_peak, features.peak_force)
-        if self._track is not None and valid and not reasons:
+        if rest.taring:
+            rest.note_peak(features.peak_force)
+        if self.settings.rest_tracking_s is not None and valid and not reasons:
             self._follow_rest(field, estimate, healthy, captured)
         self._last_captured = captured
-        if masked and self._rest_known:
+        if sick:
             np.copyto(field, np.nan, where=~healthy[:, None])
         return Cycle(
             sequence=group.sequence,
@@ -196,13 +194,16 @@ class BoardPipeline:
         return raw, temperature, status, present
 
     def _reasons(
-        self, estimate: Estimate, healthy: Bool, present: Bool
+        self, estimate: Estimate, healthy: Bool, present: Bool, known: bool
     ) -> tuple[tuple[str, ...], bool]:
         """Why features are degraded, and whether they are valid all the same."""
         reasons: list[str] = []
         valid = True
-        if not self._rest_known:
+        if not known:
             reasons.append("taring")
+            valid = False
+        elif self._rest.rough:
+            reasons.append("rest field uncertain: tare")
             valid = False
         if np.count_nonzero(present) < len(present):
             reasons += [f"array {self._names[a]} missing" for a in np.flatnonzero(~present)]
@@ -213,7 +214,7 @@ class BoardPipeline:
                 reasons.append(f"taxels masked: {self._names[a]} {masked[a]:.0%}")
                 valid = False
         ambient = estimate.ambient
-        if self._rest_known and np.count_nonzero(ambient.valid) < len(present):
+        if known and np.count_nonzero(ambient.valid) < len(present):
             for a in np.flatnonzero(~ambient.valid & present):
                 name = self._names[a]
                 if estimate.borrowed[a]:
@@ -227,67 +228,25 @@ class BoardPipeline:
 
     def _tip_usable(self, estimate: Estimate, present: Bool) -> bool:
         ambient = estimate.ambient
-        return self._rest_known and all(
+        return all(
             present[a]
             and (ambient.valid[a] or estimate.borrowed[a] or ambient.age[a] <= self._hold[a])
             for a in self._tip_arrays
         )
 
-    def _begin_tare(self, initial: bool) -> None:
-        shape = (self._layout.arrays, 3, self._layout.width)
-        self._tare = Tare(shape, self.settings.tare_s, self._noise)
-        self._tare_initial = initial
-        self._tare_peak = 0.0
-
     def _advance_tare(
-        self, field: Float, healthy: Bool, whole: bool, captured: Instant, group: Group
-    ) -> Float:
-        """Take one cycle into the tare; its field over the rest field now in force."""
-        tare, layout = self._tare, self._layout
-        if tare is None or not tare.add(field, healthy, whole, captured):
-            return field
-        trouble = tare.trouble()
-        limit = self.settings.tare_limit_n
-        if trouble is None and not self._tare_initial and self._tare_peak > limit:
-            trouble = (
-                f"a taxel bears {self._tare_peak:.1f} N, more than the {limit:g} N that drift may "
-                "look like: lift the skin off everything"
-            )
-        if trouble is not None:
-            self._end_tare(False, f"tare refused: {trouble}", 0.0, self._noise, group.sequence)
-            if not self._rest_known:
-                self._begin_tare(initial=True)
-            return field
-        shift = np.where(tare.healthy[:, None], tare.mean, 0.0)
-        self._model.rest += shift
-        noise = tare.noise()
-        largest = float(np.abs(shift).max())
-        left = layout.taxels - int(tare.healthy.sum())
-        kept = "stay masked" if self._tare_initial else "keep theirs"
-        kept = f"; {left} unhealthy taxels {kept}" if left else ""
-        self._end_tare(
-            True,
-            f"tared over {tare.cycles} cycles: rest fields moved by up to {largest:.1f} µT{kept}",
-            largest,
-            noise,
-            group.sequence,
-        )
-        self._rest_known = True
-        if self._tare_initial:
-            unrested = layout.real & ~tare.healthy
-            self._unrested = unrested if unrested.any() else None
+        self, field: Float, healthy: Bool, whole: bool, captured: Instant, sequence: int
+    ) -> None:
+        """Take one cycle into the tare under way; its end begins contacts and fits anew."""
+        shift = self._rest.advance(field, healthy, whole, captured, sequence)
+        report = self._rest.report
+        if shift is None or report is None:
+            return
+        field -= shift
         self._compensator.reset()
         self._features.reset()
         self._theta = np.zeros_like(self._theta)
-        self._apply_noise(noise)
-        return field - shift
-
-    def _end_tare(
-        self, accepted: bool, message: str, shift: float, noise: Float, sequence: int
-    ) -> None:
-        cycles = 0 if self._tare is None else self._tare.cycles
-        self._tare_report = TareReport(accepted, message, cycles, shift, noise, sequence)
-        self._tare = None
+        self._apply_noise(report.noise_ut)
 
     def _apply_noise(self, noise: Float) -> None:
         """Noise of one sample, (3,) µT in chip axes, sets the thresholds of contact and fit."""
@@ -299,12 +258,12 @@ class BoardPipeline:
         self, field: Float, estimate: Estimate, healthy: Bool, captured: Instant
     ) -> None:
         """Let the rest of untouched taxels follow what compensation left over."""
-        if self._track is None or self._last_captured is None:
+        period = self.settings.rest_tracking_s
+        if period is None or self._last_captured is None:
             return
-        share = min(1.0, (captured - self._last_captured) / NS_PER_S / self._track)
+        share = min(1.0, (captured - self._last_captured) / NS_PER_S / period)
         free = healthy & ~self._layout.padded(self._features.contact)
-        left = field - self._model.plane_field(estimate.theta)
-        self._model.rest += np.where(free[:, None], share * left, 0.0)
+        self._rest.follow(field - self._model.plane_field(estimate.theta), free, share)
 
     def _due(self, captured: Instant) -> bool:
         """Whether this cycle's features are to be sent, at ``feature_rate_hz``."""

@@ -42,17 +42,21 @@ class TareReport:
 
 
 class Tare:
-    """Sums of the cycles of one tare; constant memory."""
+    """Sums of the cycles of one tare; constant memory. ``expected``: (3,) µT rms of one sample."""
 
     def __init__(self, shape: tuple[int, ...], seconds: float, noise_ut: Float) -> None:
         self._seconds = seconds
-        self._expected = noise_ut
+        self.expected = noise_ut
         self._start: Instant | None = None
         self._sums = np.zeros((2, *shape))
         self._squares = np.zeros(shape)
         self._pivot = np.zeros(shape)  # the first cycle: sums of differences keep their digits
         self._counts = [0, 0]
         self._healthy = np.ones((shape[0], shape[2]), dtype=bool)
+
+    def again(self) -> Tare:
+        """A fresh tare of the same kind."""
+        return Tare(self._squares.shape, self._seconds, self.expected)
 
     @property
     def cycles(self) -> int:
@@ -95,12 +99,12 @@ class Tare:
             return "no taxel was healthy throughout"
         spread = self._spread().swapaxes(1, 2)[self._healthy]
         drift = np.abs(self._sums[1] / self._counts[1] - self._sums[0] / self._counts[0])
-        error = self._expected * np.sqrt(1 / self._counts[0] + 1 / self._counts[1])
+        error = self.expected * np.sqrt(1 / self._counts[0] + 1 / self._counts[1])
         allowed = np.maximum(STILL_SIGMAS * error, STILL_FLOOR_UT)
         moved = drift.swapaxes(1, 2)[self._healthy]
         if (moved > allowed).any():
             return f"the field moved by {moved.max():.1f} µT during the tare: keep the skin still"
-        if (spread > NOISY_RATIO * self._expected).any():
+        if (spread > NOISY_RATIO * self.expected).any():
             return f"the field varied by {spread.max():.1f} µT rms: keep the skin still, untouched"
         return None
 
