@@ -283,7 +283,7 @@ class Daemon:
             for node, station in port.stations.items():
                 station.each_second(now)
                 wall_ns = self._wall.wall_ns(now)
-                values = diagnostics.summary(port, node, station, now)
+                station.summary = values = diagnostics.summary(port, node, station, now)
                 message = diagnostics.message(station.name, values, self.recorder, wall_ns)
                 outlet.send(DIAGNOSTICS, station.name, message, wall_ns)
         self._watch_log(outlet)

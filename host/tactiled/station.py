@@ -65,6 +65,8 @@ class Station:
         """Cycles whose forces were published."""
         self.counters: Counter[str] = Counter()
         self.board_status: dict[str, int] = {}
+        self.summary: dict[str, Any] = {}
+        """`diagnostics.summary` of the last second; replaced as a whole, for other threads."""
         self._outlet = outlet
         self._shelf = shelf
         self._settings = settings
@@ -150,10 +152,10 @@ class Station:
         match event:
             case Sampled(block):
                 self._on_block(block)
-            case Identified(identity, rebooted):
+            case Identified(identity, _):
                 self.identity, self.refusal, self.state = identity, None, "identified"
-                if self.pipeline is not None and rebooted:
-                    self.pipeline.reset()
+                if self.pipeline is not None and self.sent:
+                    self.pipeline.reset()  # what it felt before it was out of sight is over
                 version = f", firmware {identity.firmware}" if identity.firmware else ""
                 self._say(logging.INFO, f"{identity}{version} found")
                 self._warn()

@@ -15,7 +15,6 @@ from rich.text import Text
 from tactile_bus.geometry import Side
 from tactile_bus.instant import monotonic_now, seconds_between
 from tactile_bus.recorder import Recorder
-from tactiled import diagnostics
 from tactiled.port import Port
 from tactiled.station import Station
 
@@ -65,23 +64,19 @@ class Status:
             self._live.update(self._table(), refresh=True)
         elif seconds_between(self._plain_at, monotonic_now()) >= PLAIN_EVERY:
             self._plain_at = monotonic_now()
-            for port, node, station in self._boards():
-                cells = [f"{k} {v}" for k, v in describe(port, node, station).items() if v]
+            for station in self._boards():
+                cells = [f"{k} {v}" for k, v in describe(station).items() if v]
                 log.info("%s: %s", station.name, ", ".join(cells))
             if self._recorder is not None:
                 log.info("log %s", describe_log(self._recorder))
 
-    def _boards(self) -> list[tuple[Port, int, Station]]:
-        return [
-            (port, node, station)
-            for port in self._ports
-            for node, station in list(port.stations.items())
-        ]
+    def _boards(self) -> list[Station]:
+        return [station for port in self._ports for station in list(port.stations.values())]
 
     def _table(self) -> Table:
         table = Table.grid(padding=(0, 2))
-        for port, node, station in self._boards():
-            cells = describe(port, node, station)
+        for station in self._boards():
+            cells = describe(station)
             style = {"streaming": "green", "refused": "red"}.get(station.state, "yellow")
             table.add_row(
                 Text(station.name, "bold"),
@@ -98,7 +93,7 @@ class Status:
         return table
 
 
-def describe(port: Port, node: int, station: Station) -> dict[str, str]:
+def describe(station: Station) -> dict[str, str]:
     """State of a board in a few short texts; empty where there is nothing to say."""
     cycle = station.last
     fresh = cycle is not None and seconds_between(cycle.received, monotonic_now()) < STALE_AFTER
@@ -106,7 +101,7 @@ def describe(port: Port, node: int, station: Station) -> dict[str, str]:
     cells = {
         "state": station.state,
         "rate": f"{station.rate:.1f} Hz",
-        "drops": drops_text(diagnostics.drops(port, node, station)),
+        "drops": drops_text(station.summary.get("drops", {})),
         "latency": ""
         if math.isnan(latency.p50)
         else f"{latency.p50 * 1e3:.1f}/{latency.p99 * 1e3:.1f} ms",

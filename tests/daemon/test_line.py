@@ -40,6 +40,7 @@ def serve(line: SerialLine, board: Any, at: At, seconds: float, start: float = 0
         events += line.tick(at(now))
         answers = []
         for payload in line.outgoing():
+            assert isinstance(payload, bytes)
             for received in decoder.feed(payload):
                 answers += board.hear(received.message, now)
         data = b"".join(encode_serial(m) for m in [*answers, *board.speak(now)])
@@ -178,6 +179,7 @@ class Bus:
             events += self.line.tick(self.at(now))
             frames: list[CanFrame] = []
             for payload in self.line.outgoing():
+                assert not isinstance(payload, bytes)
                 for received in self.decoder.feed(payload):
                     everyone = received.board == 127
                     self.questions += everyone and isinstance(received.message, Identify)

@@ -276,10 +276,14 @@ def test_ctrl_c_leaves_a_whole_log_that_replays_on_keys_of_its_own(lab: Lab) -> 
 
 
 def test_silence_ends_the_features_and_never_repeats_one(lab: Lab) -> None:
-    lab.boards("--pty", "board0", "--seed", "1", "--faults", "silence@4s+1.2s", link="board0")
+    board = lab.boards("--pty", "board0", "--seed", "1", link="board0")
     daemon = lab.tactiled("--port", "board0", "--no-log")
     ear = Ear(lab.listen())
+    ear.wait(10)
+    board.process.send_signal(signal.SIGSTOP)
     daemon.wait_for("no samples for")
+    time.sleep(1.2)
+    board.process.send_signal(signal.SIGCONT)
     ear.wait(20, after=time.monotonic())
     numbers = [m.sequence for _, m in ear.heard]
     assert numbers == sorted(set(numbers))
@@ -287,13 +291,20 @@ def test_silence_ends_the_features_and_never_repeats_one(lab: Lab) -> None:
     assert max(pauses) > 1.0
 
 
-def test_an_unplugged_board_is_taken_up_again(lab: Lab) -> None:
-    lab.boards("--pty", "board0", "--seed", "1", "--unplug", "4s+0.8s", link="board0")
+def test_an_unplugged_board_is_taken_up_again_and_another_in_its_place_refused(lab: Lab) -> None:
+    board = lab.boards("--pty", "board0", "--seed", "1", link="board0")
     daemon = lab.tactiled("--port", "board0", "--log", "run.mcap")
     ear = Ear(lab.listen())
     ear.wait(10)
+    board.end()
     daemon.wait_for("waiting for it to come back")
+    (lab.folder / "board0").unlink(missing_ok=True)
+    board = lab.boards("--pty", "board0", "--seed", "1", link="board0")
     ear.wait(10, after=time.monotonic())
+    board.end()
+    (lab.folder / "board0").unlink(missing_ok=True)
+    lab.boards("--pty", "board0", "--seed", "2", link="board0")
+    daemon.wait_for("answers where")
     assert daemon.process.poll() is None
 
 
