@@ -32,9 +32,12 @@ SHORT_NAMES = {
     name.rsplit("/", 1)[1]: name
     for name in (
         "tactile_msgs/msg/AmbientField",
+        "tactile_msgs/msg/ArmState",
         "tactile_msgs/msg/ContactFeatures",
         "tactile_msgs/msg/ContactPatch",
         "tactile_msgs/msg/RawChunk",
+        "tactile_msgs/msg/ReachEvent",
+        "tactile_msgs/msg/ReachState",
         "tactile_msgs/msg/SkinGeometry",
         "tactile_msgs/msg/TaxelField",
         "tactile_msgs/msg/TaxelForces",
@@ -53,6 +56,9 @@ SHORT_NAMES = {
         "diagnostic_msgs/msg/DiagnosticStatus",
         "diagnostic_msgs/msg/KeyValue",
         "rcl_interfaces/msg/Log",
+        "std_msgs/msg/ColorRGBA",
+        "visualization_msgs/msg/Marker",
+        "visualization_msgs/msg/MarkerArray",
     )
 }
 """Types that ``MSG.<name>`` finds by their last part."""

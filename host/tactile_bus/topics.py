@@ -47,7 +47,27 @@ RAW = Topic("tactile/{name}/raw", f"{_OWN}/RawChunk", 100, published=False)
 DIAGNOSTICS = Topic("tactile/{name}/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 1)
 LOG = Topic("tactile/{name}/log", "rcl_interfaces/msg/Log", 0)
 
-TOPICS = (FEATURES, FORCES, FIELD, AMBIENT, GEOMETRY, RAW, DIAGNOSTICS, LOG)
+ARM_STATE = Topic("arm/{name}/state", f"{_OWN}/ArmState", 100, stale_after=0.05)
+COMMAND = Topic("arm/{name}/cmd_vel", "geometry_msgs/msg/TwistStamped", 100, stale_after=0.1)
+REACH_STATE = Topic("reach/{name}/state", f"{_OWN}/ReachState", 100)
+REACH_EVENT = Topic("reach/{name}/event", f"{_OWN}/ReachEvent", 0)
+WORLD = Topic("world/{name}/objects", "visualization_msgs/msg/MarkerArray", 10)
+
+TOPICS = (
+    FEATURES,
+    FORCES,
+    FIELD,
+    AMBIENT,
+    GEOMETRY,
+    RAW,
+    DIAGNOSTICS,
+    LOG,
+    ARM_STATE,
+    COMMAND,
+    REACH_STATE,
+    REACH_EVENT,
+    WORLD,
+)
 
 
 def find_topic(key: str) -> tuple[Topic, str] | None:
@@ -66,11 +86,15 @@ def find_topic(key: str) -> tuple[Topic, str] | None:
     return None
 
 
-def service_key(name: str, service: str) -> str:
-    """Key of a queryable of the board daemon: status, tare, set_rate, recalibrate."""
-    return Topic("tactile/{name}/srv/" + service, "", 0).key(name)
+def service_key(name: str, service: str, kind: str = "tactile") -> str:
+    """Key of a queryable of a daemon.
+
+    ``kind`` tactile: status, tare, set_rate, recalibrate; arm: limits, clear; reach: goal, stop,
+    reset, arm, status.
+    """
+    return Topic(kind + "/{name}/srv/" + service, "", 0).key(name)
 
 
-def alive_key(name: str) -> str:
+def alive_key(name: str, kind: str = "tactile") -> str:
     """Key of the liveliness token of whoever publishes for ``name``. Information only."""
-    return Topic("tactile/{name}/alive", "", 0).key(name)
+    return Topic(kind + "/{name}/alive", "", 0).key(name)
