@@ -13,7 +13,7 @@ import tomllib
 from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, Union
 
 import msgspec
 from msgspec import Meta
@@ -128,27 +128,44 @@ def _resolve(keys: KeyPath, data: Any, kind: Any) -> KeyPath:
     at = keys.index("...")
     table = _value_at(data, keys[:at])
     for key in table if isinstance(table, dict) else range(len(table)):
-        found = _resolve((*keys[:at], key, *keys[at + 1 :]), data, kind)
-        wanted = _type_at(types.type_info(kind), found)
+        found = (*keys[:at], key)
+        wanted = _python_type(_type_at(types.type_info(kind), found))
         try:
-            msgspec.convert(_value_at(data, found), _python_type(wanted), strict=True)
+            msgspec.convert(_value_at(data, found), wanted, strict=True)
         except msgspec.ValidationError:
-            return found
+            return _resolve((*found, *keys[at + 1 :]), data, kind)
     return keys[:at]
 
 
-def _python_type(info: types.Type | None) -> Any:
-    """A type msgspec converts to, good enough to tell which of several values it refused."""
-    if isinstance(info, types.StructType):
-        return info.cls
-    simple = {types.FloatType: float, types.IntType: int, types.StrType: str, types.BoolType: bool}
-    base = simple.get(type(info), Any)  # type: ignore[arg-type]
-    limits = {
-        key: getattr(info, key)
-        for key in ("gt", "ge", "lt", "le", "multiple_of", "pattern", "min_length", "max_length")
-        if getattr(info, key, None) is not None
-    }
+def _python_type(info: Any) -> Any:
+    """The type that msgspec described, for the kinds of types that TOML can fill."""
+    match info:
+        case types.Metadata():
+            return _python_type(info.type)
+        case types.StructType() | types.EnumType():
+            return info.cls
+        case types.LiteralType():
+            return Literal[tuple(info.values)]
+        case types.UnionType():
+            return Union[tuple(_python_type(t) for t in info.types)]  # noqa: UP007 - made at run time
+        case types.DictType():
+            return dict[str, _python_type(info.value_type)]  # type: ignore[misc]
+        case types.ListType() | types.VarTupleType() | types.SetType():
+            return list[_python_type(info.item_type)]  # type: ignore[misc]
+        case types.NoneType():
+            return None
+    base = SIMPLE.get(type(info), Any)
+    limits = {name: getattr(info, name) for name in LIMITS if getattr(info, name, None) is not None}
     return Annotated[base, Meta(**limits)] if limits else base
+
+
+SIMPLE: dict[type, Any] = {
+    types.FloatType: float,
+    types.IntType: int,
+    types.StrType: str,
+    types.BoolType: bool,
+}
+LIMITS = ("gt", "ge", "lt", "le", "multiple_of", "pattern", "min_length", "max_length")
 
 
 def _message(name: str, lines: dict[KeyPath, int], keys: KeyPath, value: Any, allowed: str) -> str:

@@ -392,7 +392,9 @@ def test_a_real_file_size_limit_is_met_like_a_full_disk(tmp_path: Path) -> None:
         from pathlib import Path
         from tactile_bus import topics
         from tactile_bus.recorder import Recorder, RecorderSettings
-        settings = RecorderSettings(min_free_bytes=0, flush_period=0.05, retry_seconds=0.05)
+        settings = RecorderSettings(
+            min_free_bytes=0, flush_period=0.05, retry_seconds=0.05, chunk_bytes=8000
+        )
         recorder = Recorder(Path(sys.argv[1]), settings)
         for i in range(400):
             recorder.write(topics.RAW, "b0", os.urandom(300), 10**18 + i, 10**18 + i)

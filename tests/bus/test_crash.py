@@ -1,0 +1,32 @@
+"""Row 29: real processes, killed while they log; every file they leave reads and recovers."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+KILLS = 12
+
+
+def test_kill_9_costs_at_most_a_second(tmp_path: Path) -> None:
+    result = tmp_path / "crash.json"
+    command = [sys.executable, "-m", "tactile_tools.cli", "crash", "--kills", str(KILLS)]
+    command += ["--writers", "4", "--seed", "1234", "--json", str(result)]
+    done = subprocess.run(command, capture_output=True, timeout=110, check=False)
+    found = json.loads(result.read_text())
+    assert found["problems"] == []
+    assert done.returncode == 0, done.stderr
+    assert found["kills"] == KILLS
+    assert found["lost_s_max"] <= 1.0
+    assert found["messages_written"] > 500
+    assert found["messages_lost"] < found["messages_written"] / 2
+
+
+def test_wrong_arguments_are_refused() -> None:
+    for words in (["--kills", "0"], ["--kills", "many"], ["--writers", "-1"]):
+        command = [sys.executable, "-m", "tactile_tools.cli", "crash", *words]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 2
+        assert "allowed: a whole number above 0" in done.stderr

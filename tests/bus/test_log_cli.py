@@ -1,0 +1,144 @@
+"""``tactile log``: what people see, exit codes, and never a traceback."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tactile_bus import topics
+from tactile_bus.messages import MSG, codec, diagnostic_status, header
+
+BASE_NS = 1_700_000_000_000_000_000
+
+
+def tactile(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tactile_tools.cli", "log", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+@pytest.fixture
+def path(tmp_path: Path, record: Any, payloads: Any) -> Path:
+    path = tmp_path / "log.mcap"
+    recorder = record(path)
+    recorder.attach("b0.cal.toml", "application/toml", b"version = 1\n")
+    recorder.metadata("board:b0", {"serial_number": "0011", "hash": "abcd"})
+    for i in range(100):
+        at = BASE_NS + i * 10_000_000
+        recorder.write(topics.FORCES, "b0", payloads[topics.FORCES], at, at)
+    for count in (3, 5):
+        values = {"drops.crc": count, "rate_hz": 100}
+        array = MSG.DiagnosticArray(
+            header(BASE_NS, ""), [diagnostic_status("tactiled/b0", 0, "ok", "0011", values)]
+        )
+        data = codec().encode(topics.DIAGNOSTICS, array)
+        recorder.write(topics.DIAGNOSTICS, "b0", data, BASE_NS, BASE_NS)
+    assert recorder.close(10)
+    return path
+
+
+def test_info_tells_all_that_matters(path: Path) -> None:
+    result = tactile("info", path)
+    assert result.returncode == 0, result.stderr
+    for text in (
+        "whole",
+        "/tactile/b0/forces",
+        "tactile_msgs/msg/TaxelForces",
+        "100.00",
+        "drops of tactiled/b0: crc 5",
+        "serial_number 0011, hash abcd",
+        "b0.cal.toml (application/toml, 12 B)",
+        "tactile-reach",
+        "2023-11-14 22:13:20.000Z",
+    ):
+        assert text in result.stdout
+
+
+def test_info_in_json_is_complete(path: Path) -> None:
+    result = tactile("info", path, "--json")
+    found = json.loads(result.stdout)
+    assert found["whole"] is True
+    assert found["messages"] == 102
+    rows = {row["topic"]: row for row in found["channels"]}
+    assert rows["/tactile/b0/forces"]["rate"] == pytest.approx(100.0)
+    assert rows["/tactile/b0/forces"]["missing"] == 0
+    assert found["drops"] == {"tactiled/b0": {"crc": 5}}
+    assert found["metadata"]["board:b0"]["hash"] == "abcd"
+
+
+def test_a_cut_log_is_recovered_to_a_new_file(path: Path) -> None:
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) * 2 // 3])
+    assert "not closed" in tactile("info", path).stdout
+    before = path.read_bytes()
+    result = tactile("recover", path)
+    assert result.returncode == 0, result.stderr
+    target = path.with_name("log_recovered.mcap")
+    assert str(target) in result.stdout
+    assert path.read_bytes() == before
+    assert json.loads(tactile("info", target, "--json").stdout)["whole"] is True
+    again = tactile("recover", path)
+    assert again.returncode == 2
+    assert "exists and is not overwritten: name another with --out" in again.stderr
+    same = tactile("recover", path, "--out", path)
+    assert same.returncode == 2
+    assert path.read_bytes() == before
+
+
+def test_recover_reports_in_json(path: Path, tmp_path: Path) -> None:
+    result = tactile("recover", path, "--out", tmp_path / "o.mcap", "--json")
+    found = json.loads(result.stdout)
+    assert found["messages"] == 102
+    assert found["damages"] == []
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (b"", "is empty"),
+        (b"\x89MC", "cut off after 3 bytes"),
+        (b"\x7fELF" + bytes(5000), "is no MCAP file"),
+        (os.urandom(200_000), "is no MCAP file"),
+    ],
+)
+def test_what_is_no_log_is_refused_with_2(tmp_path: Path, content: bytes, text: str) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content)
+    for command in ("info", "recover"):
+        result = tactile(command, path)
+        assert result.returncode == 2
+        assert text in result.stderr
+        assert "name a log" in result.stderr
+        assert "Traceback" not in result.stderr
+        assert result.stdout == ""
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_missing_files_directories_and_devices(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for place, text in (
+        (tmp_path / "none.mcap", "name a file that exists"),
+        (tmp_path, "name one .mcap file in it"),
+        (Path("/dev/zero"), "no file but a device or a pipe"),
+        (tmp_path / "pipe", "no file but a device or a pipe"),
+    ):
+        result = tactile("info", place)
+        assert result.returncode == 2
+        assert text in result.stderr
+
+
+def test_a_target_that_cannot_be_written_is_refused_with_3(path: Path) -> None:
+    result = tactile("recover", path, "--out", "/proc/none/out.mcap")
+    assert result.returncode == 3
+    assert "name a place with room to write to" in result.stderr
+
+
+def test_names_with_markup_are_shown_as_they_are(path: Path, tmp_path: Path) -> None:
+    odd = tmp_path / "[bold]x.mcap"
+    odd.write_bytes(path.read_bytes())
+    assert "[bold]x.mcap" in tactile("info", odd).stdout

@@ -1,0 +1,336 @@
+"""zenoh sessions: safe by default, never hanging, bounded."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from tactile_bus import topics
+from tactile_bus.messages import MAX_PAYLOAD
+from tactile_bus.session import (
+    PORTS,
+    BusConfig,
+    BusError,
+    TlsConfig,
+    close_session,
+    open_session,
+)
+from tactile_bus.streams import declare_alive, declare_publisher, latest, list_alive
+
+SUBSCRIBER = textwrap.dedent("""
+    import sys, time
+    from tactile_bus.session import BusConfig, open_session
+    from tactile_bus.streams import latest
+    config = BusConfig(listen=(), connect=(f"tcp/127.0.0.1:{sys.argv[1]}",))
+    stream = latest(open_session(config), sys.argv[2])
+    print("ready", flush=True)
+    while True:
+        sample = stream.newest()
+        if sample is not None:
+            print(sample.sequence, stream.skipped, flush=True)
+        time.sleep(float(sys.argv[3]))
+""")
+
+
+@pytest.fixture
+def subscriber() -> Iterator[Any]:
+    """``subscriber(port, key, pause)``: a real process that prints what it acts on."""
+    processes = []
+
+    def start(port: int, key: str, pause: float) -> subprocess.Popen[str]:
+        command = [sys.executable, "-c", SUBSCRIBER, str(port), key, str(pause)]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        processes.append(process)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        return process
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def test_nothing_is_open_to_the_network_by_default() -> None:
+    for role in (*PORTS, "tool"):
+        config = BusConfig(role=role)  # type: ignore[arg-type]
+        for endpoint in (*config.listen_endpoints(), *config.connect_endpoints()):
+            assert endpoint.startswith("tcp/127.0.0.1:")
+    assert BusConfig(role="tactiled").listen_endpoints() == ("tcp/127.0.0.1:7447",)
+    assert BusConfig(role="tool").listen_endpoints() == ()
+    # Each pair of roles is joined from one side only.
+    assert BusConfig(role="tactiled").connect_endpoints() == ()
+    assert BusConfig(role="arm").connect_endpoints() == (
+        "tcp/127.0.0.1:7447",
+        "tcp/127.0.0.1:7448",
+    )
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    ["tcp/0.0.0.0:0", "tcp/[::]:0", "tcp/192.168.1.5:7447", "udp/10.0.0.1:1", "tcp/robot.local:1"],
+)
+def test_off_host_endpoints_are_refused(endpoint: str) -> None:
+    for config in (BusConfig(listen=(endpoint,)), BusConfig(connect=(endpoint,))):
+        with pytest.raises(BusError, match="--insecure"):
+            open_session(config)
+
+
+def test_off_host_endpoints_are_taken_when_asked_by_name(caplog: Any) -> None:
+    session = open_session(BusConfig(listen=("tcp/0.0.0.0:0",), connect=(), insecure=True))
+    assert "without protection" in caplog.text
+    close_session(session)
+
+
+def test_tls_without_keys_or_names_is_refused() -> None:
+    with pytest.raises(BusError, match=r"\[bus.tls\] table"):
+        open_session(BusConfig(listen=("tls/0.0.0.0:0",)))
+    tls = TlsConfig(root_ca="a", certificate="b", private_key="c", allowed=())
+    with pytest.raises(BusError, match="allowed is empty"):
+        open_session(BusConfig(listen=("tls/0.0.0.0:0",), connect=(), tls=tls))
+
+
+def test_what_is_no_endpoint_is_named() -> None:
+    with pytest.raises(BusError, match="robot"):
+        open_session(BusConfig(listen=(), connect=("robot",), insecure=True))
+
+
+def test_a_busy_port_is_named_with_a_remedy(bus: Any, free_port: Any) -> None:
+    port = free_port()
+    bus(listen=port)
+    with pytest.raises(BusError, match=rf"127.0.0.1:{port} is in use.*--listen"):
+        bus(listen=port)
+
+
+def test_samples_carry_sequence_stamp_and_source(bus: Any, free_port: Any, until: Any) -> None:
+    port = free_port()
+    publisher = declare_publisher(bus(listen=port), topics.FEATURES, "b0")
+    stream = latest(bus(connect=port), "tactile/*/features")
+    until(lambda: publisher.put(b"x", 1) or stream.newest())
+    publisher.put(b"data", 123)
+    sample = stream.wait(5)
+    while sample.data != b"data":
+        sample = stream.wait(5)
+    assert sample.key == "tactile/b0/features"
+    assert (sample.wall_ns, sample.source) == (123, publisher.source)
+    assert sample.sequence == publisher.sequence
+
+
+def test_a_slow_reader_gets_the_newest_and_counts_the_rest(
+    bus: Any, free_port: Any, until: Any
+) -> None:
+    port = free_port()
+    publisher = declare_publisher(bus(listen=port), topics.FEATURES, "b0")
+    stream = latest(bus(connect=port), publisher.key)
+    until(lambda: publisher.put(b"x", 1) or stream.newest())
+    time.sleep(0.2)
+    stream.newest()
+    received, skipped, sent = stream.received, stream.skipped, publisher.sequence
+    for _ in range(500):
+        publisher.put(b"x", 1)
+        time.sleep(0.0005)
+    time.sleep(0.3)
+    sample = stream.newest()
+    assert sample.sequence == sent + 500
+    assert stream.received == received + 1
+    assert stream.skipped == skipped + 499
+    assert stream.newest() is None
+
+
+def test_a_slow_process_acts_on_the_newest(bus: Any, free_port: Any, subscriber: Any) -> None:
+    """Row 21: a reader that takes 0.2 s over each sample does not fall behind."""
+    port = free_port()
+    publisher = declare_publisher(bus(listen=port), topics.FEATURES, "b0")
+    process = subscriber(port, publisher.key, 0.2)
+    seen, sent_at = [], {}
+    deadline = time.monotonic() + 3
+    while time.monotonic() < deadline:
+        publisher.put(bytes(1000), 1)
+        sent_at[publisher.sequence] = time.monotonic()
+        time.sleep(0.002)
+    process.kill()
+    out, _ = process.communicate()
+    seen = [int(line.split()[0]) for line in out.splitlines()]
+    assert len(seen) >= 5
+    # Had they queued, the last one acted on would be one of the first few sent.
+    assert seen[-1] > publisher.sequence - 1000
+    assert seen[-1] > 10 * len(seen)
+
+
+def test_a_stopped_subscriber_blocks_nobody(
+    bus: Any, free_port: Any, subscriber: Any, until: Any
+) -> None:
+    """Row 20: with one reader under SIGSTOP, puts go on and the others get everything new."""
+    port = free_port()
+    session = bus(listen=port)
+    publisher = declare_publisher(session, topics.FEATURES, "b0")
+    stopped = subscriber(port, publisher.key, 0.01)
+    stream = latest(bus(connect=port), publisher.key)
+    until(lambda: publisher.put(b"x", 1) or stream.newest())
+    os.kill(stopped.pid, signal.SIGSTOP)
+    try:
+        # Far more than sockets and queues hold: a publisher that blocks would hang here.
+        started = time.monotonic()
+        for _ in range(3000):
+            publisher.put(bytes(20_000), 1)
+            time.sleep(0.0003)
+        took = time.monotonic() - started
+        until(lambda: (stream.newest() or publisher.put(b"last", 1)) is not None)
+        assert took < 20  # blocking on congestion waits 5 s for each message
+    finally:
+        os.kill(stopped.pid, signal.SIGCONT)
+    assert stream.received > 0
+
+
+def test_oversized_payloads_are_refused(bus: Any, free_port: Any, until: Any) -> None:
+    port = free_port()
+    session = bus(listen=port)
+    publisher = declare_publisher(session, topics.FEATURES, "b0")
+    with pytest.raises(ValueError, match="65536 allowed"):
+        publisher.put(bytes(MAX_PAYLOAD + 1), 1)
+    stream = latest(bus(connect=port), publisher.key)
+    until(lambda: publisher.put(bytes(MAX_PAYLOAD), 1) or stream.newest())
+    time.sleep(0.1)
+    stream.newest()
+    # A sender that does not keep to the limit: a little above we count, far above zenoh drops.
+    session.put(publisher.key, bytes(MAX_PAYLOAD + 100))
+    until(lambda: stream.newest() is None and stream.refused == 1)
+    session.put(publisher.key, bytes(4 << 20))
+    time.sleep(0.3)
+    assert stream.newest() is None
+    publisher.put(b"still here", 1)
+    assert stream.wait(5).data == b"still here"
+
+
+def test_a_plain_zenoh_sender_is_understood(bus: Any, free_port: Any, until: Any) -> None:
+    port = free_port()
+    session = bus(listen=port)
+    stream = latest(bus(connect=port), "arm/a/state")
+    until(lambda: session.put("arm/a/state", b"x") or stream.newest())
+    session.put("arm/a/state", b"y", attachment=b"odd")
+    sample = stream.wait(5)
+    assert sample.data in (b"x", b"y")
+    assert (sample.sequence, sample.wall_ns, sample.source) == (None, None, None)
+
+
+def test_daemons_find_one_another_whoever_starts_first(
+    bus: Any, free_port: Any, until: Any
+) -> None:
+    port = free_port()
+    early = bus(connect=port)
+    assert list_alive(early, 0.2) == []
+    late = bus(listen=port)
+    token = declare_alive(late, "b0")
+    assert list_alive(early, 10) == ["b0"]
+    token.undeclare()
+    until(lambda: list_alive(early, 0.1) == [])
+    close_session(late)
+    again = bus(listen=port)  # restarted: found again without anyone's help
+    _token = declare_alive(again, "b0")
+    assert list_alive(early, 10) == ["b0"]
+
+
+@pytest.mark.parametrize(
+    "way", ["", "close_session(session)", "session.close()", "raise SystemExit(7)"]
+)
+def test_a_process_that_used_the_bus_ends(free_port: Any, way: str) -> None:
+    """With a subscriber callback and a service, which zenoh serves from threads of its own."""
+    code = textwrap.dedent(f"""
+        from tactile_bus.session import BusConfig, open_session, close_session
+        from tactile_bus.services import declare_service
+        session = open_session(BusConfig(listen=("tcp/127.0.0.1:{free_port()}",), connect=()))
+        session.declare_subscriber("a/b", lambda sample: None)
+        declare_service(session, "tactile/b0/srv/status", lambda request: request)
+        {way}
+    """)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, timeout=20, check=False
+    )
+    assert result.returncode == (7 if "SystemExit" in way else 0)
+    assert b"Traceback" not in result.stderr
+
+
+def test_closing_does_not_wait_for_a_stopped_peer(
+    free_port: Any, subscriber: Any, until: Any
+) -> None:
+    port = free_port()
+    session = open_session(BusConfig(listen=(f"tcp/127.0.0.1:{port}",), connect=()))
+    publisher = declare_publisher(session, topics.FEATURES, "b0")
+    process = subscriber(port, publisher.key, 0.01)
+    until(lambda: session.info.peers_zid())
+    os.kill(process.pid, signal.SIGSTOP)
+    for _ in range(3000):
+        publisher.put(bytes(20_000), 1)
+    started = time.monotonic()
+    close_session(session, 0.5)
+    assert time.monotonic() - started < 5  # zenoh by itself waits 10 s
+    os.kill(process.pid, signal.SIGCONT)
+
+
+@pytest.fixture
+def certificates(tmp_path: Path) -> dict[str, TlsConfig]:
+    """A certificate authority and certificates for robot, desk and stranger."""
+    if shutil.which("openssl") is None:
+        pytest.skip("needs the openssl command to make certificates")
+
+    def openssl(*words: str) -> None:
+        subprocess.run(["openssl", *words], check=True, capture_output=True, cwd=tmp_path)
+
+    new = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2")
+    openssl("req", "-x509", *new, "-keyout", "ca.key", "-out", "ca.pem", "-subj", "/CN=ca")
+    (tmp_path / "ext").write_text(
+        "subjectAltName=IP:127.0.0.1,DNS:localhost\nextendedKeyUsage=serverAuth,clientAuth\n"
+    )
+    found = {}
+    for name in ("robot", "desk", "stranger"):
+        openssl("req", *new[:-2], "-keyout", f"{name}.key", "-out", "r.csr", "-subj", f"/CN={name}")
+        openssl(
+            "x509", "-req", "-in", "r.csr", "-CA", "ca.pem", "-CAkey", "ca.key", "-days", "2",
+            "-CAcreateserial", "-extfile", "ext", "-out", f"{name}.pem",
+        )  # fmt: skip
+        found[name] = TlsConfig(
+            root_ca=str(tmp_path / "ca.pem"),
+            certificate=str(tmp_path / f"{name}.pem"),
+            private_key=str(tmp_path / f"{name}.key"),
+            allowed=("robot", "desk"),
+        )
+    return found
+
+
+def test_over_tls_only_named_certificates_hear_anything(
+    certificates: dict[str, TlsConfig], free_port: Any, until: Any
+) -> None:
+    port = free_port()
+    sessions: list[zenoh.Session] = []
+
+    def join(who: str, **places: tuple[str, ...]) -> zenoh.Session:
+        config = BusConfig(**({"listen": (), "connect": ()} | places), tls=certificates[who])  # type: ignore[arg-type]
+        sessions.append(open_session(config))
+        return sessions[-1]
+
+    try:
+        robot = join("robot", listen=(f"tls/127.0.0.1:{port}",))
+        publisher = declare_publisher(robot, topics.FEATURES, "b0")
+        friend = latest(join("desk", connect=(f"tls/127.0.0.1:{port}",)), publisher.key)
+        stranger = latest(join("stranger", connect=(f"tls/127.0.0.1:{port}",)), publisher.key)
+        until(lambda: publisher.put(b"x", 1) or friend.newest())
+        for _ in range(100):
+            publisher.put(b"x", 1)
+            time.sleep(0.005)
+        assert friend.wait(5) is not None
+        assert stranger.newest() is None
+    finally:
+        for session in sessions:
+            close_session(session)
