@@ -27,6 +27,7 @@ from sensor_proto.packets import (
 
 MakeSamples = Callable[..., Samples]
 Frames = list[CanFrame]
+u7 = st.integers(0, 127)
 
 
 def numbers(received: list[Received]) -> list[tuple[int, int]]:
@@ -271,6 +272,26 @@ def test_memory_stays_bounded_whatever_comes() -> None:
     grown, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert grown < 32 * len(kinds) * 1200
+
+
+frames_at_random = st.builds(
+    CanFrame,
+    st.one_of(
+        st.integers(0, 2**32),
+        st.builds(lambda k, b: MARK << 16 | k << 8 | b, st.sampled_from(MessageType), u7),
+    ),
+    st.binary(max_size=70),
+    st.booleans(),
+    st.integers(0, 9).map(lambda n: n == 0),
+)
+
+
+@given(st.lists(frames_at_random, max_size=30))
+@settings(max_examples=100, deadline=None)
+def test_frames_at_random_never_raise_and_are_never_accepted(frames: Frames) -> None:
+    decoder = CanDecoder()
+    assert decoder.feed(frames) == []
+    assert decoder.counters["accepted"] == 0
 
 
 def test_reset_forgets_unfinished_transfers(transfers: list[Frames]) -> None:
