@@ -69,7 +69,10 @@ def _add_boards(commands: Commands) -> argparse.ArgumentParser:
         "--node", action="append", default=[], type=_node, metavar="ID",
         help="node id of a board on every bus, 0 to 126; once for each board (default 1)",
     )  # fmt: skip
-    ports.add_argument("--fd", action="store_true", help="CAN FD on --slcan (default CAN 2.0B)")
+    ports.add_argument(
+        "--fd", action="store_true",
+        help="CAN FD on --slcan (default CAN 2.0B, which at 1 Mbit/s carries one finger at 60 Hz)",
+    )  # fmt: skip
     who = boards.add_argument_group("boards")
     _add_identity(who)
     who.add_argument(

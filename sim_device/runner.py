@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import select
 from collections.abc import Callable, Sequence
 from typing import Generic, Protocol, TypeVar
@@ -19,8 +20,8 @@ STATUS_PERIOD = 0.5
 """s between two calls of the status function."""
 
 LONGEST_WAIT = 0.05
-"""s that a board waits for a full port at most; then it goes on, and the port drops the oldest, so
-that a host that comes back gets nothing older."""
+"""s that a board waits for a full terminal at most; then it goes on, and the port drops the oldest,
+so that a host that comes back gets nothing older. A full bus always empties."""
 
 STALL = 0.1
 """s of a full port after which a replay is late for good: its later rows move by as much."""
@@ -93,7 +94,7 @@ class SerialStation:
         self._make_board = make_board
         self._unplugged = tuple(unplugged)
         self._start: Instant | None = None
-        self._feeder = _Feeder[bytes]()
+        self._feeder = _Feeder[bytes](LONGEST_WAIT)
 
     @property
     def losses(self) -> dict[str, int]:
@@ -127,7 +128,7 @@ class SerialStation:
             return
         if not self.port.is_open:
             self.board = self._make_board(elapsed)
-            self._feeder = _Feeder()
+            self._feeder = _Feeder(LONGEST_WAIT)
             self.port.open()
         data = self.port.receive()
         if data:
@@ -150,7 +151,7 @@ class CanStation:
         self.port = port
         self.boards = [make(0.0) for make in make_boards]
         self.sent = 0
-        self._feeders = [_Feeder[tuple[CanFrame, ...]]() for _ in self.boards]
+        self._feeders = [_Feeder[tuple[CanFrame, ...]](math.inf) for _ in self.boards]
 
     @property
     def losses(self) -> dict[str, int]:
@@ -320,14 +321,15 @@ class Runner:
 
 
 class _Feeder(Generic[Payload]):
-    """Lets a board wait while its port is full, but not for ever."""
+    """Lets a board wait while its port is full, ``longest`` s at most."""
 
-    def __init__(self) -> None:
+    def __init__(self, longest: float) -> None:
+        self._longest = longest
         self._last: Instant | None = None
 
     def tick(self, board: Board[Payload], ready: bool, now: Instant) -> Payload | None:
         """What the board sends; None while it waits."""
-        waited = self._last is None or seconds_between(self._last, now) >= LONGEST_WAIT
+        waited = self._last is None or seconds_between(self._last, now) >= self._longest
         if not ready and not waited:
             return None
         self._last = now

@@ -175,7 +175,7 @@ def test_an_anyskin_board_streams_floats_unasked(launch: Launch, tmp_path: Path)
 def test_an_unplugged_board_vanishes_and_comes_back_freshly_booted(
     launch: Launch, tmp_path: Path, eventually: Any
 ) -> None:
-    launch("boards", "--pty", "board0", "--unplug", "1s+0.5s")
+    launch("boards", "--pty", "board0", "--unplug", "2s+0.5s")
     link = tmp_path / "board0"
     host = SerialTransport(str(link))
     host.open()
