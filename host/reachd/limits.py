@@ -15,9 +15,12 @@ from reachd.workspace import Region
 ROUNDING = 1e-12
 """m/s, rad/s: what floating point leaves of a component that was taken away."""
 
-PASSES = 3
-"""Rounds over the constraints before the whole twist is scaled instead: neighbouring borders of a
-region need two."""
+NO_OVERSHOOT = math.e
+"""A motion that slows in proportion to what is left, seen with a delay, never overshoots when its
+time constant is at least e times the delay."""
+
+PARALLEL = 1e-6
+"""Sine of the angle below which two borders have no corner worth the name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +72,11 @@ def within_acceleration(twist: Twist, last: Twist, dv: float, dw: float) -> Twis
 def workspace_constraints(arm: ArmState, settings: SafetySettings) -> list[Constraint]:
     """What keeps tip and pivot inside their regions.
 
-    The speed towards a border is at most the distance left over the time for which the arm may go
-    on with this command, its state having been as old as it may be: so the point ends on the border
-    at worst. Outside, only the way back is open.
+    The speed towards a border is at most the distance left over a time constant, which is so long
+    that with the oldest state and a command kept for its whole life the point comes to rest inside.
+    Outside, only the way back is open.
     """
-    horizon = settings.arm_age + settings.command_expiry
+    horizon = NO_OVERSHOOT * (settings.arm_age + settings.command_expiry)
     c = settings.tip_length * math.cos(arm.heading)
     s = settings.tip_length * math.sin(arm.heading)
     found = []
@@ -124,31 +127,54 @@ def wrench_constraints(twist: Twist, arm: ArmState, left: float) -> list[Constra
 def constrained(twist: Twist, constraints: list[Constraint]) -> Twist:
     """``twist`` reduced until every constraint holds.
 
-    First only what offends is taken away, so that the arm may slide along a border; if the
-    constraints contradict one another, the whole twist is scaled.
+    First the velocity gives way, to the nearest one that obeys, so that the arm may slide along a
+    border; then the turning; and where less turning would need a velocity that turns back, the
+    whole twist is scaled.
     """
-    for _ in range(PASSES):
-        broken = [rule for rule in constraints if rule.broken_by(twist)]
-        if not broken:
-            return twist
-        for rule in broken:
-            twist = _reduced(twist, rule)
+    if not any(rule.broken_by(twist) for rule in constraints):
+        return twist
+    omega = twist.omega
+    room = [(rule, max(0.0, rule.bound - rule.nw * omega)) for rule in constraints]
+    vx, vy = _nearest(twist.vx, twist.vy, [(rule.nx, rule.ny, most) for rule, most in room])
+    part = 1.0
+    for rule, most in room:
+        if most == 0.0 and rule.nw * omega > rule.bound:
+            moving = rule.nx * vx + rule.ny * vy
+            part = min(part, max(0.0, rule.bound - moving) / (rule.nw * omega))
+    twist = Twist(vx, vy, omega * part)
     for rule in constraints:
         if rule.broken_by(twist):
             twist = scaled(twist, rule.bound / rule.along(twist))
     return twist
 
 
-def _reduced(twist: Twist, rule: Constraint) -> Twist:
-    """Take away from the velocity, then from the turning, what breaks ``rule``."""
-    moving = rule.nx * twist.vx + rule.ny * twist.vy
-    turning = rule.nw * twist.omega
-    if moving > 0.0:
-        kept = min(moving, max(0.0, rule.bound - turning))
-        away = moving - kept
-        twist = Twist(twist.vx - rule.nx * away, twist.vy - rule.ny * away, twist.omega)
-        moving = kept
-    if moving + turning > rule.bound and turning > 0.0:
-        omega = twist.omega * max(0.0, rule.bound - moving) / turning
-        twist = Twist(twist.vx, twist.vy, omega)
-    return twist
+def _nearest(vx: float, vy: float, rules: list[tuple[float, float, float]]) -> tuple[float, float]:
+    """Velocity nearest to (vx, vy) with ``nx·vx + ny·vy ≤ most`` for every (nx, ny, most ≥ 0).
+
+    The nearest point of a convex region lies on one border or in a corner of two. Standing still
+    is always inside, so the answer is never faster and never points the other way.
+    """
+    broken = [rule for rule in rules if _beyond(vx, vy, rule)]
+    if not broken:
+        return vx, vy
+    for nx, ny, most in broken:
+        size = nx * nx + ny * ny
+        away = (nx * vx + ny * vy - most) / size
+        x, y = vx - nx * away, vy - ny * away
+        if not any(_beyond(x, y, rule) for rule in rules):
+            return x, y
+    best, least = (0.0, 0.0), math.hypot(vx, vy)
+    for index, (ax, ay, a) in enumerate(rules):
+        for bx, by, b in rules[index + 1 :]:
+            across = ax * by - ay * bx
+            if abs(across) < PARALLEL:
+                continue
+            x, y = (a * by - b * ay) / across, (b * ax - a * bx) / across
+            distance = math.hypot(vx - x, vy - y)
+            if distance < least and not any(_beyond(x, y, rule) for rule in rules):
+                best, least = (x, y), distance
+    return best
+
+
+def _beyond(x: float, y: float, rule: tuple[float, float, float]) -> bool:
+    return rule[0] * x + rule[1] * y > rule[2] + ROUNDING

@@ -113,7 +113,7 @@ HARDWARE = Parameters(
         arm_f_max=15.0,
         arm_m_max=4.5,
         # 38 × 53 cm; the tip keeps off the walls and may come out in front to start and to reset.
-        tip_region=box(-0.25, 0.378, -0.255, 0.255),
+        tip_region=box(-0.30, 0.378, -0.255, 0.255),
         pivot_region=box(-0.45, 0.30, -0.40, 0.40),
         **_COMMON_SAFETY,
     ),
@@ -180,7 +180,7 @@ AUTHORS_SIM = Parameters(
         arm_f_max=_SIM_FORCE,
         arm_m_max=_SIM_TORQUE,
         # 37.5 × 55 cm. Its cupboard's walls alone bound its arm: the regions lie just outside.
-        tip_region=box(-0.30, 0.40, -0.30, 0.30),
+        tip_region=box(-0.35, 0.40, -0.30, 0.30),
         pivot_region=box(-0.50, 0.40, -0.45, 0.45),
         # Only its straight line is slowed, and by the strategy: burrow arrives at full speed.
         disabled=frozenset({Check.SLOW_DOWN}),

@@ -1,0 +1,146 @@
+"""Whatever comes in, what goes out is finite and within limits (row 18 of the fault table).
+
+100,000 inputs in the ordinary run; the million of the fault table is had by
+`REACH_RANDOM_INPUTS=1000000 pytest tests/reach/test_gate_random.py`.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from reachd.limits import ROUNDING, approach_left, load, workspace_constraints
+from reachd.parameters import SETS
+from reachd.safety import SafetyGate
+from reachd.safety_settings import MOVING_MODES, Check, SafetySettings
+from reachd.seam import ZERO, ArmState, Goal, Touch, Twist
+from tactile_bus.geometry import Side
+from tactile_bus.instant import Instant
+
+INPUTS = int(os.environ.get("REACH_RANDOM_INPUTS", "100000"))
+BLOCK = 50_000
+ODD = np.array([math.nan, math.inf, -math.inf, 1.7e308, -1.7e308, 5e-324, -0.0, 1e30])
+
+
+def numbers(rng: np.random.Generator, n: int, scale: float, odd: float) -> list[float]:
+    """Normal numbers over three decades, a part ``odd`` of them nasty."""
+    values = rng.normal(0.0, scale, n) * 10.0 ** rng.uniform(-2, 1, n)
+    nasty = rng.random(n) < odd
+    values[nasty] = rng.choice(ODD, nasty.sum())
+    return values.tolist()
+
+
+def ages(rng: np.random.Generator, n: int, usual: float) -> list[int]:
+    """ns: mostly fresh, some old, some from the future."""
+    values = rng.exponential(usual, n)
+    values[rng.random(n) < 0.01] *= 100
+    values[rng.random(n) < 0.005] *= -50
+    return (values * 1e9).astype(np.int64).tolist()
+
+
+def check(
+    gate: SafetyGate, s: SafetySettings, arm: ArmState, twist: Twist, last: Twist, dt: float
+) -> None:
+    """Every promise of a twist that went out."""
+    parts = (twist.vx, twist.vy, twist.omega)
+    assert all(map(math.isfinite, parts))
+    if twist == ZERO:
+        return
+    assert gate.armed
+    assert arm.mode in MOVING_MODES
+    assert math.hypot(twist.vx, twist.vy) <= s.speed * (1 + 1e-9)
+    assert abs(twist.omega) <= s.turn_rate * (1 + 1e-9)
+    for rule in workspace_constraints(arm, s):
+        assert rule.along(twist) <= rule.bound + 2 * ROUNDING
+    left = approach_left(load(arm, s), s.soft_fraction)
+    force = math.hypot(arm.fx, arm.fy)
+    if left == 0.0:
+        inward = -(arm.fx * twist.vx + arm.fy * twist.vy) / force if force else 0.0
+        assert inward <= 2 * ROUNDING
+        assert -arm.mz * twist.omega <= 2 * ROUNDING * abs(arm.mz)
+    if left == 1.0 and all(rule.bound > 0.2 for rule in workspace_constraints(arm, s)):
+        step = math.hypot(twist.vx - last.vx, twist.vy - last.vy)
+        assert step <= s.acceleration * dt + 1e-12
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_random_inputs(name: str, make_touch: Callable) -> None:
+    s = SETS[name].safety
+    limits = s.arm_limits
+    rng = np.random.default_rng(20240)
+    gate = SafetyGate(s)
+    now, moved, latches = 10**12, 0, 0
+    last = ZERO
+    for _ in range(0, INPUTS // len(SETS), BLOCK):
+        n = min(BLOCK, INPUTS // len(SETS))
+        columns = zip(
+            numbers(rng, n, 0.1, 0.002),
+            numbers(rng, n, 0.1, 0.002),
+            numbers(rng, n, 0.3, 0.002),
+            rng.uniform(-0.5, 0.4, n).tolist(),
+            rng.uniform(-0.4, 0.4, n).tolist(),
+            rng.uniform(-7, 7, n).tolist(),
+            numbers(rng, n, 8.0, 0.002),
+            numbers(rng, n, 8.0, 0.002),
+            numbers(rng, n, 2.0, 0.002),
+            rng.choice(["ready", "moving", "stopped", "estop", "x"], n, p=P_MODE).tolist(),
+            numbers(rng, n, 5.0, 0.002),
+            (rng.random(n) < 0.98).tolist(),
+            ages(rng, n, 0.01),
+            ages(rng, n, 0.004),
+            np.maximum(rng.normal(0.01, 0.003, n) * 1e9, -1e6).astype(np.int64).tolist(),
+            np.where(rng.random(n) < 0.01, 0.1, 0.0).tolist(),
+            (rng.random(n) < 0.002).tolist(),
+            strict=True,
+        )
+        for vx, vy, w, x, y, h, fx, fy, mz, mode, f, ok, old, stale, dt, late, double in columns:
+            now += dt
+            at, seen = Instant(now - old), Instant(now - stale)
+            touch = Touch(at, at, ok, f, Side.LEFT, x, y, f, f)
+            arm = ArmState(
+                seen, seen, x, y, h, ZERO, fx, fy, mz, mode,
+                limits.v_max, limits.omega_max, limits.f_max, limits.m_max,
+            )  # fmt: skip
+            decision = gate.step(
+                Twist(vx, vy, w), touch, arm, GOAL, Instant(now), lateness=late, duplicate=double
+            )
+            check(gate, s, arm, decision.twist, last, max(dt, 0) / 1e9)
+            last = decision.twist
+            moved += decision.twist != ZERO
+            if decision.held is not None:
+                latches += 1
+                calm = ArmState(
+                    Instant(now), Instant(now), 0.0, 0.0, 0.0, ZERO, 0.0, 0.0, 0.0, "ready",
+                    limits.v_max, limits.omega_max, limits.f_max, limits.m_max,
+                )  # fmt: skip
+                gate.arm(Instant(now + 1), make_touch(Instant(now)), calm, Instant(now + 1))
+    assert moved > INPUTS // len(SETS) // 5, "the test must let things move"
+    assert latches > INPUTS // len(SETS) // 200
+
+
+GOAL = Goal(0.3, 0.0, 0.0075, 40.0)
+P_MODE = [0.4, 0.57, 0.015, 0.01, 0.005]
+
+
+def test_random_commands_with_every_limit_off_are_finite(
+    make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
+) -> None:
+    from dataclasses import replace
+
+    from reachd.safety_settings import ALWAYS_ON
+
+    off = replace(settings, disabled=frozenset(Check) - ALWAYS_ON)
+    gate = make_gate(off)
+    rng = np.random.default_rng(3)
+    now = Instant(5_000_000_000)
+    for vx, vy, w in zip(*(numbers(rng, 3000, 1.0, 0.3) for _ in range(3)), strict=True):
+        decision = gate.step(Twist(vx, vy, w), make_touch(now), make_arm(now), None, now)
+        out = decision.twist
+        assert all(map(math.isfinite, (out.vx, out.vy, out.omega)))
+        if not gate.armed:
+            now = Instant(now + 1)
+            assert gate.arm(now, make_touch(now), make_arm(now), now) == ()
