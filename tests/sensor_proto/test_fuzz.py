@@ -45,6 +45,13 @@ def test_a_seed_says_everything() -> None:
 
 
 @pytest.mark.usefixtures("small_blocks")
+def test_the_number_of_processes_changes_nothing() -> None:
+    alone, together = (fuzz.run_fuzz(3500, seed=5, jobs=jobs) for jobs in (1, 2))
+    del alone["seconds"], together["seconds"]
+    assert alone == together
+
+
+@pytest.mark.usefixtures("small_blocks")
 def test_a_decoder_without_a_crc_would_be_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(packet, "intact", lambda packets: [True] * len(packets))
     result = fuzz.run_fuzz(6000, seed=1)
