@@ -8,6 +8,7 @@ and the normal force is ``-z``.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -83,7 +84,7 @@ class SkinGeometry:
     def slices(self) -> tuple[slice, ...]:
         """Where each array stands in arrays that hold all taxels one after another."""
         ends = np.cumsum([0, *(a.taxels for a in self.arrays)]).tolist()
-        return tuple(slice(a, b) for a, b in zip(ends, ends[1:], strict=False))
+        return tuple(slice(a, b) for a, b in itertools.pairwise(ends))
 
 
 def grid_on_plane(

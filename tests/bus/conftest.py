@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from tactile_bus import topics
+from tactile_bus.markers import CYLINDER, marker
 from tactile_bus.mcap_file import DiskStorage
 from tactile_bus.messages import MSG, codec, diagnostic_status, header, log_message
 from tactile_bus.recorder import Recorder, RecorderSettings
@@ -27,6 +28,7 @@ def example_messages() -> dict[topics.Topic, Any]:
     """One message of every topic, with values that tell fields apart."""
     head = header(WALL_NS, "ee")
     vector, point = MSG.Vector3(0.5, -1.5, 2.25), MSG.Point(0.125, 0.25, -0.5)
+    twist, wrench = MSG.Twist(vector, vector), MSG.Wrench(vector, vector)
     f32, u8, u16 = np.float32, np.uint8, np.uint16
     return {
         topics.FEATURES: MSG.ContactFeatures(
@@ -57,6 +59,27 @@ def example_messages() -> dict[topics.Topic, Any]:
             header(WALL_NS, ""), [diagnostic_status("b0", 1, "ok", "0011", {"drops.crc": 5})]
         ),
         topics.LOG: log_message(WALL_NS, 30, "b0", "grüße"),
+        topics.ARM_STATE: MSG.ArmState(
+            header(WALL_NS, "cupboard"), 1, 2, 0.1, -0.2, 0.3, twist, wrench,
+            "moving", 0.05, 0.35, 10.0, 1.5,
+        ),
+        topics.COMMAND: MSG.TwistStamped(header(WALL_NS, "cupboard"), twist),
+        topics.REACH_STATE: MSG.ReachState(
+            header(WALL_NS, "cupboard"), 1, 2, "reaching", "burrow", "hybrid_event",
+            MSG.Point(0.358, 0.03, 0.0), 0.0075, 0.2, 3.5, twist, twist, True, "",
+            ["wrench"], 0.25, 0.125, 0.0625,
+        ),
+        topics.REACH_EVENT: MSG.ReachEvent(
+            header(WALL_NS, ""), 1, "excavation", "ccw", "push at the tip"
+        ),
+        topics.WORLD: MSG.MarkerArray(
+            [
+                marker(
+                    WALL_NS, "cupboard", "objects", 3, CYLINDER,
+                    (0.1, 0.2, 0.06, 0.5), (0.08, 0.08, 0.12), (0.1, 0.2, 0.3, 1.0),
+                )
+            ]
+        ),
     }  # fmt: skip
 
 
@@ -158,9 +181,10 @@ def record(disk: FragileDisk) -> Iterator[Callable[..., Recorder]]:
     """``record(path, **settings)``: a recorder on ``disk`` with quick flushes, closed at last."""
     recorders = []
 
-    def start(path: Path, **settings: Any) -> Recorder:
+    def start(path: Path, prefix: str = "tactile", **settings: Any) -> Recorder:
         quick = {"flush_period": 0.05, "retry_seconds": 0.05, "min_free_bytes": 0} | settings
-        recorders.append(Recorder(path, RecorderSettings(**quick), storage=disk))
+        log = Recorder(path, RecorderSettings(**quick), prefix=prefix, storage=disk)
+        recorders.append(log)
         return recorders[-1]
 
     yield start
