@@ -99,7 +99,7 @@ class LogWriter:
         self._new_latched: dict[int, Item] = {}
         self._channels: dict[int, Channel] = {}
         self._extras: dict[tuple[str, str], Callable[[McapFile], None]] = {}
-        self._unwritten: list[tuple[str, str]] = []
+        self._unwritten: dict[tuple[str, str], None] = {}  # in the order they came
         self._schemas: dict[str, int] = {}
         self._in_file: set[int] = set()
         self._file: McapFile | None = None
@@ -130,7 +130,7 @@ class LogWriter:
     def set_metadata(self, name: str, values: dict[str, str]) -> None:
         """A table of texts for this and every later file."""
         self._extras["metadata", name] = lambda file: file.add_metadata(name, values)
-        self._unwritten.append(("metadata", name))
+        self._unwritten["metadata", name] = None
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
         """A file to embed in this and every later file."""
@@ -138,17 +138,20 @@ class LogWriter:
         self._extras["attachment", name] = lambda file: file.add_attachment(
             name, media_type, data, now_ns, now_ns
         )
-        self._unwritten.append(("attachment", name))
+        self._unwritten["attachment", name] = None
 
     def open_first(self) -> None:
         """Open the first file; OSError when that fails, FileExistsError when it is there."""
         self._open()
+        enforce(self._set, self._settings.max_files, self._settings.max_bytes)
 
     def add(self, item: Item) -> None:
         """Take one message into the chunk to come; flushes when that is full."""
         channel = item.channel
         self._channels[channel.number] = channel
-        if channel.topic.latched and len(self._latched) < LATCHED_MAX:
+        if channel.topic.latched and (
+            channel.number in self._latched or len(self._latched) < LATCHED_MAX
+        ):
             self._new_latched[channel.number] = item
         self._chunk.add(channel.number, item.sequence, item.log_ns, item.publish_ns, item.data)
         if len(self._chunk.data) >= self._settings.chunk_bytes:
@@ -237,9 +240,9 @@ class LogWriter:
         file = self._file
         if file is None:
             return
-        while self._unwritten:
-            self._extras[self._unwritten[0]](file)
-            del self._unwritten[0]
+        for extra in tuple(self._unwritten):
+            self._extras[extra](file)
+            del self._unwritten[extra]
         for reason in self.gaps:
             file.add_metadata(GAP, self.gaps[reason].metadata(reason))
             del self.gaps[reason]

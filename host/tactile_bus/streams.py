@@ -17,7 +17,7 @@ ATTACHMENT = struct.Struct("<qqB16s")
 
 
 class Publisher:
-    """One stream that drops when a link is full and never blocks for a stopped subscriber."""
+    """One stream, for one thread; drops when a link is full, never waits for a subscriber."""
 
     def __init__(self, session: zenoh.Session, key: str, msgtype: str) -> None:
         encoding = zenoh.Encoding.APPLICATION_CDR.with_schema(msgtype)

@@ -347,6 +347,44 @@ def test_retention_keeps_the_newest_and_the_current(
     assert stranger.exists()
 
 
+def test_retention_starts_with_what_earlier_runs_left(
+    tmp_path: Path, record: Any, payloads: Any, disk: Any
+) -> None:
+    old = []
+    for year in (2001, 2002, 2003):
+        first = record(tmp_path / "x.mcap")
+        first.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
+        first.close(10)
+        old.append(tmp_path / f"tactile_{year}0101T000000Z_0000.mcap")
+        (tmp_path / "x.mcap").rename(old[-1])
+    # The last run was killed: its file has no summary, but it can be read.
+    data = old[-1].read_bytes()
+    old[-1].write_bytes(data[: len(data) - 100])
+    recorder = record(tmp_path, max_files=2)
+    assert not old[0].exists()
+    assert not old[1].exists()
+    assert old[2].exists()
+    assert Path(recorder.stats.path).exists()
+
+
+def test_nothing_is_deleted_when_the_newest_cannot_be_read(
+    tmp_path: Path, record: Any, caplog: Any
+) -> None:
+    old = [tmp_path / f"tactile_{year}0101T000000Z_0000.mcap" for year in (2001, 2002, 2003)]
+    for path in old:
+        path.write_bytes(bytes(1000))
+    record(tmp_path, max_files=1)
+    assert all(path.exists() for path in old)
+    assert "nothing is deleted" in caplog.text
+
+
+def test_a_file_that_another_process_writes_is_not_deleted(tmp_path: Path, record: Any) -> None:
+    other = record(tmp_path)
+    time.sleep(1.1)  # names have whole seconds
+    record(tmp_path, max_files=1)
+    assert Path(other.stats.path).exists()
+
+
 def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(b"precious")
