@@ -76,7 +76,7 @@ def example_messages() -> dict[topics.Topic, Any]:
             [
                 marker(
                     WALL_NS, "cupboard", "objects", 3, CYLINDER,
-                    (0.1, 0.2, 0.06, 0.5), (0.08, 0.08, 0.12), (0.1, 0.2, 0.3, 1.0),
+                    (0.1, 0.2, 0.06, 0.5), (0.08, 0.08, 0.12), (0.25, 0.5, 0.75, 1.0),
                 )
             ]
         ),
@@ -181,10 +181,9 @@ def record(disk: FragileDisk) -> Iterator[Callable[..., Recorder]]:
     """``record(path, **settings)``: a recorder on ``disk`` with quick flushes, closed at last."""
     recorders = []
 
-    def start(path: Path, prefix: str = "tactile", **settings: Any) -> Recorder:
+    def start(path: Path, **settings: Any) -> Recorder:
         quick = {"flush_period": 0.05, "retry_seconds": 0.05, "min_free_bytes": 0} | settings
-        log = Recorder(path, RecorderSettings(**quick), prefix=prefix, storage=disk)
-        recorders.append(log)
+        recorders.append(Recorder(path, RecorderSettings(**quick), storage=disk))
         return recorders[-1]
 
     yield start
