@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -26,6 +28,10 @@ corner of an edge apart, and corners wander by v_max × a control period = 0.5 m
 
 class WorldError(RuntimeError):
     """The physics diverged or overflowed: this trial is worth nothing."""
+
+
+Touch = tuple[int, float, float, float, float, float, float]
+"""One of an engine's points: body; place x, y m, outward normal x, y, force x, y N, in ``ee``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,45 +142,42 @@ def substeps(dt: float) -> int:
     return count
 
 
-def merge_contacts(rows: Float, bodies: NDArray[np.int64], count: int) -> list[FingerContact]:
-    """Contacts from touches of ``count`` physics steps.
+def merge_touches(touches: Sequence[Touch], count: int) -> tuple[FingerContact, ...]:
+    """Contacts from the touches of ``count`` physics steps.
 
-    ``rows``: (k, 6) x, y, normal x, y, force x, y in ``ee``; ``bodies``: (k,). Touches of one
-    body within `MERGE_RADIUS` of each other become one: forces summed and divided by ``count``,
-    place and normal weighted by normal force.
+    Touches of one body within `MERGE_RADIUS` of each other become one: forces summed and divided
+    by ``count``, place and normal weighted by normal force. Touches that do not press are left out.
     """
-    normal = np.maximum(-(rows[:, 4] * rows[:, 2] + rows[:, 5] * rows[:, 3]), 0.0)
-    open_groups: list[list[float]] = []
+    groups: list[list[float]] = []  # weight; then weighted x, y, normal x, y; then force x, y
     owners: list[int] = []
-    for (x, y, nx, ny, fx, fy), weight, body in zip(
-        rows.tolist(), normal.tolist(), bodies.tolist(), strict=True
-    ):
+    for body, x, y, nx, ny, fx, fy in touches:
+        weight = -(fx * nx + fy * ny)
         if weight <= 0.0:
             continue
-        for group, owner in zip(open_groups, owners, strict=True):
-            total = group[6]
-            dx, dy = x - group[0] / total, y - group[1] / total
+        for group, owner in zip(groups, owners, strict=True):
+            dx, dy = x - group[1] / group[0], y - group[2] / group[0]
             if owner == body and dx * dx + dy * dy < MERGE_RADIUS**2:
                 break
         else:
             group = [0.0] * 7
-            open_groups.append(group)
+            groups.append(group)
             owners.append(body)
-        for index, value in enumerate((x * weight, y * weight, nx * weight, ny * weight, fx, fy)):
-            group[index] += value
-        group[6] += weight
-    contacts = []
-    for (x, y, nx, ny, fx, fy, weight), body in zip(open_groups, owners, strict=True):
-        length = float(np.hypot(nx, ny))
-        contacts.append(
-            FingerContact(
-                x=x / weight,
-                y=y / weight,
-                normal_x=nx / length,
-                normal_y=ny / length,
-                force_x=fx / count,
-                force_y=fy / count,
-                body=body,
-            )
+        group[0] += weight
+        group[1] += weight * x
+        group[2] += weight * y
+        group[3] += weight * nx
+        group[4] += weight * ny
+        group[5] += fx
+        group[6] += fy
+    return tuple(
+        FingerContact(
+            x=x / weight,
+            y=y / weight,
+            normal_x=nx / math.hypot(nx, ny),
+            normal_y=ny / math.hypot(nx, ny),
+            force_x=fx / count,
+            force_y=fy / count,
+            body=body,
         )
-    return contacts
+        for (weight, x, y, nx, ny, fx, fy), body in zip(groups, owners, strict=True)
+    )

@@ -32,7 +32,7 @@ _SCATTER_Y: Final = 0.45
 
 _DISC_SHARE = 0.43
 """Share of cylinders drawn. Places are refused to them more often than to boxes, so that 41 % are
-left, as in the recorded scenes; an even draw would leave 48 % and fill 0.41 of the area, not 0.37."""
+left, as in the recorded scenes; an even draw leaves 48 % and fills 0.41 of the area, not 0.37."""
 
 _SHORT = 0.0003
 """m that plates stop short of the cupboard's bounds, as in the recorded scenes."""

@@ -17,8 +17,9 @@ from sim_device.world.base import (
     FingerContact,
     FingerState,
     Float,
+    Touch,
     WorldError,
-    merge_contacts,
+    merge_touches,
     substeps,
 )
 from sim_device.world.mujoco_model import FINGER_GEOM, cupboard_model, yaw_inertia
@@ -44,7 +45,9 @@ _FATAL = tuple(
 # Otherwise MuJoCo prints, and writes MUJOCO_LOG.TXT wherever the process happens to stand.
 mujoco.set_mju_user_warning(logging.getLogger(__name__).debug)
 
-_Touches = tuple[NDArray[np.int32], Float, Float, Float, NDArray[np.int32], Float, tuple[float, ...]]
+_Touches = tuple[
+    NDArray[np.int32], Float, Float, Float, NDArray[np.int32], Float, tuple[float, ...]
+]
 
 
 class MujocoWorld:
@@ -66,7 +69,7 @@ class MujocoWorld:
         self._mass = np.array([[o.mass, o.mass, yaw_inertia(o)] for o in scene.objects])
         self._finger_mass = (parameters.finger_mass,) * 2 + (parameters.finger_inertia,)
         self._finger_geom = model.geom(FINGER_GEOM).id
-        self._body_of_geom = np.full(model.ngeom, WALL, dtype=np.int64)
+        self._body_of_geom = [WALL] * model.ngeom
         for index in range(n):
             self._body_of_geom[model.geom(f"object_{index}").id] = index
         # Views: MuJoCo never moves these arrays.
@@ -75,6 +78,7 @@ class MujocoWorld:
         self._finger_push = data.qfrc_constraint[-3:]
         self._objects_qpos = data.qpos[: 4 * n].reshape(n, 4)
         self._objects_qvel = data.qvel[: 4 * n].reshape(n, 4)
+        self._warnings = data.warning
         self._start = scene.start
         self._steps = 0
         self._work = 0.0
@@ -112,28 +116,35 @@ class MujocoWorld:
         self._ctrl[:] = (twist.vx, twist.vy, twist.omega)
         self._touches.clear()
         self._contacts = None
-        total_x = total_y = total_m = 0.0
-        before = self._finger_qvel.tolist()
+        mass, _, inertia = self._finger_mass
+        total_x = total_y = total_m = work = 0.0
+        u0, v0, w0 = self._finger_qvel.tolist()
         for _ in range(count):
-            pose = (*self._finger_qpos.tolist(),)
+            pose = tuple(self._finger_qpos.tolist())
             mujoco.mj_step(model, data)
-            after = self._finger_qvel.tolist()
-            push = self._finger_push.tolist()
+            u1, v1, w1 = self._finger_qvel.tolist()
+            fx, fy, mz = self._finger_push.tolist()
             # By momentum, what contacts did not give the finger, its motors did.
-            for inertia, v0, v1, force in zip(self._finger_mass, before, after, push, strict=True):
-                self._work += (inertia * (v1 - v0) - PHYSICS_STEP * force) * (v0 + v1) / 2
-            before = after
-            total_x += push[0]
-            total_y += push[1]
-            total_m += push[2]
-            if push[0] or push[1] or push[2]:
+            work += (
+                (mass * (u1 - u0) - PHYSICS_STEP * fx) * (u0 + u1)
+                + (mass * (v1 - v0) - PHYSICS_STEP * fy) * (v0 + v1)
+                + (inertia * (w1 - w0) - PHYSICS_STEP * mz) * (w0 + w1)
+            )
+            u0, v0, w0 = u1, v1, w1
+            if fx or fy or mz:
+                total_x, total_y, total_m = total_x + fx, total_y + fy, total_m + mz
                 self._keep_touches(pose)
+        self._work += work / 2
         self._steps += count
         self._count = count
         self._wrench = (total_x / count, total_y / count, total_m / count)
-        warnings = data.warning
-        if any(warnings[kind].number for kind in _FATAL):
-            raise WorldError(f"physics gave up at {self.time:.3f} s of {self._scene.source} scene")
+        warnings = self._warnings
+        for kind in _FATAL:
+            if warnings[kind].number:
+                raise WorldError(
+                    f"physics gave up at {self.time:.3f} s of scene {self._scene.seed} "
+                    f"({self._scene.source})"
+                )
 
     def _keep_touches(self, pose: tuple[float, ...]) -> None:
         """Copy what `contacts` will need of this physics step; it may never be asked."""
@@ -164,30 +175,44 @@ class MujocoWorld:
         return self._contacts
 
     def _merged(self) -> tuple[FingerContact, ...]:
-        """Contacts from the touches kept of each physics step."""
-        rows, bodies = [], []
-        for geoms, position, frames, distance, address, forces, pose in self._touches:
-            is_first = geoms[:, 0] == self._finger_geom
-            index = np.flatnonzero((is_first | (geoms[:, 1] == self._finger_geom)) & (address >= 0))
-            if not len(index):
-                continue
-            other = np.where(is_first, geoms[:, 1], geoms[:, 0])[index]
-            # Normals point from the first geom to the second, forces act on the second.
-            sign = np.where(is_first, 1.0, -1.0)[index, None]
-            frame = frames.reshape(-1, 3, 3)[index]
-            force = forces[address[index, None] + np.arange(3)]
-            planar = np.einsum("ki,kij->kj", force, frame)[:, :2] * -sign
-            normal = frame[:, 0, :2] * sign
-            # Half of the depth from the middle of the overlap to the finger's own surface.
-            place = position[index, :2] - normal * distance[index, None] / 2
-            c, s = math.cos(pose[2]), math.sin(pose[2])
-            to_ee = np.array([[c, -s], [s, c]])
-            origin = (pose[0] + self._start.x, pose[1] + self._start.y)
-            rows.append(np.hstack([(place - origin) @ to_ee, normal @ to_ee, planar @ to_ee]))
-            bodies.append(self._body_of_geom[other])
-        if not rows:
-            return ()
-        return tuple(merge_contacts(np.concatenate(rows), np.concatenate(bodies), self._count))
+        """Contacts from the touches kept of each physics step.
+
+        Loops, because a finger touches few things: arrays cost more to make than they save.
+        """
+        me, bodies = self._finger_geom, self._body_of_geom
+        touches: list[Touch] = []
+        for geoms, position, frames, distance, address, forces, (px, py, heading) in self._touches:
+            c, s = math.cos(heading), math.sin(heading)
+            px, py = px + self._start.x, py + self._start.y
+            for index, (first, second) in enumerate(geoms.tolist()):
+                if first != me and second != me:
+                    continue
+                row = int(address[index])
+                if row < 0:
+                    continue
+                # Normals point from the first geom to the second, forces act on the second.
+                sign = 1.0 if first == me else -1.0
+                nx, ny, _, ax, ay, _, bx, by, _ = frames[index].tolist()
+                fn, fa, fb = forces[row : row + 3].tolist()
+                fx = -sign * (fn * nx + fa * ax + fb * bx)
+                fy = -sign * (fn * ny + fa * ay + fb * by)
+                x, y, _ = position[index].tolist()
+                # Half of the depth from the middle of the overlap to the finger's own surface.
+                depth = sign * float(distance[index]) / 2
+                x, y = x - nx * depth - px, y - ny * depth - py
+                nx, ny = sign * nx, sign * ny
+                touches.append(
+                    (
+                        bodies[second if first == me else first],
+                        c * x + s * y,
+                        c * y - s * x,
+                        c * nx + s * ny,
+                        c * ny - s * nx,
+                        c * fx + s * fy,
+                        c * fy - s * fx,
+                    )
+                )
+        return merge_touches(touches, self._count)
 
     def finger(self) -> FingerState:
         """Where the finger is, how it moves and what pushes it."""
@@ -220,11 +245,9 @@ class MujocoWorld:
 
     def kinetic_energy(self) -> float:
         """J, of finger and objects in the plane."""
-        objects = float((self._mass * self._objects_qvel[:, [0, 1, 3]] ** 2).sum())
-        finger = sum(
-            m * v * v for m, v in zip(self._finger_mass, self._finger_qvel.tolist(), strict=True)
-        )
-        return (objects + finger) / 2
+        doubled = float((self._mass * self._objects_qvel[:, [0, 1, 3]] ** 2).sum())
+        doubled += float((np.array(self._finger_mass) * self._finger_qvel**2).sum())
+        return doubled / 2
 
     @property
     def motor_work(self) -> float:
