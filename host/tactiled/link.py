@@ -97,11 +97,14 @@ class State(Enum):
     REFUSED = auto()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class _Array:
     index: int  # place in the descriptor
     taxels: int
     scale: NDArray[np.float64]  # (3,) µT per count
+    captured: (
+        Instant  # of the last samples: later ones are not stamped earlier, whatever their ticks
+    )
 
 
 class BoardLink:
@@ -295,10 +298,11 @@ class BoardLink:
             self.clock = ClockMap(message.tick_hz)
         else:
             self.clock.restart()
-        self._arrays.clear()
+        before, self._arrays = self._arrays, {}
         for index, a in enumerate(message.arrays):
             scale = np.array([a.lsb_xy_nt, a.lsb_xy_nt, a.lsb_z_nt]) * 1e-3
-            self._arrays[a.array] = _Array(index, a.taxels, scale)
+            last = before[a.array].captured if a.array in before else Instant(0)
+            self._arrays[a.array] = _Array(index, a.taxels, scale, last)
             tracker = self.trackers.setdefault(a.array, SequenceTracker())
             if rebooted:
                 tracker.restart()
@@ -379,6 +383,8 @@ class BoardLink:
             return []
         self.clock.arrived(message.ticks, arrival)
         stamp = self.clock.stamp(message.ticks, arrival)
+        captured = max(stamp.captured, min(array.captured, arrival))
+        array.captured = Instant(captured)
         events: list[Event] = []
         if self._silent or self._resuming:
             events.append(Resumed(seconds_between(self._last_sample, arrival)))
@@ -386,9 +392,9 @@ class BoardLink:
         block = SampleBlock(
             array=array.index,
             sequence=message.sequence,
-            captured=stamp.captured,
+            captured=array.captured,
             received=arrival,
-            uncertainty=stamp.uncertainty,
+            uncertainty=stamp.uncertainty + seconds_between(stamp.captured, array.captured),
             field_ut=message.field * array.scale,
             temperature_c=np.array([message.temperature_cc / 100]),
             status=message.status,

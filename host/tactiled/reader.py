@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import os
 import threading
+from collections import deque
 from collections.abc import Callable
 
+from tactiled.blocks import Chunk
 from tactiled.inbox import Inbox, PortEnded, PortLost, PortOpened
 from tactiled.outlet import Outlet
 from tactiled.transports import EndOfLog, PortClosed, Transport, TransportError
@@ -22,6 +24,12 @@ REOPEN_FIRST = 0.05
 
 REOPEN_SLOWEST = 0.5
 """s between attempts: data must be back 2 s after a replug."""
+
+LOG_DELAY = 0.003
+"""s for which the log of a chunk waits: the pipeline works on it first, undisturbed."""
+
+LOG_BATCH = 32
+"""Chunks that may wait so, when they come faster than that."""
 
 PACE = 0.002
 """s between looks whether the pipeline has caught up with a recording."""
@@ -59,6 +67,7 @@ class PortReader:
         self.name = name
         self._failed = failed
         self._paced = paced
+        self._waiting: deque[Chunk] = deque()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"read-{name}", daemon=True)
 
@@ -96,15 +105,17 @@ class PortReader:
             self._failed(error)
 
     def _read_until_lost(self) -> None:
-        transport, inbox, outlet = self.transport, self._inbox, self._outlet
+        transport, inbox, waiting = self.transport, self._inbox, self._waiting
         try:
             while True:
-                chunk = transport.read(READ_TIMEOUT)
+                chunk = transport.read(LOG_DELAY if waiting else READ_TIMEOUT)
                 if chunk is not None:
                     while self._paced and inbox.full and not self._stopping.wait(PACE):
                         pass
                     inbox.put(chunk)
-                    outlet.raw(self.name, transport.name, chunk)
+                    waiting.append(chunk)
+                if chunk is None or len(waiting) >= LOG_BATCH:
+                    self._log_waiting()
         except EndOfLog:
             raise
         except PortClosed:
@@ -112,6 +123,12 @@ class PortReader:
         except TransportError as error:
             if not self._stopping.is_set():
                 inbox.put(PortLost(str(error)))
+        finally:
+            self._log_waiting()
+
+    def _log_waiting(self) -> None:
+        while self._waiting:
+            self._outlet.raw(self.name, self.transport.name, self._waiting.popleft())
 
     def _reopen(self) -> None:
         wait, said = REOPEN_FIRST, ""

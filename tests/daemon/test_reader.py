@@ -1,0 +1,163 @@
+"""The reader's thread against a transport that does as told."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from tactile_bus.instant import Instant
+from tactiled.blocks import Chunk
+from tactiled.inbox import Inbox, PortEnded, PortLost, PortOpened, Wake
+from tactiled.reader import PortReader, byte_time
+from tactiled.transports import (
+    BusState,
+    EndOfLog,
+    Medium,
+    PortBusy,
+    PortClosed,
+    PortGone,
+    PortMissing,
+)
+
+
+class ScriptedTransport:
+    """Reads come from a queue: chunks, or errors to raise; openings likewise."""
+
+    name = "scripted"
+    medium = Medium.SERIAL
+    state = BusState.ACTIVE
+    losses: dict[str, int] = {}  # noqa: RUF012 - never changed
+
+    def __init__(self) -> None:
+        self.reads: queue.Queue[Chunk | Exception] = queue.Queue()
+        self.openings: list[Exception] = []
+        self.opened = 0
+        self._closed = threading.Event()
+
+    def open(self) -> None:
+        if self.openings:
+            raise self.openings.pop(0)
+        self.opened += 1
+
+    def read(self, timeout: float) -> Chunk | None:
+        if self._closed.is_set() or not self.opened:
+            raise PortClosed("closed")
+        try:
+            item = self.reads.get(timeout=timeout)
+        except queue.Empty:
+            return None
+        if isinstance(item, Exception):
+            raise item
+        return item
+
+    def write(self, data: Any) -> None:
+        raise AssertionError("a reader does not write")
+
+    def close(self) -> None:
+        self._closed.set()
+
+
+class RawLog:
+    """Stands in for the outlet: keeps what a reader logs."""
+
+    def __init__(self) -> None:
+        self.chunks: list[Chunk] = []
+
+    def raw(self, name: str, port: str, chunk: Chunk) -> None:
+        self.chunks.append(chunk)
+
+
+class Rig:
+    def __init__(self, paced: bool = False, limit: int = 100) -> None:
+        self.transport = ScriptedTransport()
+        self.inbox = Inbox(Wake(), limit)
+        self.log = RawLog()
+        self.failures: list[BaseException] = []
+        outlet: Any = self.log
+        self.reader = PortReader(
+            self.transport, self.inbox, outlet, "b", self.failures.append, paced
+        )
+
+    def next(self) -> Any:
+        end = time.monotonic() + 10
+        while (item := self.inbox.take()) is None:
+            assert time.monotonic() < end
+            time.sleep(0.002)
+        return item
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    made = Rig()
+    yield made
+    made.reader.stop()
+
+
+def test_chunks_are_handed_over_and_logged(rig: Rig, instant: Callable[[float], Instant]) -> None:
+    chunks = [Chunk(instant(k), bytes([k])) for k in range(100)]
+    for chunk in chunks:
+        rig.transport.reads.put(chunk)
+    rig.reader.open(wait=False)
+    rig.reader.start()
+    assert rig.next() == PortOpened()
+    assert [rig.next() for _ in chunks] == chunks
+    assert rig.reader.stop()
+    assert rig.log.chunks == chunks
+
+
+def test_a_port_that_vanishes_is_told_and_opened_again(rig: Rig) -> None:
+    rig.reader.open(wait=False)
+    rig.reader.start()
+    assert rig.next() == PortOpened()
+    rig.transport.openings = [PortMissing("not yet"), PortBusy("not yet")]
+    rig.transport.reads.put(PortGone("unplugged", "plug it in"))
+    assert rig.next() == PortLost("unplugged; plug it in")
+    assert rig.next() == PortOpened()
+    assert rig.reader.reopened == 1
+    assert not rig.failures
+
+
+def test_a_port_missing_at_the_start_is_an_error_or_waited_for(rig: Rig) -> None:
+    rig.transport.openings = [PortMissing("no port"), PortMissing("no port")]
+    with pytest.raises(PortMissing):
+        rig.reader.open(wait=False)
+    rig.reader.open(wait=True)
+    rig.reader.start()
+    assert rig.next() == PortOpened()
+
+
+def test_what_a_reader_dies_of_is_told(rig: Rig) -> None:
+    rig.reader.open(wait=False)
+    rig.transport.reads.put(RuntimeError("driver"))
+    rig.reader.start()
+    end = time.monotonic() + 10
+    while not rig.failures:
+        assert time.monotonic() < end
+        time.sleep(0.002)
+    assert str(rig.failures[0]) == "driver"
+
+
+def test_a_recording_waits_for_the_pipeline_and_ends(instant: Callable[[float], Instant]) -> None:
+    rig = Rig(paced=True, limit=4)
+    chunks = [Chunk(instant(k), bytes([k])) for k in range(50)]
+    for chunk in chunks:
+        rig.transport.reads.put(chunk)
+    rig.transport.reads.put(EndOfLog("end"))
+    rig.reader.open(wait=False)
+    rig.reader.start()
+    items = [rig.next() for _ in range(52)]
+    assert items == [PortOpened(), *chunks, PortEnded()]
+    assert rig.inbox.dropped == 0
+    rig.reader.stop()
+
+
+def test_only_a_uart_takes_time_on_the_wire() -> None:
+    assert byte_time("/dev/ttyUSB0", 115_200) == pytest.approx(86.8e-6, rel=1e-3)
+    assert byte_time("/dev/ttyACM0", 115_200) == 0
+    assert byte_time("/dev/pts/3", 115_200) == 0
+    assert byte_time(None, 115_200) == 0
