@@ -124,7 +124,10 @@ class SlcanDecoder:
         self.answers.clear()
 
     def feed(self, data: bytes) -> list[CanFrame]:
-        """Frames completed by ``data``, in order; errors and states as SocketCAN error frames."""
+        """Frames completed by ``data``, in order.
+
+        Errors, states and answers to ``F`` are SocketCAN error frames among them.
+        """
         parts = _ENDS.split(bytes(self._buffer) + data)
         frames: list[CanFrame] = []
         for line, end in zip(parts[:-1:2], parts[1::2], strict=True):
@@ -152,6 +155,9 @@ class SlcanDecoder:
             pass  # "sent", of adapters with automatic polling
         elif not line or line[:1] in b"VvNF":
             self.answers.append(line)
+            state = state_of_flags(line)
+            if state is not None:  # in its place among the lines, or an old answer would undo news
+                frames.append(can_errors.state_frame(state))
         else:
             self._counts[Rejected.MALFORMED] += 1
 

@@ -16,6 +16,8 @@ from sensor_proto.canseg import CanFrame
 if TYPE_CHECKING:
     import can
 
+log = logging.getLogger(__name__)
+
 FORM = "INTERFACE:CHANNEL[@BITRATE[/DATA_BITRATE]][+fd], as in socketcan:can0, \
 slcan:/dev/ttyACM1@1000000, virtual:0"
 
@@ -102,6 +104,8 @@ def open_bus(spec: CanSpec) -> can.BusABC:
     options: dict[str, object] = {}
     if spec.interface == "socketcan":
         _check_link(spec.channel)
+        if spec.bitrate is not None:
+            log.warning("%s: the bit rate is not used; `ip link` sets that of a CAN link", spec)
         options["fd"] = spec.fd
     elif spec.interface == "virtual":
         options["rx_queue_size"] = RX_QUEUE

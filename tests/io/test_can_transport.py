@@ -124,6 +124,17 @@ def test_bus_off_is_named_and_left_again(
 
     assert eventually(back)
     assert transport.losses["can_restarts"] >= 1
+    adapter.set_bus_off(True)
+    assert eventually(lambda: transport.read(0.02) and transport.state is BusState.BUS_OFF)
+
+
+def test_bus_off_is_left_also_while_every_board_is_silent(
+    adapter: Any, transport: CanTransport, eventually: Any
+) -> None:
+    adapter.set_bus_off(True)
+    assert eventually(lambda: transport.read(0.02) and transport.state is BusState.BUS_OFF)
+    adapter.set_bus_off(False)
+    assert eventually(lambda: transport.read(0.02) and transport.state is BusState.ACTIVE)
 
 
 def test_bus_off_is_found_on_adapters_that_tell_it_only_when_asked(

@@ -93,13 +93,14 @@ def test_any_chunking_of_the_adapters_bytes_gives_the_same(cuts: list[int]) -> N
     for start, end in pairwise(edges):
         frames += decoder.feed(STREAM[start:end])
     assert frames[:2] == [FRAME, FD_FRAME]
-    assert can_errors.told_state(frames[2]) is BusState.BUS_OFF
-    assert can_errors.names(frames[3]) == (
+    assert can_errors.told_state(frames[2]) is BusState.WARNING
+    assert can_errors.told_state(frames[3]) is BusState.BUS_OFF
+    assert can_errors.names(frames[4]) == (
         "protocol-violation",
         "no-acknowledgement",
         "bus-error",
     )
-    assert len(frames) == 4
+    assert len(frames) == 5
     assert list(decoder.answers) == [b"", b"\a", b"F84"]
     assert decoder.counters == {"standard_id": 1, "malformed_line": 1}
 

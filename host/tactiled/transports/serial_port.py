@@ -211,7 +211,10 @@ def _open_exclusively(device: str, baud: int) -> serial.Serial:
         port.close()
         raise _busy(device, others)
     # flock stops only programs that ask for it; this also stops those that do not.
-    ioctl(port.fileno(), termios.TIOCEXCL)
+    try:
+        ioctl(port.fileno(), termios.TIOCEXCL)
+    except OSError as error:
+        log.debug("%s cannot be made exclusive: %s", device, error)  # flock holds all the same
     return port
 
 

@@ -15,6 +15,7 @@ from sensor_proto.can_errors import BusState
 from sensor_proto.canseg import CanFrame
 from tactile_bus.can_bus import DEFAULT_BITRATE, DEFAULT_DATA_BITRATE, CanSpec
 from tactile_bus.instant import Instant, after, monotonic_now, seconds_between
+from tactiled.blocks import Chunk
 from tactiled.transports.base import PortUnsuitable
 from tactiled.transports.serial_port import SerialTransport
 
@@ -62,13 +63,13 @@ class SlcanLink:
         self.port.open()
         self._decoder.reset()
         self._pending.clear()
+        self._told = BusState.ACTIVE
         try:
             self._open_channel()
         except BaseException:
             self.port.close()
             raise
         self._last = monotonic_now()
-        self._told = BusState.ACTIVE
 
     def close(self) -> None:
         """Close the adapter's channel, then the port."""
@@ -87,8 +88,7 @@ class SlcanLink:
             wait = min(left, SILENCE) if self._tells_flags else left
             chunk = self.port.read(max(0.0, wait))
             if chunk is not None:
-                frames = self._decoder.feed(bytes_of(chunk.payload))
-                frames += self._flag_frames()
+                frames = self._decode(chunk)
                 if frames:
                     self._last = chunk.received
                     return chunk.received, frames
@@ -107,15 +107,18 @@ class SlcanLink:
         """Leave bus-off: the channel is closed and opened again."""
         self.port.write(b"C\rO\r")
 
-    def _flag_frames(self) -> list[CanFrame]:
-        """Error frames for flags that came as answers; other answers are done with."""
-        told = [slcan.state_of_flags(answer) for answer in self._decoder.answers]
-        self._decoder.answers.clear()
+    def _decode(self, chunk: Chunk) -> list[CanFrame]:
+        """Frames of a serial chunk, without those that tell a state once more."""
+        if not isinstance(chunk.payload, bytes):
+            raise TypeError("a serial chunk holds bytes")
         frames = []
-        for state in told:
-            if state is not None and state is not self._told:
-                frames.append(can_errors.state_frame(state))
-                self._told = state
+        for frame in self._decoder.feed(chunk.payload):
+            state = can_errors.told_state(frame) if frame.error else None
+            if state is None or state is not self._told:
+                frames.append(frame)
+            if not frame.error and self._told is BusState.BUS_OFF:
+                state = BusState.ACTIVE  # nothing comes in during bus-off
+            self._told = state or self._told
         return frames
 
     def _open_channel(self) -> None:
@@ -154,12 +157,5 @@ class SlcanLink:
             chunk = self.port.read(left) if left > 0 else None
             if chunk is None:
                 break
-            self._pending += self._decoder.feed(bytes_of(chunk.payload))
+            self._pending += self._decode(chunk)
         return self._decoder.answers[-1] if self._decoder.answers else None
-
-
-def bytes_of(payload: bytes | tuple[CanFrame, ...]) -> bytes:
-    """Payload of a serial chunk; TypeError for CAN frames."""
-    if isinstance(payload, bytes):
-        return payload
-    raise TypeError("a serial chunk holds bytes")
