@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 from reachd.safety_settings import SafetySettings
 from reachd.seam import ArmState, Twist
-from reachd.workspace import Region
 
 ROUNDING = 1e-12
 """m/s, rad/s: what floating point leaves of a component that was taken away."""
@@ -69,29 +68,39 @@ def within_acceleration(twist: Twist, last: Twist, dv: float, dw: float) -> Twis
     return Twist(last.vx + ax * part, last.vy + ay * part, last.omega + turn)
 
 
-def workspace_constraints(arm: ArmState, settings: SafetySettings) -> list[Constraint]:
-    """What keeps tip and pivot inside their regions.
+def workspace_constraints(
+    arm: ArmState, settings: SafetySettings, fastest: float = math.inf
+) -> list[Constraint]:
+    """What keeps tip and pivot inside their regions, as far as it binds at ``fastest`` (m/s).
 
     The speed towards a border is at most the distance left over a time constant, which is so long
     that with the oldest state and a command kept for its whole life the point comes to rest inside.
     Outside, only the way back is open.
     """
     horizon = NO_OVERSHOOT * (settings.arm_age + settings.command_expiry)
-    c = settings.tip_length * math.cos(arm.heading)
-    s = settings.tip_length * math.sin(arm.heading)
+    matters = fastest * horizon
     found = []
-    points: tuple[tuple[Region, float, float], ...] = (
-        (settings.tip_region, c, s),
+    for region, rx, ry in (
+        (
+            settings.tip_region,
+            settings.tip_length * math.cos(arm.heading),
+            settings.tip_length * math.sin(arm.heading),
+        ),
         (settings.pivot_region, 0.0, 0.0),
-    )
-    for region, rx, ry in points:
+    ):
         x, y = arm.x + rx, arm.y + ry
         for b in region.borders:
             depth = b.offset - b.nx * x - b.ny * y
-            # The point's velocity is that of the pivot plus ω ẑ × r = ω·(−r_y, r_x).
-            bound = max(0.0, depth) / horizon
-            found.append(Constraint(b.nx, b.ny, b.ny * rx - b.nx * ry, bound))
+            if depth < matters:
+                # The point's velocity is that of the pivot plus ω ẑ × r = ω·(−r_y, r_x).
+                bound = max(0.0, depth) / horizon
+                found.append(Constraint(b.nx, b.ny, b.ny * rx - b.nx * ry, bound))
     return found
+
+
+def fastest_point(twist: Twist, settings: SafetySettings) -> float:
+    """Speed (m/s) that neither tip nor pivot exceeds."""
+    return math.hypot(twist.vx, twist.vy) + settings.tip_length * abs(twist.omega)
 
 
 def load(arm: ArmState, settings: SafetySettings) -> float:
@@ -131,7 +140,7 @@ def constrained(twist: Twist, constraints: list[Constraint]) -> Twist:
     border; then the turning; and where less turning would need a velocity that turns back, the
     whole twist is scaled.
     """
-    if not any(rule.broken_by(twist) for rule in constraints):
+    if not constraints or not any(rule.broken_by(twist) for rule in constraints):
         return twist
     omega = twist.omega
     room = [(rule, max(0.0, rule.bound - rule.nw * omega)) for rule in constraints]

@@ -10,9 +10,11 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from reachd.finite import finite, usable
 from reachd.limits import (
     approach_left,
     constrained,
+    fastest_point,
     load,
     within_acceleration,
     within_speed,
@@ -21,7 +23,7 @@ from reachd.limits import (
 )
 from reachd.safety_settings import MOVING_MODES, PAUSED_MODE, Check, SafetySettings
 from reachd.seam import ZERO, ArmState, Goal, Touch, Twist
-from tactile_bus.instant import Instant, after, seconds_between
+from tactile_bus.instant import Instant, seconds_between
 
 Effect = Literal["ignored", "limited", "stopped", "latched", "refused"]
 
@@ -58,6 +60,14 @@ class SafetyGate:
     def __init__(self, settings: SafetySettings) -> None:
         self._settings = settings
         self._off = settings.disabled
+        # Asked in every cycle, and an enum takes its time to be found in a set.
+        self._bounds_speed = Check.SPEED not in self._off
+        self._bounds_turning = Check.TURN_RATE not in self._off
+        self._bounds_acceleration = Check.ACCELERATION not in self._off
+        self._slows = Check.SLOW_DOWN not in self._off
+        self._bounds_workspace = Check.WORKSPACE not in self._off
+        self._bounds_wrench = Check.WRENCH not in self._off
+        self._confirmed: tuple[float, ...] = ()  # limits last read back and found as asked
         self._hold: Intervention | None = Intervention(
             Check.NOT_ARMED, "stopped", "the gate is not armed: arm it by an operator's request"
         )
@@ -151,7 +161,9 @@ class SafetyGate:
         if stops or arm is None or wanted is None:
             return self._stop((*stops, *notes), None)
         twist = self._limited(wanted, arm, goal, passed, notes)
-        if not _finite_twist(twist):  # numbers near the end of the range, with limits disabled
+        if not finite(
+            twist.vx, twist.vy, twist.omega
+        ):  # numbers near the end of the range, with limits disabled
             self._latch(_not_finite(wanted), now)
             return self._stop((_not_finite(wanted),), Check.COMMAND_NOT_FINITE)
         self._last = twist
@@ -175,7 +187,8 @@ class SafetyGate:
         if failure is not None or wanted is None:
             text = f"the strategy failed: {failure or 'it gave no command'}"
             return [Intervention(Check.STRATEGY_FAILED, "latched", text)]
-        return [] if _finite_twist(wanted) else [_not_finite(wanted)]
+        ok = finite(wanted.vx, wanted.vy, wanted.omega)
+        return [] if ok else [_not_finite(wanted)]
 
     def _timing(self, passed: float, lateness: float) -> list[Intervention]:
         """What is wrong with the loop: its own report, and the time since its last step."""
@@ -214,20 +227,22 @@ class SafetyGate:
     ) -> None:
         """Age of the last valid features."""
         s = self._settings
-        if touch is not None and touch.valid and _finite_touch(touch):
-            newest = max(touch.captured, touch.received)
-            if newest > after(now, s.future) and self._on(Check.FEATURES_FUTURE):
-                text = f"features stamped {seconds_between(now, newest):.3f} s ahead are not used"
+        if touch is not None and usable(touch):
+            ahead = seconds_between(now, max(touch.captured, touch.received))
+            if ahead > s.future and self._on(Check.FEATURES_FUTURE):
+                text = f"features stamped {ahead:.3f} s ahead of now are not used"
                 notes.append(Intervention(Check.FEATURES_FUTURE, "ignored", text))
             else:
                 oldest = min(touch.captured, touch.received)
                 self._felt = oldest if self._felt is None else max(self._felt, oldest)
         age = math.inf if self._felt is None else seconds_between(self._felt, now)
+        # One period early, so that zero is sent before the age is reached, not after.
+        if age <= s.features_age - s.period:
+            return
         text = f"no valid features for {age:.3f} s"
         if age > s.features_latch and self._on(Check.FEATURES_LOST):
             faults.append(Intervention(Check.FEATURES_LOST, "latched", text))
-        # One period early, so that zero is sent before the age is reached, not after.
-        if age > s.features_age - s.period and self._on(Check.FEATURES_STALE):
+        if self._on(Check.FEATURES_STALE):
             stops.append(Intervention(Check.FEATURES_STALE, "stopped", text))
 
     def _arm_state(
@@ -239,22 +254,21 @@ class SafetyGate:
     ) -> None:
         """Age, sanity and mode of the arm's state, and the limits it confirms."""
         s = self._settings
-        age = math.inf
-        if arm is not None:
-            age = seconds_between(Instant(min(arm.captured, arm.received)), now)
-            newest = max(arm.captured, arm.received)
-            if newest > after(now, s.future) and self._on(Check.ARM_FUTURE):
-                text = f"arm state stamped {seconds_between(now, newest):.3f} s ahead of now"
-                stops.append(Intervention(Check.ARM_FUTURE, "stopped", text))
-        text = f"no arm state for {age:.3f} s"
-        if age > s.arm_latch and self._on(Check.ARM_LOST):
-            faults.append(Intervention(Check.ARM_LOST, "latched", text))
-        stale = age > s.arm_age - s.period and self._on(Check.ARM_STALE)
-        if stale or arm is None:
-            stops.append(Intervention(Check.ARM_STALE, "stopped", text))
         if arm is None:
+            stops.append(Intervention(Check.ARM_STALE, "stopped", "no arm state has come"))
             return
-        if not _finite_arm(arm):
+        age = seconds_between(min(arm.captured, arm.received), now)
+        ahead = seconds_between(now, max(arm.captured, arm.received))
+        if ahead > s.future and self._on(Check.ARM_FUTURE):
+            text = f"arm state stamped {ahead:.3f} s ahead of now"
+            stops.append(Intervention(Check.ARM_FUTURE, "stopped", text))
+        if age > s.arm_age - s.period:
+            text = f"no arm state for {age:.3f} s"
+            if age > s.arm_latch and self._on(Check.ARM_LOST):
+                faults.append(Intervention(Check.ARM_LOST, "latched", text))
+            if self._on(Check.ARM_STALE):
+                stops.append(Intervention(Check.ARM_STALE, "stopped", text))
+        if not finite(arm.x, arm.y, arm.heading, arm.fx, arm.fy, arm.mz):
             text = "the arm's state holds a number that is not finite"
             stops.append(Intervention(Check.ARM_NOT_FINITE, "stopped", text))
         if arm.mode == PAUSED_MODE:
@@ -264,8 +278,11 @@ class SafetyGate:
         elif arm.mode not in MOVING_MODES and self._on(Check.ARM_MODE):
             text = f"the arm is in mode {arm.mode!r}: clear it at the arm, then arm again"
             faults.append(Intervention(Check.ARM_MODE, "latched", text))
-        if self._on(Check.ARM_LIMITS):
-            faults.extend(self._unconfirmed(arm))
+        limits = (arm.v_max, arm.omega_max, arm.f_max, arm.m_max)
+        if limits != self._confirmed and self._on(Check.ARM_LIMITS):
+            wrong = self._unconfirmed(arm)
+            faults.extend(wrong)
+            self._confirmed = () if wrong else limits
 
     def _unconfirmed(self, arm: ArmState) -> list[Intervention]:
         """Limits that the arm does not confirm as asked, with both values."""
@@ -309,14 +326,14 @@ class SafetyGate:
         """Apply every limit of motion to a healthy command; says in ``notes`` which ones acted."""
         s = self._settings
         twist = self._speed(wanted, notes)
-        if self._on(Check.ACCELERATION):
+        if self._bounds_acceleration:
             dt = min(max(passed, 0.0), s.period + s.lateness)
             before = twist
             twist = within_acceleration(
                 twist, self._last, s.acceleration * dt, s.turn_acceleration * dt
             )
             _note(notes, Check.ACCELERATION, before, twist, "the command changes too fast")
-        if goal is not None and self._on(Check.SLOW_DOWN):
+        if goal is not None and self._slows:
             tip_x = arm.x + s.tip_length * math.cos(arm.heading)
             tip_y = arm.y + s.tip_length * math.sin(arm.heading)
             if math.hypot(goal.x - tip_x, goal.y - tip_y) < s.slow_radius:
@@ -330,25 +347,27 @@ class SafetyGate:
         """Greatest speed and turn rate; the path stays."""
         s = self._settings
         twist = wanted
-        if self._on(Check.SPEED):
+        if self._bounds_speed:
             twist = within_speed(wanted, s.speed, math.inf)
-            _note(notes, Check.SPEED, wanted, twist, f"faster than {s.speed:g} m/s")
-        if self._on(Check.TURN_RATE):
+            _note(notes, Check.SPEED, wanted, twist, "the command is too fast")
+        if self._bounds_turning:
             before = twist
             twist = within_speed(twist, math.inf, s.turn_rate)
-            _note(notes, Check.TURN_RATE, before, twist, f"turns faster than {s.turn_rate:g} rad/s")
+            _note(notes, Check.TURN_RATE, before, twist, "the command turns too fast")
         return twist
 
     def _held_back(self, twist: Twist, arm: ArmState, notes: list[Intervention]) -> Twist:
         """Workspace and wrench together, for either alone could undo the other."""
         s = self._settings
-        rules = workspace_constraints(arm, s) if self._on(Check.WORKSPACE) else []
-        kept = constrained(twist, rules)
-        _note(notes, Check.WORKSPACE, twist, kept, "the edge of the workspace is near")
+        kept, rules = twist, []
+        if self._bounds_workspace:
+            rules = workspace_constraints(arm, s, fastest_point(twist, s))
+            kept = constrained(twist, rules)
+            _note(notes, Check.WORKSPACE, twist, kept, "the edge of the workspace is near")
         part = load(arm, s)
-        left = approach_left(part, s.soft_fraction)
-        if left == 1.0 or not self._on(Check.WRENCH):
+        if part <= s.soft_fraction or not self._bounds_wrench:
             return kept
+        left = approach_left(part, s.soft_fraction)
         held = wrench_constraints(twist, arm, left)
         text = f"the load is {part:.0%} of its limit: {left:.0%} of the approach is left"
         _note(notes, Check.WRENCH, twist, constrained(twist, held), text)
@@ -358,29 +377,10 @@ class SafetyGate:
 def _note(
     notes: list[Intervention], code: Check, before: Twist, after_it: Twist, text: str
 ) -> None:
-    if after_it != before:
+    if after_it is not before and after_it != before:
         notes.append(Intervention(code, "limited", text))
-
-
-def _finite_twist(twist: Twist) -> bool:
-    return math.isfinite(twist.vx) and math.isfinite(twist.vy) and math.isfinite(twist.omega)
 
 
 def _not_finite(wanted: Twist) -> Intervention:
     text = f"the command is not finite: {wanted.vx}, {wanted.vy}, {wanted.omega}"
     return Intervention(Check.COMMAND_NOT_FINITE, "latched", text)
-
-
-def _finite_touch(touch: Touch) -> bool:
-    return all(
-        map(
-            math.isfinite,
-            (touch.peak_force, touch.peak_x, touch.peak_y, touch.total_force, touch.tip_force),
-        )
-    )
-
-
-def _finite_arm(arm: ArmState) -> bool:
-    return all(
-        map(math.isfinite, (arm.x, arm.y, arm.heading, arm.fx, arm.fy, arm.mz)),
-    )

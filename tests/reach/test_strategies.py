@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from reachd.finite import usable
 from reachd.parameters import AUTHORS_SIM, HARDWARE, parameters
 from reachd.primitives import aim, burrow, straight
 from reachd.seam import ZERO, ArmState, Goal, Strategy, Touch
 from reachd.strategies import load_strategy
 from reachd.strategies.base import MAX_EVENTS
-from reachd.strategies.hybrid import usable
 from tactile_bus.geometry import Side
 from tactile_bus.instant import Instant, after
 

@@ -9,22 +9,13 @@ from __future__ import annotations
 
 import math
 
+from reachd.finite import usable
 from reachd.primitives import burrow, straight
 from reachd.seam import ZERO, Touch, Twist
 from reachd.strategies.base import Moment, ReachingStrategy
 from reachd.strategies.isolated import Excavate
 from tactile_bus.geometry import Side
 from tactile_bus.instant import NS_PER_S, Instant, seconds_between
-
-
-def usable(touch: Touch) -> bool:
-    """Whether ``touch`` may be acted on: valid, and every number in it finite."""
-    return touch.valid and all(
-        map(
-            math.isfinite,
-            (touch.peak_force, touch.peak_x, touch.peak_y, touch.total_force, touch.tip_force),
-        )
-    )
 
 
 class HybridClock(Excavate):
