@@ -6,7 +6,7 @@ doubted again when it stops to fit.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from sensor_proto.anyskin_search import (
     plausible,
 )
 from sensor_proto.decoder import ACCEPTED, Reject, Tally
-from sensor_proto.packets import FloatSamples, Received, TaxelStatus
+from sensor_proto.packets import FloatBurst, FloatSamples, Received, TaxelStatus
 
 SUSPECT_FRAMES = 3
 """Consecutive frames with mostly impossible temperatures after which the boundary is doubted."""
@@ -86,19 +86,34 @@ class AnySkinDecoder:
 
         ``trailing`` of frames held back is at most the length of ``data``.
         """
-        received: list[Received] = []
+        # Iterating over arrays makes the views of single frames at half the cost of indexing.
+        return [
+            Received(FloatSamples(field_ut, temperature_c, bits), 0, after)
+            for burst in self.feed_bursts(data)
+            for field_ut, temperature_c, bits, after in zip(
+                burst.values[:, :, 1:],
+                burst.values[:, :, 0],
+                burst.status,
+                burst.trailing,
+                strict=True,
+            )
+        ]
+
+    def feed_bursts(self, data: bytes, /) -> list[FloatBurst]:
+        """Same frames as `feed`, as arrays: a tenth of the cost where many come at once."""
+        bursts: list[FloatBurst] = []
         size = len(data)
         for begin in range(0, size, PIECE):
-            self._feed(data[begin : begin + PIECE], size, max(0, size - begin - PIECE), received)
-        return received
+            self._feed(data[begin : begin + PIECE], size, max(0, size - begin - PIECE), bursts)
+        return bursts
 
-    def _feed(self, piece: bytes, fed: int, later: int, received: list[Received]) -> None:
+    def _feed(self, piece: bytes, fed: int, later: int, bursts: list[FloatBurst]) -> None:
         """Take one piece; ``fed``: bytes of the whole chunk, ``later``: those after the piece."""
         buffer = self._buffer + piece
         at = 0
         while True:
             if self._locked:
-                at += self._take(buffer, at, later, fed, received)
+                at += self._take(buffer, at, later, fed, bursts)
                 if self._locked:
                     break
             found = self._search(buffer[at:])
@@ -127,7 +142,7 @@ class AnySkinDecoder:
         counts = range(1, MAX_MAGNETOMETERS + 1) if self._given is None else (self._given,)
         return search.new(counts)
 
-    def _take(self, buffer: bytes, at: int, later: int, fed: int, received: list[Received]) -> int:
+    def _take(self, buffer: bytes, at: int, later: int, fed: int, bursts: list[FloatBurst]) -> int:
         """Append the frames from ``at`` on, and unlock where they cease to fit; bytes taken."""
         n = self._count or 0
         size = frame_size(n)
@@ -154,16 +169,10 @@ class AnySkinDecoder:
         values.flags.writeable = status.flags.writeable = False
         self._tally[ACCEPTED] += fitting
         first = len(buffer) - at - size + later
-        trailing: Iterable[int] = range(first, first - fitting * size, -size)
+        trailing: Sequence[int] = range(first, first - fitting * size, -size)
         if first > fed:
             trailing = [min(after, fed) for after in trailing]
-        # Iterating over arrays makes the views of single frames at half the cost of indexing.
-        received += [
-            Received(FloatSamples(field_ut, temperature_c, bits), 0, after)
-            for field_ut, temperature_c, bits, after in zip(
-                values[:fitting, :, 1:], values[:fitting, :, 0], status, trailing, strict=True
-            )
-        ]
+        bursts.append(FloatBurst(values[:fitting], status[:fitting], trailing))
         return fitting * size
 
     def _trusted(self, temperature_c: NDArray[np.float32]) -> int:
@@ -182,10 +191,9 @@ def _all_good(values: NDArray[np.float32]) -> bool:
     """Whether no reading of (k, n, 4) needs a closer look; False for any NaN."""
     temperature_c = values[:, :, 0]
     return bool(
-        temperature_c.min() >= TINY_C
+        TINY_C <= temperature_c.min()
         and temperature_c.max() <= HOTTEST_C
-        and values.max() <= MAX_FIELD_UT
-        and values.min() >= -MAX_FIELD_UT
+        and np.abs(values).max() <= MAX_FIELD_UT
     )
 
 

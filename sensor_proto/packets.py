@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 
@@ -225,6 +226,19 @@ class FloatSamples:
     field_ut: NDArray[np.float32]
     temperature_c: NDArray[np.float32]
     status: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FloatBurst:
+    """k consecutive frames of a board that sends floats, as arrays: for whoever reads many at once.
+
+    ``values``: (k, n, 4) float32 t °C, x, y, z µT. ``status``: (k, n) uint8 of `TaxelStatus`.
+    ``trailing``: per frame, as in `Received`.
+    """
+
+    values: NDArray[np.float32]
+    status: NDArray[np.uint8]
+    trailing: Sequence[int]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
