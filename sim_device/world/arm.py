@@ -22,6 +22,9 @@ STEP_NS: Final = round(PHYSICS_STEP * NS_PER_S)
 MAX_EXPIRY: Final = 0.075
 """s a command may hold. Braking takes up to 20 ms, so that the arm rests within 100 ms of it."""
 
+DEFAULT_EXPIRY: Final = 0.05
+"""s; five cycles of a controller at 100 Hz."""
+
 MAX_PENDING: Final = 64
 """Commands under way to the joints: 100 a second at a latency of half a second."""
 
@@ -193,12 +196,12 @@ class SimulatedArm:
             self._world.limit_wrench(self._limits.f_max, self._limits.m_max)
         return self._limits
 
-    def command(self, twist: Twist, now: Instant, expiry: float = MAX_EXPIRY) -> bool:
+    def command(self, twist: Twist, now: Instant, expiry: float = DEFAULT_EXPIRY) -> bool:
         """Move at ``twist`` until ``expiry`` s from ``now``, or the next command.
 
-        False where it is refused and counted: not finite, an expiry that is not finite or not
-        above 0, or an arm that is not enabled. Longer expiries are cut to `MAX_EXPIRY`, speeds to
-        the limits.
+        False where it is refused and counted, and the arm stops: not finite, an expiry that is not
+        finite or not above 0, or an arm that is not enabled. Longer expiries are cut to
+        `MAX_EXPIRY`, speeds to the limits.
         """
         if not (math.isfinite(twist.vx) and math.isfinite(twist.vy) and math.isfinite(twist.omega)):
             return self._refuse("not_finite")
@@ -257,8 +260,11 @@ class SimulatedArm:
         return True
 
     def _refuse(self, reason: str) -> bool:
-        """Count a command that is not obeyed; what was obeyed before lives on until it expires."""
+        """Count a command that is not obeyed, and stop: its sender is out of order."""
         self.counters[reason] += 1
+        self._active = None
+        self._pending.clear()
+        self._stopped_itself = True
         return False
 
     def _within_limits(self, twist: Twist) -> Twist:
