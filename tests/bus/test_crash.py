@@ -7,6 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from tactile_tools.cli import main
+
 KILLS = 12
 
 
@@ -24,9 +28,9 @@ def test_kill_9_costs_at_most_a_second(tmp_path: Path) -> None:
     assert found["messages_lost"] < found["messages_written"] / 2
 
 
-def test_wrong_arguments_are_refused() -> None:
-    for words in (["--kills", "0"], ["--kills", "many"], ["--writers", "-1"]):
-        command = [sys.executable, "-m", "tactile_tools.cli", "crash", *words]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-        assert done.returncode == 2
-        assert "allowed: a whole number above 0" in done.stderr
+@pytest.mark.parametrize("words", [["--kills", "0"], ["--kills", "many"], ["--writers", "-1"]])
+def test_wrong_arguments_are_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["crash", *words])
+    assert ended.value.code == 2
+    assert "allowed: a whole number above 0" in capsys.readouterr().err

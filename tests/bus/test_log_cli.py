@@ -6,6 +6,8 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +15,28 @@ import pytest
 
 from tactile_bus import topics
 from tactile_bus.messages import MSG, codec, diagnostic_status, header
+from tactile_tools.cli import main
 
 BASE_NS = 1_700_000_000_000_000_000
 
 
-def tactile(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tactile_tools.cli", "log", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+@dataclass(frozen=True)
+class Outcome:
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def tactile(capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
+    """``tactile("info", path)``: run `tactile log` within this process."""
+
+    def run(*words: str | Path) -> Outcome:
+        capsys.readouterr()
+        code = main(["log", *map(str, words)])
+        return Outcome(code, *capsys.readouterr())
+
+    return run
 
 
 @pytest.fixture
@@ -42,7 +59,7 @@ def path(tmp_path: Path, record: Any, payloads: Any) -> Path:
     return path
 
 
-def test_info_tells_all_that_matters(path: Path) -> None:
+def test_info_tells_all_that_matters(tactile: Any, path: Path) -> None:
     result = tactile("info", path)
     assert result.returncode == 0, result.stderr
     for text in (
@@ -59,7 +76,7 @@ def test_info_tells_all_that_matters(path: Path) -> None:
         assert text in result.stdout
 
 
-def test_info_in_json_is_complete(path: Path) -> None:
+def test_info_in_json_is_complete(tactile: Any, path: Path) -> None:
     result = tactile("info", path, "--json")
     found = json.loads(result.stdout)
     assert found["whole"] is True
@@ -71,7 +88,7 @@ def test_info_in_json_is_complete(path: Path) -> None:
     assert found["metadata"]["board:b0"]["hash"] == "abcd"
 
 
-def test_a_cut_log_is_recovered_to_a_new_file(path: Path) -> None:
+def test_a_cut_log_is_recovered_to_a_new_file(tactile: Any, path: Path) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: len(data) * 2 // 3])
     assert "not closed" in tactile("info", path).stdout
@@ -90,7 +107,7 @@ def test_a_cut_log_is_recovered_to_a_new_file(path: Path) -> None:
     assert path.read_bytes() == before
 
 
-def test_recover_reports_in_json(path: Path, tmp_path: Path) -> None:
+def test_recover_reports_in_json(tactile: Any, path: Path, tmp_path: Path) -> None:
     result = tactile("recover", path, "--out", tmp_path / "o.mcap", "--json")
     found = json.loads(result.stdout)
     assert found["messages"] == 102
@@ -106,7 +123,9 @@ def test_recover_reports_in_json(path: Path, tmp_path: Path) -> None:
         (os.urandom(200_000), "is no MCAP file"),
     ],
 )
-def test_what_is_no_log_is_refused_with_2(tmp_path: Path, content: bytes, text: str) -> None:
+def test_what_is_no_log_is_refused_with_2(
+    tactile: Any, tmp_path: Path, content: bytes, text: str
+) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
     for command in ("info", "recover"):
@@ -119,7 +138,7 @@ def test_what_is_no_log_is_refused_with_2(tmp_path: Path, content: bytes, text: 
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_missing_files_directories_and_devices(tmp_path: Path) -> None:
+def test_missing_files_directories_and_devices(tactile: Any, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for place, text in (
         (tmp_path / "none.mcap", "name a file that exists"),
@@ -132,13 +151,21 @@ def test_missing_files_directories_and_devices(tmp_path: Path) -> None:
         assert text in result.stderr
 
 
-def test_a_target_that_cannot_be_written_is_refused_with_3(path: Path) -> None:
+def test_a_target_that_cannot_be_written_is_refused_with_3(tactile: Any, path: Path) -> None:
     result = tactile("recover", path, "--out", "/proc/none/out.mcap")
     assert result.returncode == 3
     assert "name a place with room to write to" in result.stderr
 
 
-def test_names_with_markup_are_shown_as_they_are(path: Path, tmp_path: Path) -> None:
+def test_names_with_markup_are_shown_as_they_are(tactile: Any, path: Path, tmp_path: Path) -> None:
     odd = tmp_path / "[bold]x.mcap"
     odd.write_bytes(path.read_bytes())
     assert "[bold]x.mcap" in tactile("info", odd).stdout
+
+
+def test_the_command_ends_with_the_same_code_and_no_traceback(path: Path) -> None:
+    for place, code in ((path, 0), (path.with_name("none.mcap"), 2)):
+        command = [sys.executable, "-m", "tactile_tools.cli", "log", "info", str(place)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == code
+        assert "Traceback" not in done.stderr

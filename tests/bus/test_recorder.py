@@ -257,7 +257,7 @@ def test_logging_stops_while_there_is_still_room_and_resumes(
     with caplog.at_level(logging.ERROR):
         until(lambda: recorder.stats.state == "low_space")
     assert "logs stop at 1.07" in caplog.text
-    assert logs(tmp_path)[0].whole  # closed in order
+    until(lambda: logs(tmp_path)[0].whole)  # closed in order
     size = sum(path.stat().st_size for path in tmp_path.iterdir())
     recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS + 1, BASE_NS)
     time.sleep(0.3)
@@ -271,7 +271,7 @@ def test_logging_stops_while_there_is_still_room_and_resumes(
 def test_files_split_by_size_and_each_stands_alone(
     tmp_path: Path, record: Any, payloads: Any, until: Any
 ) -> None:
-    recorder = record(tmp_path, split_bytes=6000, flush_period=0.03)
+    recorder = record(tmp_path, split_bytes=6000, chunk_bytes=1000, flush_period=0.03)
     recorder.attach("cal.toml", "application/toml", b"x = 1\n")
     recorder.metadata("board:b0", {"serial_number": "0011"})
     recorder.write(topics.GEOMETRY, "b0", payloads[topics.GEOMETRY], BASE_NS, BASE_NS)
@@ -330,7 +330,7 @@ def test_retention_keeps_the_newest_and_the_current(
 ) -> None:
     stranger = tmp_path / "holiday.mcap"
     stranger.write_bytes(b"not ours")
-    recorder = record(tmp_path, split_bytes=3000, max_files=3, flush_period=0.03)
+    recorder = record(tmp_path, split_bytes=3000, chunk_bytes=1000, max_files=3)
     deadline = time.monotonic() + 30
     count = 0
     while recorder.stats.files < 7:
