@@ -51,7 +51,7 @@ class CanLine:
         self._encoders: dict[int, CanEncoder] = {}
         self._links: dict[int, BoardLink] = {}
         self._up = False
-        self._frames = 0
+        self._frames = self._errors = 0
         self._since = self._discover_due = self._diagnose_from = Instant(0)
         self._known_at: Instant | None = None  # when the boards met until then are enough
         self._known = False
@@ -75,7 +75,7 @@ class CanLine:
         """The bus is open."""
         self._up = True
         self._decoder.reset()
-        self._frames = 0
+        self._frames = self._errors = 0
         self._since = self._discover_due = self._diagnose_from = now
         if self._known:
             for link in self._links.values():
@@ -96,6 +96,7 @@ class CanLine:
         if isinstance(chunk.payload, bytes):
             raise TypeError("a CAN bus brings frames, not bytes")
         self._frames += len(chunk.payload)
+        self._errors += sum(frame.error for frame in chunk.payload)
         heard: list[LineEvent] = []
         out: list[LineEvent] = []
         for received in self._decoder.feed(chunk.payload):
@@ -176,6 +177,12 @@ class CanLine:
                 f"{self._port} is silent: no frame at all, and no answer to Identify",
                 "check the bit rate (…@1000000), termination (60 Ω across the bus), power and "
                 "that the adapter is the right one",
+            )
+        if self._errors == self._frames:
+            return Diagnosed(
+                f"{self._port} carries nothing but error frames ({self._errors})",
+                "the bit rate is wrong (…@1000000), the bus is not terminated, or nobody else is "
+                "on it to acknowledge",
             )
         return Diagnosed(
             f"{self._port} carries {self._frames} frames, but no taxel board answers Identify",

@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
+from pathlib import Path
 from types import FrameType
 
 from rich.console import Console
@@ -21,6 +22,9 @@ from tactiled.status import REFRESH, Status
 from tactiled.transports import list_ports
 
 log = logging.getLogger(__name__)
+
+ARPHRD_CAN = "280"
+"""Type of a CAN network in Linux (if_arp.h)."""
 
 DONE, FAILED, USAGE, REFUSED = range(4)
 
@@ -113,9 +117,24 @@ def _list_ports() -> int:
     ports = list_ports()
     for port in ports:
         print(port)
-    if not ports:
-        print("no serial ports are plugged in", file=sys.stderr)
+    buses = can_networks()
+    for bus in buses:
+        print(f"socketcan:{bus}")
+    if not ports and not buses:
+        print("no serial port and no CAN network is there", file=sys.stderr)
     return DONE
+
+
+def can_networks(folder: Path = Path("/sys/class/net")) -> list[str]:
+    """CAN networks of this machine, by what Linux says of each network."""
+    found = []
+    for entry in sorted(folder.iterdir()) if folder.is_dir() else ():
+        try:
+            if (entry / "type").read_text().strip() == ARPHRD_CAN:
+                found.append(entry.name)
+        except OSError:
+            continue  # it went away meanwhile
+    return found
 
 
 def _set_up_logging(console: Console, verbose: bool) -> None:

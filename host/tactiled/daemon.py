@@ -137,6 +137,7 @@ class Daemon:
         name = wanted.name
         if isinstance(transport, McapTransport):
             name = reader.name = transport.board or "board0"
+            self._shelf.adopt_from_log(Path(wanted.spec), name)
 
         def admit(node: int, identity: Identity) -> Refusal | None:
             return port.admit(node, identity)

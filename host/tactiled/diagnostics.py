@@ -86,7 +86,7 @@ def drops(port: Port, node: int, station: Station) -> dict[str, int]:
     counts = port.drops() | {k: n for k, n in station.drops().items() if n}
     link = port.line.links.get(node)
     if isinstance(link, BoardLink):
-        trackers = link.trackers.values()
+        trackers = [array.tracker for array in link.arrays.values()]
         counts["samples_missing"] = sum(t.missing for t in trackers)
         counts["samples_duplicate"] = sum(t.duplicate for t in trackers)
         counts["samples_late"] = sum(t.late for t in trackers)
@@ -108,21 +108,28 @@ def message(name: str, values: dict[str, Any], recorder: Recorder | None, wall_n
         )
     ]
     if recorder is not None:
-        stats = recorder.stats
-        log_level = OK if stats.state == "recording" else ERROR
-        pairs = {
-            "path": stats.path,
-            "files": stats.files,
-            "written": stats.written,
-            "bytes": stats.bytes_written,
-            "waiting": stats.queued,
-            "errors": stats.errors,
-            "last_error": stats.last_error,
-        } | {f"{DROPS_PREFIX}{reason}": n for reason, n in stats.dropped.items()}
+        log = log_summary(recorder)
+        log_level = OK if log["state"] == "recording" else ERROR
         statuses.append(
-            diagnostic_status(f"tactiled/{name}/log", log_level, stats.state, "", pairs)
+            diagnostic_status(f"tactiled/{name}/log", log_level, log["state"], "", _flatten(log))
         )
     return MSG.DiagnosticArray(header(wall_ns, ""), statuses)
+
+
+def log_summary(recorder: Recorder) -> dict[str, Any]:
+    """State of the log and what it dropped."""
+    stats = recorder.stats
+    return {
+        "state": stats.state,
+        "path": stats.path,
+        "files": stats.files,
+        "written": stats.written,
+        "bytes": stats.bytes_written,
+        "queued": stats.queued,
+        "errors": stats.errors,
+        "last_error": stats.last_error,
+        "drops": dict(stats.dropped),
+    }
 
 
 def _flatten(values: dict[str, Any]) -> dict[str, object]:

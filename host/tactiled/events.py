@@ -24,6 +24,18 @@ class Identity:
     max_rate: float | None
     descriptor: Descriptor | None = None
 
+    @classmethod
+    def of(cls, descriptor: Descriptor) -> Identity:
+        """Identity of a board that described itself."""
+        return cls(
+            serial_number=descriptor.serial_number,
+            model=descriptor.model,
+            firmware=descriptor.firmware,
+            shapes=tuple((a.rows, a.columns) for a in descriptor.arrays),
+            max_rate=descriptor.max_rate_mhz / 1000,
+            descriptor=descriptor,
+        )
+
     def __str__(self) -> str:
         """As messages name it."""
         number = f" {self.serial_number}" if self.serial_number else " without a serial number"

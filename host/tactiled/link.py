@@ -8,11 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum, auto
-
-import numpy as np
-from numpy.typing import NDArray
 
 from sensor_proto.packets import (
     PROTOCOL_MAJOR,
@@ -33,7 +29,6 @@ from sensor_proto.packets import (
     Stop,
 )
 from tactile_bus.instant import Instant, after, seconds_between
-from tactiled.blocks import SampleBlock
 from tactiled.clock import ClockMap
 from tactiled.commands import CommandQueue
 from tactiled.events import (
@@ -51,7 +46,8 @@ from tactiled.events import (
     Sampled,
     Streaming,
 )
-from tactiled.sequence import SequenceTracker, Verdict
+from tactiled.intake import ArrayIntake
+from tactiled.sequence import Verdict
 
 IDENTIFY_FIRST = 0.1
 """s to the second Identify; doubles up to `IDENTIFY_SLOWEST`."""
@@ -97,22 +93,12 @@ class State(Enum):
     REFUSED = auto()
 
 
-@dataclass(slots=True, eq=False)
-class _Array:
-    index: int  # place in the descriptor
-    taxels: int
-    scale: NDArray[np.float64]  # (3,) µT per count
-    captured: (
-        Instant  # of the last samples: later ones are not stamped earlier, whatever their ticks
-    )
-
-
 class BoardLink:
     """State machine of one board; ``rate`` in Hz, None leaves the board's own.
 
     ``listen_only``: for recordings, which answer nobody; a descriptor alone brings the board into
     service, and arrivals alone place its clock.
-    ``counters``: samples dropped here, by reason. ``trackers``: per array.
+    ``counters``: samples dropped here, by reason. ``arrays``: by their numbers.
     """
 
     def __init__(
@@ -126,9 +112,8 @@ class BoardLink:
         self.descriptor: Descriptor | None = None
         self.status: Status | None = None
         self.clock: ClockMap | None = None
-        self.trackers: dict[int, SequenceTracker] = {}
+        self.arrays: dict[int, ArrayIntake] = {}
         self.counters: Counter[str] = Counter()
-        self._arrays: dict[int, _Array] = {}
         self._out: list[HostMessage] = []
         self._commands = CommandQueue(lambda message: self._out.append(message))
         self._token = 0
@@ -279,7 +264,7 @@ class BoardLink:
                 f"{message.model} board {serial} answers where {self.identity} was before",
                 f"plug {self.identity.serial_number} in again, or restart tactiled for {serial}",
             )
-        identity = _identity(message)
+        identity = Identity.of(message)
         if (
             self.rate is not None
             and identity.max_rate is not None
@@ -292,22 +277,21 @@ class BoardLink:
         return self._admit(identity)
 
     def _take_on(self, message: Descriptor, now: Instant, rebooted: bool) -> Identity:
-        identity = _identity(message)
+        identity = Identity.of(message)
         self.descriptor, self.identity = message, identity
         if self.clock is None:
             self.clock = ClockMap(message.tick_hz)
         else:
             self.clock.restart()
-        before, self._arrays = self._arrays, {}
+        for number in set(self.arrays) - {a.array for a in message.arrays}:
+            del self.arrays[number]
         for index, a in enumerate(message.arrays):
-            scale = np.array([a.lsb_xy_nt, a.lsb_xy_nt, a.lsb_z_nt]) * 1e-3
-            last = before[a.array].captured if a.array in before else Instant(0)
-            self._arrays[a.array] = _Array(index, a.taxels, scale, last)
-            tracker = self.trackers.setdefault(a.array, SequenceTracker())
+            intake = self.arrays.setdefault(a.array, ArrayIntake())
+            intake.describe(index, a)
             if rebooted:
-                tracker.restart()
+                intake.tracker.restart()
             else:
-                tracker.resume()
+                intake.tracker.resume()
         self.status = None
         self.state, self._silent = State.CONFIGURING, False
         self._identify_due = after(now, KEEPALIVE)
@@ -371,11 +355,11 @@ class BoardLink:
                 # It is there after all: do not wait for the back-off.
                 self._identify_due = min(self._identify_due, after(arrival, IDENTIFY_FIRST))
             return []
-        array = self._arrays.get(message.array)
-        if array is None or array.taxels != len(message.field):
+        array = self.arrays.get(message.array)
+        if array is None or not array.fits(message):
             self.counters["wrong_shape"] += 1
             return []
-        verdict = self.trackers[message.array].take(message.sequence)
+        verdict = array.tracker.take(message.sequence)
         if verdict is Verdict.FOREIGN:
             reset = Reset(f"its sequence fell back to {message.sequence}")
             return [reset, *self._identify(arrival)]
@@ -383,23 +367,11 @@ class BoardLink:
             return []
         self.clock.arrived(message.ticks, arrival)
         stamp = self.clock.stamp(message.ticks, arrival)
-        captured = max(stamp.captured, min(array.captured, arrival))
-        array.captured = Instant(captured)
         events: list[Event] = []
         if self._silent or self._resuming:
             events.append(Resumed(seconds_between(self._last_sample, arrival)))
         self._silent, self._resuming, self._last_sample = False, False, arrival
-        block = SampleBlock(
-            array=array.index,
-            sequence=message.sequence,
-            captured=array.captured,
-            received=arrival,
-            uncertainty=stamp.uncertainty + seconds_between(stamp.captured, array.captured),
-            field_ut=message.field * array.scale,
-            temperature_c=np.array([message.temperature_cc / 100]),
-            status=message.status,
-        )
-        events.append(Sampled(block))
+        events.append(Sampled(array.block(message, stamp, arrival)))
         return events
 
     def _on_status(self, message: Status, now: Instant) -> list[Event]:
@@ -408,8 +380,8 @@ class BoardLink:
         if before is not None and message.uptime_ms < before.uptime_ms:
             cause = RESET_CAUSES.get(message.reset_cause, f"cause {message.reset_cause}")
             events.append(Reset(f"its uptime fell to {message.uptime_ms / 1000:g} s ({cause})"))
-            for tracker in self.trackers.values():
-                tracker.restart()
+            for array in self.arrays.values():
+                array.tracker.restart()
             if self.state in (State.CONFIGURING, State.STREAMING):
                 events += self._identify(now)
         return events
@@ -427,14 +399,3 @@ class BoardLink:
         if quiet >= max(RELINK, limit):
             events += self._identify(now)
         return events
-
-
-def _identity(message: Descriptor) -> Identity:
-    return Identity(
-        serial_number=message.serial_number,
-        model=message.model,
-        firmware=message.firmware,
-        shapes=tuple((a.rows, a.columns) for a in message.arrays),
-        max_rate=message.max_rate_mhz / 1000,
-        descriptor=message,
-    )

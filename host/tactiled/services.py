@@ -20,7 +20,7 @@ from tactile_bus.calibration import CalibrationError
 from tactile_bus.instant import monotonic_now
 from tactile_bus.services import Service, ServiceError, declare_service
 from tactile_bus.topics import service_key
-from tactiled.diagnostics import summary
+from tactiled.diagnostics import log_summary, summary
 from tactiled.events import Answered, Event
 from tactiled.link import BoardLink
 from tactiled.port import Port
@@ -89,9 +89,12 @@ class BoardServices:
             service.close()
 
     def _status(self, _: Nothing) -> dict[str, Any]:
-        result: dict[str, Any] = self._do(
-            lambda: summary(self._port, self._node, self._station, monotonic_now())
-        )
+        def sum_up() -> dict[str, Any]:
+            values = summary(self._port, self._node, self._station, monotonic_now())
+            recorder = self._station.recorder
+            return values | {"log": None if recorder is None else log_summary(recorder)}
+
+        result: dict[str, Any] = self._do(sum_up)
         return result
 
     def _tare(self, _: Nothing) -> dict[str, Any]:

@@ -10,9 +10,13 @@ from tactile_bus.calibration import (
     BoardCalibration,
     CalibrationMismatch,
     load,
+    loads,
     nominal,
     nominal_from_descriptor,
 )
+from tactile_bus.calibration_file import SUFFIX
+from tactile_bus.log_reader import LogReader
+from tactile_bus.log_records import AttachmentRecord
 from tactiled.events import Identity, Refusal
 
 UNNUMBERED = "unknown"
@@ -44,6 +48,22 @@ class Shelf:
     def reload(self) -> None:
         """Read every file again; `CalibrationError` (and nothing changed) when one is bad."""
         self._files = {path: load(path) for path in self._paths}
+
+    def adopt_from_log(self, log: Path, board: str) -> None:
+        """Use the calibration that ``board`` was recorded with, unless files were given.
+
+        Nominal figures are not adopted: they follow from what the board says of itself.
+        """
+        if self._paths:
+            return
+        with LogReader(log) as reader:
+            for event in reader.events():
+                if isinstance(event, AttachmentRecord) and event.name == f"{board}{SUFFIX}":
+                    text = reader.read_at(event.position, event.size).decode("utf-8", "replace")
+                    calibration = loads(text, f"{log}: {event.name}")
+                    if not calibration.nominal:
+                        self._files[log] = calibration
+                    return
 
     def choose(self, identity: Identity) -> Choice | Refusal:
         """Calibration for a board, or why there is none."""

@@ -10,7 +10,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from tactile_bus.calibration import saves
+from tactile_bus.calibration_file import SUFFIX
 from tactile_bus.instant import NS_PER_S, Instant, monotonic_now, seconds_between
+from tactile_bus.recorder import Recorder
 from tactile_bus.topics import AMBIENT, FEATURES, FIELD, FORCES, GEOMETRY
 from tactiled.blocks import Cycle, Features, SampleBlock
 from tactiled.events import (
@@ -77,6 +79,11 @@ class Station:
         self._answers: dict[int, Future[Event]] = {}
         self._tares: list[Future[dict[str, Any]]] = []
 
+    @property
+    def recorder(self) -> Recorder | None:
+        """The log that this board's messages go to."""
+        return self._outlet.recorder
+
     # Who it is
 
     def admit(self, identity: Identity) -> Refusal | None:
@@ -121,10 +128,10 @@ class Station:
         if before is not None:
             self.counters.update({k: v for k, v in asdict(before).items() if k not in ("cycles",)})
         self._maker = MessageMaker(calibration, self._outlet.wall)
-        recorder = self._outlet.recorder
+        recorder = self.recorder
         if recorder is not None:
             text = saves(calibration).encode()
-            recorder.attach(f"{self.name}.cal.toml", "application/toml", text)
+            recorder.attach(f"{self.name}{SUFFIX}", "application/toml", text)
             summary = {key: str(value) for key, value in self.calibration_summary().items()}
             recorder.metadata(
                 f"board:{self.name}",

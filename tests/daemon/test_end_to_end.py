@@ -127,7 +127,7 @@ def test_a_spoiled_wire_loses_cycles_but_never_makes_one_up(instant: At) -> None
     assert numbers == sorted(set(numbers))
     link = line.links[0]
     assert isinstance(link, BoardLink)
-    trackers = link.trackers.values()
+    trackers = [array.tracker for array in link.arrays.values()]
     sent = board.counters["cycles"]
     for tracker in trackers:
         total = tracker.accepted + tracker.late + tracker.missing

@@ -234,7 +234,7 @@ def test_a_rebooted_board_streams_again_within_a_second(rig: Rig) -> None:
     rig.run(1.0)
     last = rig.of(Sampled)[-1].block
     assert abs(last.captured - rig.at(rig.now)) / NS_PER_S <= last.uncertainty + 0.011
-    assert sum(t.missing for t in rig.link.trackers.values()) == 0
+    assert sum(a.tracker.missing for a in rig.link.arrays.values()) == 0
 
 
 def test_stamps_never_run_backwards_through_a_reboot(rig: Rig) -> None:

@@ -186,6 +186,7 @@ def test_status_tells_everything_of_a_board(running: tuple[Lab, Program, Any]) -
     assert not status["calibration"]["nominal"]
     assert len(status["calibration"]["hash"]) == 64
     assert len(status["field_support"]) == 3
+    assert status["log"]["state"] == "recording"
 
 
 def test_tare_waits_for_its_end_and_reports(running: tuple[Lab, Program, Any]) -> None:

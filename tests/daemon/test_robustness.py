@@ -127,7 +127,7 @@ def test_chunks_dropped_on_overflow_are_the_gaps_that_are_counted(
     link = line.links[0]
     assert isinstance(link, BoardLink)
     assert inbox.dropped == 30
-    missing = [tracker.missing for tracker in link.trackers.values()]
+    missing = [array.tracker.missing for array in link.arrays.values()]
     # The first ten dropped came before anything was used: nobody can miss those.
     assert missing == [20, 20]
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from sensor_proto.packets import Descriptor
-from tactile_bus.calibration import nominal, nominal_from_descriptor, save
+from tactile_bus.calibration import load, nominal, nominal_from_descriptor, save, saves
+from tactile_bus.recorder import Recorder
 from tactiled.events import Identity, Refusal
 from tactiled.shelf import Choice, Shelf
 
@@ -82,6 +83,27 @@ def test_a_board_without_a_serial_number_takes_the_one_file_that_fits_it(tmp_pat
     assert chosen.path == path
     assert "cannot confirm" in chosen.warning
     assert isinstance(Shelf([path], strict=True).choose(skin("USB2")), Refusal)
+
+
+def test_a_replay_uses_the_calibration_it_was_recorded_with(
+    tmp_path: Path, descriptor: Descriptor
+) -> None:
+    calibration = load(file_of(tmp_path, descriptor, "00000000000000aa"))
+    log = tmp_path / "run.mcap"
+    recorder = Recorder(log)
+    recorder.attach("pad.cal.toml", "application/toml", saves(calibration).encode())
+    recorder.attach("rim.cal.toml", "application/toml", b"")
+    assert recorder.close(30)
+    shelf = Shelf([], strict=True)
+    shelf.adopt_from_log(log, "pad")
+    chosen = shelf.choose(pad(descriptor))
+    assert isinstance(chosen, Choice)
+    assert chosen.calibration.hash == calibration.hash
+    given = Shelf([file_of(tmp_path, descriptor, "00000000000000aa")], strict=True)
+    given.adopt_from_log(log, "pad")
+    chosen = given.choose(pad(descriptor))
+    assert isinstance(chosen, Choice)
+    assert chosen.path != log
 
 
 def test_reloading_reads_what_the_file_says_now(tmp_path: Path, descriptor: Descriptor) -> None:
