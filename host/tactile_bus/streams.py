@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import time
 import uuid
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import zenoh
@@ -65,6 +66,16 @@ class BusSample:
     source: bytes | None
 
 
+def read_sample(sample: zenoh.Sample) -> BusSample:
+    """Bytes of a sample and what its publisher said of itself."""
+    sequence = wall_ns = source = None
+    attachment = sample.attachment
+    if attachment is not None and len(attachment) == ATTACHMENT.size:
+        sequence, wall_ns, _, source = ATTACHMENT.unpack(attachment.to_bytes())
+    key = str(sample.key_expr)
+    return BusSample(key, sample.payload.to_bytes(), sequence, wall_ns, source)
+
+
 class Latest:
     """Newest sample of a key; older ones that were not fetched are gone, and counted.
 
@@ -90,15 +101,12 @@ class Latest:
             self.refused += 1
             return None
         self.received += 1
-        sequence = wall_ns = source = None
-        attachment = sample.attachment
-        if attachment is not None and len(attachment) == ATTACHMENT.size:
-            sequence, wall_ns, _, source = ATTACHMENT.unpack(attachment.to_bytes())
-            if self._last is not None and self._last[0] == source:
-                self.skipped += max(sequence - self._last[1] - 1, 0)
-            self._last = (source, sequence)
-        key = str(sample.key_expr)
-        return BusSample(key, sample.payload.to_bytes(), sequence, wall_ns, source)
+        found = read_sample(sample)
+        if found.source is not None and found.sequence is not None:
+            if self._last is not None and self._last[0] == found.source:
+                self.skipped += max(found.sequence - self._last[1] - 1, 0)
+            self._last = (found.source, found.sequence)
+        return found
 
     def wait(self, timeout: float, period: float = 0.001) -> BusSample | None:
         """The newest sample, waiting for one up to ``timeout`` s; None when none came."""
@@ -112,6 +120,38 @@ class Latest:
     def close(self) -> None:
         """Take the subscription back."""
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+class Tap:
+    """Every sample of a key expression, handed to ``take`` in zenoh's thread: for logs and watches.
+
+    ``take`` must be quick, for what it leaves undone piles up: control reads `Latest` instead.
+    ``remote_only``: nothing that this session itself puts.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key: str,
+        take: Callable[[BusSample], None],
+        *,
+        remote_only: bool = False,
+    ) -> None:
+        self._take = take
+        self.key = key
+        self.refused = 0  # above MAX_PAYLOAD
+        origin = zenoh.Locality.REMOTE if remote_only else zenoh.Locality.ANY
+        self._subscriber = session.declare_subscriber(key, self._hear, allowed_origin=origin)
+
+    def close(self) -> None:
+        """Take the subscription back."""
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        if len(sample.payload) > MAX_PAYLOAD:
+            self.refused += 1
+        else:
+            self._take(read_sample(sample))
 
 
 def latest(session: zenoh.Session, key: str) -> Latest:

@@ -98,3 +98,8 @@ def service_key(name: str, service: str, kind: str = "tactile") -> str:
 def alive_key(name: str, kind: str = "tactile") -> str:
     """Key of the liveliness token of whoever publishes for ``name``. Information only."""
     return Topic(kind + "/{name}/alive", "", 0).key(name)
+
+
+def commander_key(arm: str, reach: str) -> str:
+    """Key of the liveliness token of whoever commands an arm. Information only."""
+    return Topic(f"arm/{arm}/commander/{{name}}", "", 0).key(reach)

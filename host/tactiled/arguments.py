@@ -9,9 +9,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from tactile_bus.options import add_log_and_bus, finite_above_zero
+from tactile_bus.session import PORTS
 from tactiled.line import KINDS
 from tactiled.pipeline_settings import METHODS
-from tactiled.settings import DEFAULT_BAUD, DEFAULT_LOG, finite_above_zero
+from tactiled.settings import DEFAULT_BAUD
 
 EPILOG = """\
 examples:
@@ -132,31 +134,7 @@ def make_parser() -> argparse.ArgumentParser:
         help="contact features a second (default: every frame; the paper has 15 Hz)",
     )
 
-    group = parser.add_argument_group("log and bus")
-    add = group.add_argument
-    add(
-        "--log",
-        metavar="PATH",
-        help=f"MCAP file to write, or folder for dated files (default folder ./{DEFAULT_LOG})",
-    )
-    add("--no-log", action="store_true", help="log nothing")
-    add(
-        "--listen",
-        action="append",
-        metavar="ENDPOINT",
-        help="zenoh endpoint (default tcp/127.0.0.1:7447); may be repeated",
-    )
-    add(
-        "--connect",
-        action="append",
-        metavar="ENDPOINT",
-        help="zenoh endpoint of a peer to join; may be repeated",
-    )
-    add(
-        "--insecure",
-        action="store_true",
-        help="allow endpoints that leave this machine unprotected",
-    )
+    add_log_and_bus(parser, PORTS["tactiled"])
 
     group = parser.add_argument_group("running")
     add = group.add_argument

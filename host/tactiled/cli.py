@@ -12,9 +12,9 @@ from pathlib import Path
 from types import FrameType
 
 from rich.console import Console
-from rich.logging import RichHandler
 
 from tactile_bus.instant import monotonic_now, seconds_between
+from tactile_bus.terminal import set_up_logging
 from tactiled.arguments import make_parser
 from tactiled.daemon import Daemon, StartError
 from tactiled.settings import Settings, SettingsError, make_settings
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run tactiled; returns the exit status: 0 done, 1 failed, 2 usage, 3 refused."""
     options = make_parser().parse_args(argv)
     console = Console(stderr=True)
-    _set_up_logging(console, options.verbose)
+    set_up_logging(console, verbose=options.verbose)
     if options.list_ports:
         return _list_ports()
     try:
@@ -135,19 +135,6 @@ def can_networks(folder: Path = Path("/sys/class/net")) -> list[str]:
         except OSError:
             continue  # it went away meanwhile
     return found
-
-
-def _set_up_logging(console: Console, verbose: bool) -> None:
-    level = logging.DEBUG if verbose else logging.INFO
-    if console.is_terminal:
-        handler: logging.Handler = RichHandler(
-            console=console, show_path=False, rich_tracebacks=False, markup=False
-        )
-        handler.setFormatter(logging.Formatter("%(message)s"))
-    else:
-        handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    logging.basicConfig(level=level, handlers=[handler], force=True)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ exits with 2.
 from __future__ import annotations
 
 import argparse
-import math
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,20 +18,14 @@ from msgspec import Meta
 from tactile_bus.calibration import CalibrationError, load
 from tactile_bus.can_bus import CanSpec
 from tactile_bus.config import ConfigError, Count, Duration, Positive, Rate, load_toml
+from tactile_bus.options import BusTable, LogTable, bus_config, log_destination
 from tactile_bus.recorder import RecorderSettings
-from tactile_bus.session import BusConfig, TlsConfig
+from tactile_bus.session import BusConfig
 from tactile_bus.topics import NAME
 from tactiled.pipeline_settings import PipelineSettings
 from tactiled.transports import listing
 
 DEFAULT_BAUD = 115_200
-
-DEFAULT_LOG = "tactile-logs"
-"""Folder of the logs, below the folder tactiled was started in."""
-
-DEFAULT_LOG_BYTES = 32 << 30
-"""Bytes that the logs of one name may take in a folder before the oldest go: about 18 h of one
-board at 100 Hz."""
 
 REPLAY_PREFIX = "replay"
 """First part of every key of a replay, so that nothing old is taken for live."""
@@ -79,23 +72,6 @@ class SensingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     auto_tare: bool | None = None
     rest_tracking_s: Duration | None = None
     hold_s: Duration = 1.5
-
-
-class LogTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[log]``: a folder, or a file that ends in .mcap; ``[log.recorder]``: how it is cut."""
-
-    enabled: bool = True
-    destination: str = DEFAULT_LOG
-    recorder: RecorderSettings = RecorderSettings(max_bytes=DEFAULT_LOG_BYTES)
-
-
-class BusTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[bus]``: zenoh endpoints."""
-
-    listen: tuple[str, ...] | None = None
-    connect: tuple[str, ...] | None = None
-    tls: TlsConfig | None = None
-    insecure: bool = False
 
 
 class ConfigFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -168,13 +144,7 @@ def make_settings(options: argparse.Namespace) -> Settings:
         rate=options.rate if options.rate is not None else file.rate,
         log=_log(options, file, replay),
         recorder=file.log.recorder,
-        bus=BusConfig(
-            role="tactiled",
-            listen=tuple(options.listen) if options.listen else file.bus.listen,
-            connect=tuple(options.connect) if options.connect else file.bus.connect,
-            tls=file.bus.tls,
-            insecure=options.insecure or file.bus.insecure,
-        ),
+        bus=bus_config(options, file.bus, "tactiled"),
         duration=options.duration,
         wait=options.wait,
         speed=options.speed,
@@ -330,23 +300,6 @@ def _pipeline(options: argparse.Namespace, file: ConfigFile, path: Path | None) 
 
 def _log(options: argparse.Namespace, file: ConfigFile, replay: bool) -> Path | None:
     """A replay is logged only when --log asks for it: everything is in its log already."""
-    if options.no_log:
+    if replay and options.log is None:
         return None
-    if options.log is not None:
-        return Path(options.log)
-    if replay or not file.log.enabled:
-        return None
-    return Path(file.log.destination)
-
-
-def finite_above_zero(text: str, unit: str) -> float:
-    """Number of a flag; `argparse.ArgumentTypeError` unless finite and above 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(
-            f"{text} given; allowed: a finite number of {unit} above 0"
-        )
-    return value
+    return log_destination(options, file.log)

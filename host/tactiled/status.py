@@ -15,6 +15,7 @@ from rich.text import Text
 from tactile_bus.geometry import Side
 from tactile_bus.instant import monotonic_now, seconds_between
 from tactile_bus.recorder import Recorder
+from tactile_bus.terminal import describe_log, drops_text
 from tactiled.port import Port
 from tactiled.station import Station
 
@@ -121,15 +122,6 @@ def describe(station: Station) -> dict[str, str]:
     return cells
 
 
-def drops_text(drops: dict[str, int]) -> str:
-    """Counts by reason, the largest first."""
-    if not drops:
-        return "0"
-    ordered = sorted(drops.items(), key=lambda item: -item[1])
-    shown = " ".join(f"{reason}={n}" for reason, n in ordered[:4])
-    return f"{shown} …" if len(ordered) > 4 else shown
-
-
 def force_text(station: Station) -> str:
     """Peak normal force of each side as a bar and in N."""
     cycle, choice = station.last, station.choice
@@ -151,14 +143,3 @@ def bar(force: float) -> str:
     """One character for a force in N, full at `FULL_BAR_N`."""
     level = round(min(max(force / FULL_BAR_N, 0.0), 1.0) * (len(BAR) - 1))
     return BAR[level]
-
-
-def describe_log(recorder: Recorder) -> str:
-    """State of the log in one line."""
-    stats = recorder.stats
-    text = f"{stats.path}  {stats.bytes_written / 1e6:.1f} MB"
-    if stats.state != "recording":
-        text += f"  {stats.state.upper()} {stats.last_error}"
-    if stats.dropped:
-        text += f"  dropped {drops_text(stats.dropped)}"
-    return text
