@@ -76,7 +76,7 @@ class Flag:
 
     def problem(self, value: object) -> str | None:
         """What is wrong with ``value``, or None."""
-        return None if isinstance(value, bool) else f"{value!r} is neither true nor false"
+        return None if isinstance(value, bool) else f"{value!r} is not {self.allowed}"
 
 
 Kind = Number | Choice | Flag

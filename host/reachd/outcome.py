@@ -9,7 +9,7 @@ from enum import StrEnum
 
 from reachd.safety import Intervention
 from reachd.safety_settings import Check
-from reachd.seam import ArmState, Touch
+from reachd.seam import ArmState, Goal, Touch
 from reachd.strategies.base import StrategyEvent
 from tactile_bus.instant import Instant, seconds_between
 
@@ -79,8 +79,9 @@ class Onsets:
 
 @dataclass(slots=True)
 class Trial:
-    """The running account of one reach."""
+    """The running account of one reach towards ``goal``."""
 
+    goal: Goal
     began: Instant
     distance: float = math.nan
     closest: float = math.inf

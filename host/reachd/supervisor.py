@@ -81,7 +81,6 @@ class Supervisor:
         self._since = Instant(0)
         self._activity = "idle"
         self._text = ""
-        self._goal: Goal | None = None
         self._returning = False
         self._trial: Trial | None = None
         self._outcome: Outcome | None = None
@@ -101,7 +100,7 @@ class Supervisor:
         """Begin a trial towards ``goal`` (of ``goals.make_goal``); returns why not."""
         if self._state is not State.IDLE:
             return f"a goal is accepted when idle, not when {self._state}: stop and reset first"
-        self._goal = goal
+        self._trial = Trial(goal, now)
         self._outcome = None
         self._enter(State.HOMING, "homing", now)
         return None
@@ -110,11 +109,7 @@ class Supervisor:
         """End whatever moves; returns why there is nothing to stop."""
         if self._state is State.IDLE:
             return "nothing to stop: idle"
-        if self._state is State.REACHING:
-            self._finish(Reason.STOPPED, text, now)
-        elif self._state is State.HOMING:
-            self._idle(text, now)
-        self._returning = False
+        self._abort(Reason.STOPPED, text, now)
         return None
 
     def request_reset(self, now: Instant) -> str | None:
@@ -132,7 +127,7 @@ class Supervisor:
             state=self._state,
             activity=self._activity,
             elapsed=seconds_between(self._since, now),
-            goal=self._goal,
+            goal=None if trial is None or self._state is State.IDLE else trial.goal,
             distance=math.nan if trial is None else trial.distance,
             text=self._text,
             outcome=self._outcome,
@@ -140,16 +135,21 @@ class Supervisor:
 
     def step(self, touch: Touch | None, arm: ArmState | None, now: Instant) -> Command:
         """What is wanted in this cycle; zero as long as an input has never come."""
+        trial = self._trial
+        if trial is None or self._state is State.IDLE:
+            return Command(ZERO)
         if self._state is State.HOMING and arm is not None:
             twist = self._towards_home(arm)
             if twist is not None:
                 return self._in_time(twist, now)
-            failure = self._begin_reach(now)
+            self._trial = trial = Trial(trial.goal, now)
+            self._enter(State.REACHING, "starting", now)
+            failure = begin(self._strategy, trial.goal, now)
             if failure is not None:
                 return Command(None, failure=failure)
         if self._state is State.REACHING:
-            return self._reach(touch, arm, now)
-        if self._state is State.RESETTING and self._returning and arm is not None:
+            return self._reach(trial, touch, arm, now)
+        if self._returning and arm is not None:
             twist = self._towards_home(arm)
             if twist is not None:
                 return self._in_time(twist, now)
@@ -161,36 +161,36 @@ class Supervisor:
 
         A latch ends a reach with its reason and stops homing and resetting.
         """
-        if self._trial is not None and self._state is State.REACHING:
-            self._trial.onsets.update(decision.interventions)
+        found = decision.interventions
+        if self._trial is not None:
+            self._trial.onsets.update(found)
         if decision.held is not None:
-            text = next(
-                (i.text for i in decision.interventions if i.code is decision.held), ""
-            ) or str(decision.held)
-            if self._state is State.REACHING:
-                self._finish(Reason.HELD, text, now)
-            elif self._state is State.HOMING:
-                self._idle(text, now)
-            self._returning = False
-        return self._onsets.update(decision.interventions)
+            why = [i.text for i in found if i.code is decision.held]
+            self._abort(Reason.HELD, "; ".join(why), now)
+        return self._onsets.update(found)
+
+    def _abort(self, reason: Reason, text: str, now: Instant) -> None:
+        """End whatever moves, without going home."""
+        if self._state is State.REACHING and self._trial is not None:
+            self._finish(self._trial, reason, text, now)
+        elif self._state is State.HOMING:
+            self._idle(text, now)
+        self._returning = False
 
     def _enter(self, state: State, activity: str, now: Instant) -> None:
         self._state, self._activity, self._since = state, activity, now
 
     def _idle(self, text: str, now: Instant) -> None:
         self._enter(State.IDLE, "idle", now)
-        self._goal = None
         self._text = text
         self._returning = False
 
-    def _finish(self, reason: Reason, text: str, now: Instant) -> None:
+    def _finish(self, trial: Trial, reason: Reason, text: str, now: Instant) -> None:
         """Close the trial and wait, holding still, to be reset."""
-        if self._trial is not None:
-            self._outcome = self._trial.end(reason, text, now)
+        self._outcome = trial.end(reason, text, now)
         self._text = text
         self._enter(State.RESETTING, "waiting for a reset", now)
-        # Not after a stop or a latch: whoever ended the motion wants none.
-        self._returning = self._auto_reset and reason in (Reason.REACHED, Reason.TIMEOUT)
+        self._returning = self._auto_reset
 
     def _towards_home(self, arm: ArmState) -> Twist | None:
         return None if self._home is None else home_twist(arm, self._home, self._parameters)
@@ -206,19 +206,10 @@ class Supervisor:
         self._returning = False
         return Command(ZERO)
 
-    def _begin_reach(self, now: Instant) -> str | None:
-        """Leave homing; returns how the strategy failed to start."""
-        goal = self._goal
-        if goal is None:
-            raise RuntimeError("homing without a goal")
-        self._trial = Trial(now)
-        self._enter(State.REACHING, "starting", now)
-        return begin(self._strategy, goal, now)
-
-    def _reach(self, touch: Touch | None, arm: ArmState | None, now: Instant) -> Command:
-        trial, goal, p = self._trial, self._goal, self._parameters
-        if trial is None or goal is None:
-            raise RuntimeError("reaching without a goal")
+    def _reach(
+        self, trial: Trial, touch: Touch | None, arm: ArmState | None, now: Instant
+    ) -> Command:
+        goal, p = trial.goal, self._parameters
         elapsed = seconds_between(trial.began, now)
         if arm is not None:
             distance = aim(arm, goal, p.tip_length).distance
@@ -226,11 +217,11 @@ class Supervisor:
             judged = p.success_during_excavation or not self._activity.startswith("excavate")
             if distance <= goal.radius and judged:
                 text = f"reached within {distance * 1e3:.1f} mm after {elapsed:.2f} s"
-                self._finish(Reason.REACHED, text, now)
+                self._finish(trial, Reason.REACHED, text, now)
                 return Command(ZERO)
         if elapsed >= goal.time_limit:
             text = f"not reached within {goal.time_limit:g} s, {trial.distance * 1e3:.1f} mm short"
-            self._finish(Reason.TIMEOUT, text, now)
+            self._finish(trial, Reason.TIMEOUT, text, now)
             return Command(ZERO)
         if arm is None or touch is None:
             return Command(ZERO, goal)

@@ -14,6 +14,7 @@ import pytest
 from reachd.safety import Decision, SafetyGate
 from reachd.safety_settings import Check, SafetySettings
 from reachd.seam import ZERO, ArmState, Goal, Touch, Twist
+from reachd.workspace import Region
 from tactile_bus.instant import Instant, after
 
 MS = 1_000_000
@@ -307,12 +308,19 @@ def test_a_command_that_is_not_finite_latches(
     assert r.step().twist == ZERO, "it stays so"
 
 
-def test_numbers_near_the_end_of_the_range_latch_with_every_limit_off(
-    rig: Callable[..., Rig],
-) -> None:
-    r = rig(Check.SPEED, Check.TURN_RATE, Check.ACCELERATION, Check.SLOW_DOWN)
-    decision = r.step(Twist(1.7e308, 1.7e308, 1.7e308))
-    assert all(map(math.isfinite, (decision.twist.vx, decision.twist.vy, decision.twist.omega)))
+def test_what_overflows_on_the_way_latches(rig: Callable[..., Rig]) -> None:
+    """With the speed limit off, a slanted border takes a huge number beyond the range."""
+    slanted = Region(((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)))
+    off = (Check.SPEED, Check.TURN_RATE, Check.ACCELERATION)
+    r = rig(*off, tip_region=slanted)
+    decision = r.step(Twist(1.7e308, 1.0, 0.0))
+    assert all(map(math.isfinite, (decision.twist.vx, decision.twist.vy)))
+    r = rig(*off, tip_region=Region(((-1.0, -1.0), (1.0, -1.0), (1.0, 0.2), (-0.9, -0.9))))
+    decision = r.step(Twist(-1.7e308, 1.7e308, 0.0), arm=r.fresh_arm(-r.period, x=0.0, y=-0.5))
+    assert decision.twist == ZERO
+    assert decision.held is Check.COMMAND_NOT_FINITE
+    assert codes(decision) == {"command_not_finite"}
+    assert r.step().held is Check.COMMAND_NOT_FINITE
 
 
 @pytest.mark.parametrize(

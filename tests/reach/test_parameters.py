@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -134,7 +135,7 @@ def test_single_values_are_overridden() -> None:
         ({"time_limit": 0}, ["time_limit", "more than 0 s"]),
         ({"burrow_amplitude": 1.0}, ["less than 1"]),
         ({"burrow_amplitude": -0.1}, ["at least 0"]),
-        ({"excavate_needs_time": 1}, ["true nor false"]),
+        ({"excavate_needs_time": 1}, ["true or false"]),
         ({"burrow_law": "other"}, ["'unit' or 'literal'", "other"]),
         ({"v_max": 0.2}, ["safety.speed", "set both"]),
         ({"omega_max": 0.2}, ["safety.turn_rate", "set both"]),
@@ -158,6 +159,11 @@ def test_what_cannot_be_used_is_refused_in_words(given: dict, words: list[str]) 
         parameters("hardware", given)
     for word in words:
         assert word in str(error.value)
+
+
+def test_a_region_is_no_list_of_numbers() -> None:
+    with pytest.raises(SettingError, match="pivot_region"):
+        replace(HARDWARE.safety, pivot_region=((0, 0), (1, 0), (0, 1)))  # type: ignore[arg-type]
 
 
 def test_unknown_set_lists_the_sets() -> None:

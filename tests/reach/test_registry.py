@@ -94,8 +94,8 @@ def test_a_package_offers_strategies_by_entry_point(
         """,
     )
     found = (
-        EntryPoint("mine", "offered:Mine", registry.GROUP),
         EntryPoint("straight", "offered:Mine", registry.GROUP),
+        EntryPoint("mine", "offered:Mine", registry.GROUP),
     )
     monkeypatch.setattr(registry, "entry_points", lambda *, group: found)
     assert available() == (*registry.BUILT_IN, "mine")

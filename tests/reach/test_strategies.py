@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from reachd.finite import usable
 from reachd.parameters import AUTHORS_SIM, HARDWARE, parameters
 from reachd.primitives import aim, burrow, straight
-from reachd.seam import ZERO, ArmState, Goal, Strategy, Touch
+from reachd.seam import ZERO, ArmState, Goal, Strategy, Touch, Twist
 from reachd.strategies import load_strategy
-from reachd.strategies.base import MAX_EVENTS
+from reachd.strategies.base import MAX_EVENTS, Moment, ReachingStrategy
 from tactile_bus.geometry import Side
 from tactile_bus.instant import Instant, after
 
@@ -394,3 +394,15 @@ def test_any_strategy_is_a_function_of_seed_and_inputs(name: str, p: object, see
         return said
 
     assert run() == run()
+
+
+class Undecided(ReachingStrategy):
+    def _choose(self, at: Moment) -> Twist | None:
+        return None
+
+
+def test_to_choose_nothing_without_an_excavation_is_an_error(make_arm: Callable) -> None:
+    strategy = Undecided(HARDWARE, rng())
+    strategy.start(FAR, T0)
+    with pytest.raises(RuntimeError, match="_choose"):
+        strategy.step(calm(T0), make_arm(), FAR, T0)

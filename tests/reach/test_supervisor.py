@@ -228,8 +228,9 @@ def test_requests_out_of_turn_are_refused_in_words() -> None:
 
 
 def test_a_latch_ends_the_reach_with_its_reason() -> None:
-    bench = Bench(auto_reset=True, home=HOME)
+    bench = Bench(auto_reset=True, home=HOME, pose=(-0.23, 0.0, 0.0))
     bench.go()
+    bench.run(5.0, State.REACHING)
     bench.run(1.0)
     bench.mode = "estop"
     bench.cycle()
@@ -237,7 +238,7 @@ def test_a_latch_ends_the_reach_with_its_reason() -> None:
     assert bench.supervisor.state is State.RESETTING
     assert bench.outcome.reason is Reason.HELD
     assert "estop" in bench.outcome.text
-    assert bench.outcome.interventions == {"acceleration": 1, "arm_mode": 1}
+    assert bench.outcome.interventions == {"acceleration": 1, "arm_mode": 1}, "of the reach alone"
     bench.mode = "ready"
     bench.run(1.0)
     assert bench.twist == ZERO, "the arm is not brought home after a latch"

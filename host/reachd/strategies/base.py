@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -50,7 +51,7 @@ class ReportsEvents(Protocol):
         ...
 
 
-class ReachingStrategy:
+class ReachingStrategy(ABC):
     """Base of the built-in strategies. ``rng`` is the only source of chance.
 
     A subclass writes ``_choose``; an excavation that it has begun runs to its end by itself.
@@ -97,7 +98,6 @@ class ReachingStrategy:
         running = self._excavating
         if running and seconds_between(running.at, now) >= p.excavate_duration:
             self._excavating = None
-            self._excavation_end = now
             self._report(StrategyEvent(now, "excavation_end", running.direction, running.trigger))
             self._excavation_ended(at)
         if self._excavating is None:
@@ -106,12 +106,13 @@ class ReachingStrategy:
                 return twist
         return self._excavate(at)
 
+    @abstractmethod
     def _choose(self, at: Moment) -> Twist | None:
         """Motion wanted outside an excavation, or None after ``_begin`` started one."""
-        raise NotImplementedError
 
     def _excavation_ended(self, at: Moment) -> None:
         """Take note that an excavation has just ended."""
+        self._excavation_end = at.now
 
     def _has_time(self, at: Moment) -> bool:
         """Whether the set allows an excavation to start with the time that remains."""

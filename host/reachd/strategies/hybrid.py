@@ -62,6 +62,7 @@ class HybridEvent(ReachingStrategy):
         return ZERO
 
     def _excavation_ended(self, at: Moment) -> None:
+        super()._excavation_ended(at)
         self._light_ns = None
         self._reference_at = at.now
         self._previous = at.now

@@ -1,0 +1,69 @@
+"""The mutation runner makes the changes it says, and tells a caught one from a missed one."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from tactile_tools import mutation
+
+SOURCE = """
+LIMIT = 3
+
+def within(a: float, b: float = 2.0) -> bool:
+    if not a < b and True:
+        return min(a, -b) + 1 > 0
+    return a is None
+"""
+
+
+def changes() -> set[tuple[str, str]]:
+    return {(m.before, m.after) for m in mutation.mutants("x.py", SOURCE)}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        ("a < b", "a <= b"),
+        ("a < b", "a > b"),
+        ("not a < b", "a < b"),
+        ("not a < b and True", "not a < b or True"),
+        ("True", "False"),
+        ("min(a, -b) + 1", "min(a, -b) - 1"),
+        ("min", "max"),
+        ("-b", "b"),
+        ("1", "2"),
+        ("min(a, -b) + 1 > 0", "min(a, -b) + 1 >= 0"),
+        ("a is None", "a is not None"),
+    ],
+)
+def test_each_kind_of_change_is_made(change: tuple[str, str]) -> None:
+    assert change in changes()
+
+
+def test_every_mutant_is_a_program_that_differs() -> None:
+    made = mutation.mutants("x.py", SOURCE)
+    original = ast.unparse(ast.parse(SOURCE))
+    assert len({m.source for m in made}) == len(made)
+    for mutant in made:
+        ast.parse(mutant.source)
+        assert mutant.source != original
+        assert mutant.source.count("\n") == original.count("\n")
+    assert ("3", "4") not in changes(), "module constants are left alone"
+
+
+def test_a_noticed_mutant_is_killed_and_another_survives(tmp_path: Path) -> None:
+    test = tmp_path / "test_it.py"
+    test.write_text(
+        "from reachd.limits import approach_left\n"
+        "def test_it(): assert approach_left(0.9, 0.8) < 0.6 and approach_left(0.5, 0.8) == 1.0\n",
+        encoding="utf-8",
+    )
+    source = (mutation.PACKAGE / "limits.py").read_text(encoding="utf-8")
+    made = [m for m in mutation.mutants("limits.py", source) if "part" in m.before]
+    caught = next(m for m in made if m.after == "1.0 + part")
+    missed = next(m for m in mutation.mutants("limits.py", source) if m.before == "force > 0.0")
+    assert mutation.judge(caught, [str(test)], 60.0) == "killed"
+    assert mutation.judge(missed, [str(test)], 60.0) == "survived"
