@@ -29,7 +29,7 @@ from tactile_bus.topics import DIAGNOSTICS, alive_key
 from tactiled import diagnostics
 from tactiled.can_line import CanLine
 from tactiled.events import Identity, Refusal
-from tactiled.inbox import Inbox, Wake
+from tactiled.inbox import MAX_AGE, Inbox, Wake
 from tactiled.line import Line, SerialLine
 from tactiled.outlet import Outlet
 from tactiled.port import Port, Trouble
@@ -131,7 +131,7 @@ class Daemon:
     def _make_port(self, wanted: PortSettings, transport: Transport, outlet: Outlet) -> Port:
         settings = self.settings
         replay = wanted.medium == "log"
-        inbox = Inbox(self._wake)
+        inbox = Inbox(self._wake, max_age=None if replay else MAX_AGE)
         reader = PortReader(transport, inbox, outlet, wanted.name, self._fail, paced=replay)
         reader.open(settings.wait and not replay)
         name = wanted.name
@@ -243,7 +243,8 @@ class Daemon:
         try:
             next_second = after(monotonic_now(), 1.0)
             while not self._stopping.is_set():
-                self._wake.wait(TICK)
+                if not any(port.behind for port in self.ports):
+                    self._wake.wait(TICK)
                 now = monotonic_now()
                 for port in self.ports:
                     port.pump(now)

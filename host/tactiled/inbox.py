@@ -6,10 +6,15 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
+from tactile_bus.instant import seconds_between
 from tactiled.blocks import Chunk
 
-CHUNKS = 256
-"""Chunks that may wait for the pipeline: 2.5 s at 100 Hz. Older data is of no use to anyone."""
+CHUNKS = 1024
+"""Chunks that may wait for the pipeline: a second of a busy CAN bus."""
+
+MAX_AGE = 0.5
+"""s that a chunk may wait: features as old as that are of no use to anyone, and a pipeline that
+cannot keep up must show what is now, with gaps, rather than everything, late."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +59,11 @@ class Wake:
 class Inbox:
     """What one port's reader hands over; drops chunks, never news of the port itself."""
 
-    def __init__(self, wake: Wake, limit: int = CHUNKS) -> None:
+    def __init__(self, wake: Wake, limit: int = CHUNKS, max_age: float | None = None) -> None:
+        """``max_age``: s after which a chunk that waits is dropped; None: never, for recordings."""
         self._wake = wake
         self._limit = limit
+        self._max_age = max_age
         self._items: deque[Item] = deque()
         self._lock = threading.Lock()
         self._chunks = 0
@@ -68,11 +75,18 @@ class Inbox:
         """Whether the next chunk would push out the oldest."""
         return self._chunks >= self._limit
 
+    @property
+    def waiting(self) -> bool:
+        """Whether there is anything to take."""
+        return bool(self._items)
+
     def put(self, item: Item) -> None:
         """Hand over one item; never waits."""
         with self._lock:
             if isinstance(item, Chunk):
                 if self._chunks >= self._limit:
+                    self._drop_oldest()
+                while self._chunks and self._is_stale(item):
                     self._drop_oldest()
                 self._chunks += 1
             self._items.append(item)
@@ -87,8 +101,16 @@ class Inbox:
             self._chunks -= isinstance(item, Chunk)
             return item
 
+    def _oldest(self) -> tuple[int, Chunk]:
+        """Place of the oldest chunk, and the chunk; there must be one."""
+        return next((i, item) for i, item in enumerate(self._items) if isinstance(item, Chunk))
+
+    def _is_stale(self, newest: Chunk) -> bool:
+        if self._max_age is None:
+            return False
+        return seconds_between(self._oldest()[1].received, newest.received) > self._max_age
+
     def _drop_oldest(self) -> None:
-        at = next(i for i, item in enumerate(self._items) if isinstance(item, Chunk))
-        del self._items[at]
+        del self._items[self._oldest()[0]]
         self._chunks -= 1
         self.dropped += 1

@@ -17,6 +17,9 @@ from tactiled.station import Station
 
 log = logging.getLogger(__name__)
 
+TURN = 64
+"""Chunks worked off at a time: however far behind a port is, others and requests get their turn."""
+
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
@@ -75,7 +78,10 @@ class Port:
 
     def pump(self, now: Instant) -> None:
         """Work off what the reader handed over, then what time demands, then write."""
-        while (item := self.inbox.take()) is not None:
+        for _ in range(TURN):
+            item = self.inbox.take()
+            if item is None:
+                break
             if isinstance(item, Chunk):
                 self._clock = item.received
                 self._handle(self.line.receive(item))
@@ -95,6 +101,11 @@ class Port:
         # A recording's time is that of its chunks, which at high speed run ahead of ours.
         self._handle(self.line.tick(now if self._live else self._clock))
         self.write()
+
+    @property
+    def behind(self) -> bool:
+        """Whether more waits than one turn works off."""
+        return self.inbox.waiting
 
     def write(self) -> None:
         """Send what the links want to say."""

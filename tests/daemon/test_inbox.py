@@ -24,6 +24,16 @@ def test_the_oldest_chunks_go_and_are_counted(instant: Callable[[float], Instant
     assert taken == [PortOpened(), *chunks[15:], PortLost("gone")]
 
 
+def test_chunks_that_waited_too_long_go_too(instant: Callable[[float], Instant]) -> None:
+    inbox = Inbox(Wake(), max_age=0.5)
+    for k in range(100):
+        inbox.put(Chunk(instant(k / 100), bytes([k])))
+    assert inbox.dropped == 49
+    first = inbox.take()
+    assert isinstance(first, Chunk)
+    assert first.payload == bytes([49])
+
+
 def test_the_pipeline_is_roused_by_what_comes(instant: Callable[[float], Instant]) -> None:
     wake = Wake()
     inbox = Inbox(wake)
