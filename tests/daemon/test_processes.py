@@ -25,6 +25,8 @@ from tactile_bus.services import ServiceError, call
 from tactile_bus.session import BusConfig, close_session, open_session
 from tactile_bus.streams import latest
 from tactile_bus.topics import FEATURES, FORCES, service_key
+from tactiled.cli import main
+from tactiled.outgoing import MessageMaker
 
 SLOW = 30.0
 """s that anything may take on a busy machine before a test gives it up."""
@@ -322,6 +324,31 @@ def test_a_killed_daemon_starts_again_and_its_log_is_read(lab: Lab) -> None:
     told = info(lab.folder / "run.mcap")
     assert not told.closed
     assert {c.topic: c.messages for c in told.channels}["/tactile/board0/features"] > 20
+
+
+def test_a_thread_that_dies_takes_the_daemon_down_and_the_log_is_whole(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lab.boards("--pty", "board0", "--seed", "1", link="board0")
+    real, log, calls = MessageMaker.forces, lab.folder / "run.mcap", []
+
+    def fail_at_last(maker: MessageMaker, cycle: Any) -> Any:
+        calls.append(cycle)
+        if len(calls) == 100:
+            raise ZeroDivisionError("a mistake in the pipeline")
+        return real(maker, cycle)
+
+    monkeypatch.setattr(MessageMaker, "forces", fail_at_last)
+    interval = sys.getswitchinterval()
+    try:
+        port = str(lab.folder / "board0")
+        assert main(["--listen", lab.endpoint, "--port", port, "--log", str(log)]) == 1
+    finally:
+        sys.setswitchinterval(interval)
+    assert "thread pipeline failed: a mistake in the pipeline" in capsys.readouterr().err
+    told = info(log)
+    assert told.closed
+    assert {c.topic: c.messages for c in told.channels}["/tactile/board0/forces"] == 99
 
 
 def test_boards_on_a_can_bus_are_named_by_node(lab: Lab) -> None:
