@@ -30,11 +30,9 @@ SUPPORT_RADIUS: Final = 0.005
 DROP: Final = 1.0
 """m, from the shelf to the floor in front of it, where what fell lies still and costs nothing."""
 
-MOTOR_KV: Final = 600.0
-"""N·s/m; with 3 kg a time constant of 5 ms, one physics step."""
-
-MOTOR_KW: Final = 10.0
-"""N·m·s/rad; with 0.05 kg·m² likewise."""
+MOTOR_TIME: Final = 0.005
+"""s, time constant of the velocity motors: gains of 600 N·s/m and 10 N·m·s/rad on the finger of
+`authors_sim`. Shorter is stiffer than a physics step can follow."""
 
 CONTACT_SOLREF: Final = (0.01, 1.0)
 CONTACT_SOLIMP: Final = (0.95, 0.99, 0.0005, 0.5, 2.0)
@@ -255,10 +253,10 @@ def _add_finger(spec: mujoco.MjSpec, scene: Scene, parameters: WorldParameters) 
         conaffinity=_PLANAR,
     )
     limits = parameters.limits
-    for joint, gain, bound in (
-        ("finger_x", MOTOR_KV, limits.f_max),
-        ("finger_y", MOTOR_KV, limits.f_max),
-        ("finger_yaw", MOTOR_KW, limits.m_max),
+    for joint, inertia, bound in (
+        ("finger_x", parameters.finger_mass, limits.f_max),
+        ("finger_y", parameters.finger_mass, limits.f_max),
+        ("finger_yaw", parameters.finger_inertia, limits.m_max),
     ):
         motor = spec.add_actuator(
             name=joint,
@@ -267,4 +265,4 @@ def _add_finger(spec: mujoco.MjSpec, scene: Scene, parameters: WorldParameters) 
             forcerange=[-bound, bound],
             forcelimited=True,
         )
-        motor.set_to_velocity(kv=gain)
+        motor.set_to_velocity(kv=inertia / MOTOR_TIME)

@@ -23,7 +23,7 @@ from sim_device.world.base import (
     merge_touches,
     substeps,
 )
-from sim_device.world.mujoco_model import MOTOR_KV, MOTOR_KW, mean_lever, yaw_inertia
+from sim_device.world.mujoco_model import MOTOR_TIME, mean_lever, yaw_inertia
 from sim_device.world.parameters import WorldParameters, world_parameters
 from sim_device.world.plates import settled
 from sim_device.world.scenes import Scene, SceneObject, Shape
@@ -132,11 +132,8 @@ class PymunkWorld:
             v0 = np.array([*finger.velocity, finger.angular_velocity])
             wanted = np.array([twist.vx, twist.vy, twist.omega])
             inertia = np.array([p.finger_mass, p.finger_mass, p.finger_inertia])
-            gain = np.array([MOTOR_KV, MOTOR_KV, MOTOR_KW])
             bound = np.array([self._f_max, self._f_max, self._m_max])
-            # Implicit in the speed reached, as in the other engine.
-            gain = gain * inertia / (inertia + PHYSICS_STEP * gain)
-            motor = np.clip(gain * (wanted - v0), -bound, bound)
+            motor = np.clip(inertia / MOTOR_TIME * (wanted - v0), -bound, bound)
             finger.apply_force_at_world_point((motor[0], motor[1]), finger.position)
             finger.torque += motor[2]
             self._space.step(PHYSICS_STEP)
@@ -228,7 +225,8 @@ class PymunkWorld:
     def kinetic_energy(self) -> float:
         """J, of finger and objects on the shelf."""
         standing = [b for b, on in zip(self._objects, self._shelf, strict=True) if on]
-        return float(sum(b.kinetic_energy for b in (*standing, self._finger)))
+        # pymunk's own figure lacks the half.
+        return float(sum(b.kinetic_energy for b in (*standing, self._finger))) / 2
 
     @property
     def motor_work(self) -> float:

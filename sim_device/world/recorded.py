@@ -6,6 +6,7 @@ import csv
 import gzip
 import json
 import math
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,7 +54,7 @@ def load_recorded(path: Path) -> tuple[Scene, ...]:
     try:
         with gzip.open(path, "rb") as stream:
             data = stream.read(MAX_BYTES + 1)
-    except (OSError, EOFError) as error:
+    except (OSError, EOFError, zlib.error) as error:
         raise SceneError(f"cannot read {path}: {error}") from None
     if len(data) > MAX_BYTES:
         raise SceneError(f"{path} unpacks to more than {MAX_BYTES} bytes")

@@ -1,0 +1,64 @@
+"""The cupboard as markers, for the bus, a log and a 3D view: one message tells the whole scene."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from sim_device.world.base import World
+from sim_device.world.scenes import Shape
+from sim_device.world.touch import SHELF_CLEARANCE
+from tactile_bus.geometry import FINGER_HEIGHT, FINGER_OUTLINE
+from tactile_bus.markers import CUBE, CYLINDER, SPHERE, marker
+from tactile_bus.messages import MSG
+
+OBJECTS, CUPBOARD, FINGER, GOAL = "objects", "cupboard", "finger", "goal"
+"""Namespaces of the markers; an object's id is its index in the scene."""
+
+FRAME: Final = "cupboard"
+WALL: Final = 0.01  # m, how thick the cupboard's walls are drawn
+LIGHTEST, HEAVIEST = 0.1, 0.8  # kg; darker objects are heavier, as in the paper's figure 2
+
+
+def scene_markers(world: World, wall_ns: int) -> Any:
+    """``MarkerArray`` of objects still on the shelf, cupboard, finger and goal, now."""
+    scene = world.scene
+    made = []
+
+    def add(
+        namespace: str,
+        number: int,
+        kind: int,
+        pose: tuple[float, float, float, float],
+        size: tuple[float, float, float],
+        colour: tuple[float, float, float, float],
+    ) -> None:
+        made.append(marker(wall_ns, FRAME, namespace, number, kind, pose, size, colour))
+
+    poses, standing = world.poses().tolist(), world.on_shelf().tolist()
+    for number, thing in enumerate(scene.objects):
+        if not standing[number]:
+            continue
+        x, y, yaw = poses[number]
+        share = min(1.0, max(0.0, (thing.mass - LIGHTEST) / (HEAVIEST - LIGHTEST)))
+        tone = 0.85 - 0.6 * share
+        kind = CYLINDER if thing.shape is Shape.DISC else CUBE
+        size = (*thing.size, thing.height) if kind == CUBE else _round(thing.radius, thing.height)
+        add(OBJECTS, number, kind, (x, y, thing.height / 2, yaw), size, (tone, tone, tone, 1.0))
+    depth, width = scene.depth, scene.width
+    wood = (0.6, 0.45, 0.3, 1.0)
+    height = FINGER_HEIGHT
+    across = (depth, WALL, height)
+    add(CUPBOARD, 0, CUBE, (depth + WALL / 2, 0, height / 2, 0), (WALL, width, height), wood)
+    add(CUPBOARD, 1, CUBE, (depth / 2, (width + WALL) / 2, height / 2, 0), across, wood)
+    add(CUPBOARD, 2, CUBE, (depth / 2, -(width + WALL) / 2, height / 2, 0), across, wood)
+    finger = world.finger()
+    xs, ys = zip(*FINGER_OUTLINE, strict=True)
+    size = (max(xs) - min(xs), max(ys) - min(ys), FINGER_HEIGHT)
+    middle = SHELF_CLEARANCE + FINGER_HEIGHT / 2
+    add(FINGER, 0, CUBE, (finger.x, finger.y, middle, finger.heading), size, (0.1, 0.4, 0.8, 0.9))
+    add(GOAL, 0, SPHERE, (*scene.goal, middle, 0.0), (0.015, 0.015, 0.015), (0.0, 0.6, 0.3, 1.0))
+    return MSG.MarkerArray(made)
+
+
+def _round(radius: float, height: float) -> tuple[float, float, float]:
+    return (2 * radius, 2 * radius, height)

@@ -1,0 +1,111 @@
+"""Scenes of few objects, the recorded ones, and the simplest reach there is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import pytest
+
+from sim_device.world.base import World
+from sim_device.world.mujoco_world import MujocoWorld
+from sim_device.world.pymunk_world import PymunkWorld
+from sim_device.world.scenes import Pose, Scene, SceneObject, Shape
+from tactile_bus.arm_types import Twist
+from tactile_bus.geometry import TIP_X
+
+RECORDED = Path(__file__).parents[2].parent / "shared" / "data" / "authors_scenes"
+
+
+def disc(x: float, y: float, *, radius: float = 0.04, mass: float = 0.5) -> SceneObject:
+    return SceneObject(Shape.DISC, 2 * radius, 2 * radius, 0.07, mass, x, y, 0.0)
+
+
+def box(
+    x: float,
+    y: float,
+    *,
+    size: tuple[float, float] = (0.04, 0.04),
+    mass: float = 0.5,
+    yaw: float = 0.0,
+) -> SceneObject:
+    return SceneObject(Shape.BOX, *size, 0.07, mass, x, y, yaw)
+
+
+def cupboard(*objects: SceneObject, start: Pose | None = None) -> Scene:
+    return Scene(
+        source="test",
+        parameters="authors_sim",
+        seed=0,
+        depth=0.375,
+        width=0.55,
+        start=start or Pose(-0.2, 0.0, 0.0),
+        goal=(0.358, 0.0),
+        objects=objects,
+    )
+
+
+class Engine(Protocol):
+    def __call__(self, scene: Scene) -> World: ...
+
+
+@dataclass(frozen=True)
+class Build:
+    disc: Callable[..., SceneObject]
+    box: Callable[..., SceneObject]
+    cupboard: Callable[..., Scene]
+
+
+@pytest.fixture(scope="session")
+def build() -> Build:
+    return Build(disc, box, cupboard)
+
+
+@pytest.fixture(params=["mujoco", "pymunk"])
+def engine(request: pytest.FixtureRequest) -> Engine:
+    if request.param == "mujoco":
+        return MujocoWorld
+    pytest.importorskip("pymunk", reason="the extra `crosscheck` is not installed")
+    return PymunkWorld
+
+
+@pytest.fixture(scope="session")
+def recorded() -> Path:
+    if not RECORDED.is_dir():
+        pytest.skip("the recorded scenes are not here (../shared/data/authors_scenes)")
+    return RECORDED
+
+
+@dataclass(frozen=True)
+class Reach:
+    """``success``: within 1 mm. ``distance``: m of the tip from the goal at the end."""
+
+    success: bool
+    distance: float
+    duration: float
+
+
+def straight_reach(world: World, limit: float = 20.0) -> Reach:
+    """The authors' straight reach with their figures: no sensing, the least a world must bear."""
+    scene = world.scene
+    for cycle in range(round(limit / 0.01)):
+        finger = world.finger()
+        dx = scene.goal[0] - finger.x - TIP_X * math.cos(finger.heading)
+        dy = scene.goal[1] - finger.y - TIP_X * math.sin(finger.heading)
+        distance = math.hypot(dx, dy)
+        if distance <= 0.001:
+            return Reach(True, distance, cycle * 0.01)
+        error = math.remainder(math.atan2(dy, dx) - finger.heading, math.tau)
+        speed = 0.025 if distance < 0.01 else 0.05
+        omega = math.copysign(0.01 if abs(error) < 0.05 else 0.35, error)
+        world.step(0.01, Twist(speed * dx / distance, speed * dy / distance, omega))
+        world.contacts()
+    return Reach(False, distance, limit)
+
+
+@pytest.fixture(scope="session")
+def reach_straight() -> Callable[..., Reach]:
+    return straight_reach

@@ -1,0 +1,63 @@
+"""Two engines that share no code must tell the same story of a simple push."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sim_device.world.mujoco_world import MujocoWorld
+from sim_device.world.scenes import Pose
+from tactile_bus.arm_types import Twist
+
+pytest.importorskip("pymunk", reason="the extra `crosscheck` is not installed")
+
+from sim_device.world.pymunk_world import PymunkWorld
+
+AHEAD, ASIDE = Twist(0.05, 0.0, 0.0), Twist(0.0, 0.05, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("objects", "twist"),
+    [
+        ([("box", 0.06, 0.0)], AHEAD),
+        ([("disc", 0.08, 0.0)], AHEAD),
+        ([("box", 0.06, 0.0), ("box", 0.12, 0.005)], AHEAD),
+        ([("box", 0.05, 0.1), ("disc", 0.05, 0.18)], ASIDE),
+        ([("disc", 0.03, 0.1), ("box", 0.09, 0.07)], ASIDE),
+    ],
+)
+def test_pushed_objects_end_in_the_same_place(
+    build: Any, objects: list[tuple[str, float, float]], twist: Twist
+) -> None:
+    kinds = {"box": build.box, "disc": build.disc}
+    scene = build.cupboard(
+        *(kinds[kind](x, y) for kind, x, y in objects),
+        start=Pose(-0.14 if twist is AHEAD else 0.0, 0.0, 0.0),
+    )
+    ends = []
+    for engine in (MujocoWorld, PymunkWorld):
+        world = engine(scene)
+        start = world.poses()
+        for _ in range(200):
+            world.step(0.01, twist)
+        finger = world.finger()
+        ends.append((world.poses() - start, np.array([finger.x, finger.y, finger.heading])))
+    (mine, finger), (theirs, other) = ends
+    assert np.abs(mine[:, :2]).max() > 0.02  # it was pushed
+    assert np.abs(finger[:2] - other[:2]).max() < 0.002
+    # The engines' laws of shelf friction differ where an object also turns.
+    assert np.abs(mine[:, :2] - theirs[:, :2]).max() < 0.003
+
+
+def test_both_say_the_same_of_a_push_into_the_corner(build: Any) -> None:
+    scene = build.cupboard(build.box(0.375 - 0.021, 0.0), start=Pose(0.17, 0.0, 0.0))
+    wrenches = []
+    for engine in (MujocoWorld, PymunkWorld):
+        world = engine(scene)
+        for _ in range(150):
+            world.step(0.01, Twist(0.05, 0.0, 0.0))
+        finger = world.finger()
+        wrenches.append((finger.fx, finger.fy))
+    assert wrenches[0] == pytest.approx(wrenches[1], abs=0.1)
