@@ -70,6 +70,7 @@ def yaw_inertia(item: SceneObject) -> float:
 def base_spec(gravity: float = 9.81) -> mujoco.MjSpec:
     """Empty model with the solver's settings. ``gravity`` in m/s², downwards."""
     spec = mujoco.MjSpec()
+    spec.compiler.degree = False
     option = spec.option
     option.timestep = PHYSICS_STEP
     option.gravity = [0.0, 0.0, -gravity]
@@ -224,7 +225,10 @@ def cupboard_model(scene: Scene, parameters: WorldParameters) -> mujoco.MjModel:
 
 
 def _add_finger(spec: mujoco.MjSpec, scene: Scene, parameters: WorldParameters) -> None:
-    """The finger: its outline extruded, three joints at the pivot, a velocity motor on each."""
+    """The finger: its outline extruded, three joints at the pivot, a velocity motor on each.
+
+    It is built unturned, as a body's joints turn with it; set the start's heading as an angle.
+    """
     start = scene.start
     outline = np.asarray(FINGER_OUTLINE)
     z = FINGER_HEIGHT / 2
@@ -234,8 +238,7 @@ def _add_finger(spec: mujoco.MjSpec, scene: Scene, parameters: WorldParameters) 
     slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
     body.add_joint(name="finger_x", type=slide, axis=(1, 0, 0))
     body.add_joint(name="finger_y", type=slide, axis=(0, 1, 0))
-    body.add_joint(name="finger_yaw", type=hinge, axis=(0, 0, 1), ref=start.heading)
-    body.quat = [math.cos(start.heading / 2), 0, 0, math.sin(start.heading / 2)]
+    body.add_joint(name="finger_yaw", type=hinge, axis=(0, 0, 1))
     body.explicitinertial = True
     body.mass = parameters.finger_mass
     body.ipos = [0, 0, 0]

@@ -63,6 +63,7 @@ class MujocoWorld:
         start = replace(scene, objects=settled(scene, parameters))
         self._model = model = cupboard_model(start, parameters)
         self._data = data = mujoco.MjData(model)
+        data.qpos[-1] = scene.start.heading
         mujoco.mj_forward(model, data)
         n = len(scene.objects)
         self._initial = np.array([[o.x, o.y, o.yaw] for o in start.objects]).reshape(n, 3)

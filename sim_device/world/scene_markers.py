@@ -42,7 +42,7 @@ def scene_markers(world: World, wall_ns: int) -> Any:
         share = min(1.0, max(0.0, (thing.mass - LIGHTEST) / (HEAVIEST - LIGHTEST)))
         tone = 0.85 - 0.6 * share
         kind = CYLINDER if thing.shape is Shape.DISC else CUBE
-        size = (*thing.size, thing.height) if kind == CUBE else _round(thing.radius, thing.height)
+        size = (thing.size_x, thing.size_y, thing.height)
         add(OBJECTS, number, kind, (x, y, thing.height / 2, yaw), size, (tone, tone, tone, 1.0))
     depth, width = scene.depth, scene.width
     wood = (0.6, 0.45, 0.3, 1.0)
@@ -58,7 +58,3 @@ def scene_markers(world: World, wall_ns: int) -> Any:
     add(FINGER, 0, CUBE, (finger.x, finger.y, middle, finger.heading), size, (0.1, 0.4, 0.8, 0.9))
     add(GOAL, 0, SPHERE, (*scene.goal, middle, 0.0), (0.015, 0.015, 0.015), (0.0, 0.6, 0.3, 1.0))
     return MSG.MarkerArray(made)
-
-
-def _round(radius: float, height: float) -> tuple[float, float, float]:
-    return (2 * radius, 2 * radius, height)

@@ -283,3 +283,14 @@ def test_a_free_finger_follows_its_command(name: str, build: Any) -> None:
     limits = parameters.limits
     assert limits.f_max * 0.005 / parameters.finger_mass <= v / 2
     assert limits.m_max * 0.005 / parameters.finger_inertia <= w / 2 * (1 + 1e-9)
+
+
+def test_a_finger_that_starts_turned_is_turned(engine: Engine, build: Any) -> None:
+    # Turned to the left, its tip is where the disc is.
+    start = Pose(0.1, 0.0, math.pi / 2)
+    world = engine(build.cupboard(build.disc(0.1, TIP + 0.042), start=start))
+    assert world.finger().heading == pytest.approx(math.pi / 2)
+    run(world, 0.5, Twist(0.0, 0.05, 0.0))
+    contacts = world.contacts()
+    assert {contact.body for contact in contacts} == {0}
+    assert all(contact.x == pytest.approx(TIP, abs=1e-3) for contact in contacts)

@@ -1,0 +1,336 @@
+"""The simulated arm behaves as a real arm's driver does, also when it fails."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim_device.world.arm import (
+    DEFAULT_EXPIRY,
+    FACTORY_LIMITS,
+    MAX_EXPIRY,
+    MAX_PENDING,
+    MAX_UNREAD,
+    ArmFault,
+    ArmSettings,
+    SimulatedArm,
+)
+from sim_device.world.mujoco_world import MujocoWorld
+from sim_device.world.scenes import Pose, Scene
+from tactile_bus.arm_types import ARM_LIMITS, ZERO, ArmLimits, ArmState, Twist
+from tactile_bus.geometry import FINGER_OUTLINE
+from tactile_bus.instant import Instant, after, seconds_between
+
+START = Instant(1_000_000_000)
+LIMITS = ARM_LIMITS["authors_sim"]
+FORWARD = Twist(0.05, 0.0, 0.0)
+
+
+def arm_in(
+    scene: Scene, settings: ArmSettings | None = None, limits: ArmLimits | None = LIMITS
+) -> SimulatedArm:
+    arm = SimulatedArm(
+        MujocoWorld(scene), settings or ArmSettings(), START, np.random.default_rng(3)
+    )
+    if limits is not None:
+        assert arm.request_limits(limits) == limits
+    return arm
+
+
+@pytest.fixture
+def arm(build: Any) -> SimulatedArm:
+    return arm_in(build.cupboard())
+
+
+def drive(arm: SimulatedArm, seconds: float, twist: Twist, period: float = 0.01) -> list[ArmState]:
+    """Command every ``period`` s, as a controller does."""
+    states = []
+    for _ in range(round(seconds / period)):
+        arm.command(twist, arm.now)
+        states += arm.advance(after(arm.now, period))
+    return states
+
+
+def wait(arm: SimulatedArm, seconds: float) -> list[ArmState]:
+    return arm.advance(after(arm.now, seconds))
+
+
+def test_it_moves_as_commanded_and_reports_it(arm: SimulatedArm) -> None:
+    state = drive(arm, 1.0, Twist(0.04, -0.03, 0.2))[-1]
+    assert state.twist.vx == pytest.approx(0.04, rel=1e-3)
+    assert (state.x, state.y) == pytest.approx((-0.2 + 0.04, -0.03), abs=0.001)
+    assert state.heading == pytest.approx(0.2, abs=0.005)
+    assert state.mode == "moving"
+    assert state.captured == arm.now
+    assert (state.fx, state.fy, state.mz) == (0.0, 0.0, 0.0)
+
+
+def test_states_come_at_their_own_rate_without_commands(arm: SimulatedArm) -> None:
+    states = wait(arm, 0.5)
+    assert len(states) == 50
+    steps = {b.captured - a.captured for a, b in pairwise(states)}
+    assert steps == {10_000_000}
+    assert {state.mode for state in states} == {"ready"}
+
+
+def test_uneven_polling_loses_and_doubles_nothing(build: Any) -> None:
+    rng = np.random.default_rng(0)
+    arm = arm_in(build.cupboard(), ArmSettings(state_rate=200))
+    states = []
+    now = START
+    for _ in range(300):
+        now = after(now, float(rng.uniform(0, 0.02)))
+        states += arm.advance(now)
+    stamps = [state.captured for state in states]
+    assert stamps == [START + 5_000_000 * (k + 1) for k in range(len(stamps))]
+    assert seconds_between(stamps[-1], now) < 0.005
+    assert arm.now == stamps[-1]
+
+
+def test_time_does_not_run_backwards(arm: SimulatedArm) -> None:
+    drive(arm, 0.1, FORWARD)
+    before, pose = arm.now, arm.world.finger().x
+    assert arm.advance(Instant(before - 50_000_000)) == []
+    assert arm.now == before
+    assert arm.world.finger().x == pose
+
+
+@pytest.mark.parametrize("expiry", [0.02, DEFAULT_EXPIRY, MAX_EXPIRY, 10.0])
+def test_it_rests_within_100_ms_of_the_last_command(build: Any, expiry: float) -> None:
+    arm = arm_in(build.cupboard(), ArmSettings(state_rate=200))
+    drive(arm, 0.5, FORWARD)
+    arm.command(FORWARD, arm.now, expiry)
+    last = arm.now
+    states = wait(arm, 0.3)
+    still = next(s for s in states if math.hypot(s.twist.vx, s.twist.vy) < 1e-3)
+    assert seconds_between(last, still.captured) <= 0.1
+    # It does obey until then: a command that dies at once is no command.
+    moving = [s for s in states if s.mode == "moving"]
+    assert seconds_between(last, moving[-1].captured) >= min(expiry, MAX_EXPIRY) - 0.011
+    assert states[-1].mode == "stopped"
+    assert arm.counters["expired"] == 1
+    x = states[-1].x
+    assert wait(arm, 1.0)[-1].x == pytest.approx(x, abs=1e-6)
+
+
+def test_a_new_command_moves_a_stopped_arm_again(arm: SimulatedArm) -> None:
+    drive(arm, 0.2, FORWARD)
+    assert wait(arm, 0.2)[-1].mode == "stopped"
+    assert drive(arm, 0.2, FORWARD)[-1].mode == "moving"
+    drive(arm, 0.1, ZERO)
+    assert arm.mode == "ready"
+
+
+@settings(max_examples=40, deadline=None)
+@given(vx=st.floats(-10, 10), vy=st.floats(-10, 10), omega=st.floats(-10, 10))
+def test_speeds_are_cut_to_the_limits_and_keep_their_direction(
+    build: Any, vx: float, vy: float, omega: float
+) -> None:
+    arm = arm_in(build.cupboard())
+    drive(arm, 0.1, Twist(vx, vy, omega))
+    moved = arm.world.finger().twist
+    speed = math.hypot(vx, vy)
+    assert math.hypot(moved.vx, moved.vy) <= LIMITS.v_max * (1 + 1e-6)
+    assert abs(moved.omega) <= LIMITS.omega_max * (1 + 1e-6)
+    scale = min(1.0, LIMITS.v_max / speed) if speed else 1.0
+    assert (moved.vx, moved.vy) == pytest.approx((vx * scale, vy * scale), abs=1e-4)
+    assert (arm.counters["clamped"] > 0) == (speed > LIMITS.v_max or abs(omega) > LIMITS.omega_max)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_command_that_is_no_number_stops_it(arm: SimulatedArm, bad: float) -> None:
+    for twist in (Twist(bad, 0, 0), Twist(0, bad, 0), Twist(0, 0, bad)):
+        drive(arm, 0.1, FORWARD)
+        assert not arm.command(twist, arm.now)
+        assert abs(wait(arm, 0.03)[-1].twist.vx) < 1e-3
+    for expiry in (bad, 0.0, -1.0):
+        drive(arm, 0.1, FORWARD)
+        assert not arm.command(FORWARD, arm.now, expiry)
+        assert abs(wait(arm, 0.03)[-1].twist.vx) < 1e-3
+    assert (arm.counters["not_finite"], arm.counters["bad_expiry"]) == (3, 3)
+
+
+def test_the_wrench_never_stays_above_the_confirmed_limit(build: Any) -> None:
+    tip = FINGER_OUTLINE[3][0]
+    arm = arm_in(build.cupboard(start=Pose(0.375 - tip - 0.01, 0.0, 0.0)))
+    for limit in (5.0, 10.0):
+        arm.request_limits(ArmLimits(0.05, 0.35, limit, 1.5))
+        states = drive(arm, 0.5, FORWARD)
+        assert states[-1].fx == pytest.approx(-limit, rel=0.01)
+        assert states[-1].f_max == limit
+
+
+def test_limits_are_confirmed_by_every_state(build: Any) -> None:
+    arm = arm_in(build.cupboard(), limits=None)
+    state = wait(arm, 0.01)[-1]
+    assert (state.v_max, state.omega_max) == (0.5, 1.0)  # Flexiv's defaults
+    asked = ArmLimits(v_max=0.04, omega_max=5.0, f_max=8.0, m_max=500.0)
+    confirmed = arm.request_limits(asked)
+    # It never confirms more than it is made for.
+    assert confirmed == ArmLimits(0.04, FACTORY_LIMITS.omega_max, 8.0, FACTORY_LIMITS.m_max)
+    state = wait(arm, 0.01)[-1]
+    assert ArmLimits(state.v_max, state.omega_max, state.f_max, state.m_max) == confirmed
+
+
+def test_refused_limits_show_in_the_answer_and_the_state(build: Any) -> None:
+    arm = arm_in(build.cupboard(), limits=None)
+    arm.inject(ArmFault.REFUSES_LIMITS)
+    assert arm.request_limits(LIMITS) == FACTORY_LIMITS
+    assert wait(arm, 0.01)[-1].v_max == FACTORY_LIMITS.v_max
+    arm.clear(ArmFault.REFUSES_LIMITS)
+    assert arm.request_limits(LIMITS) == LIMITS
+
+
+def test_a_silent_arm_sends_nothing_and_moves_on(arm: SimulatedArm) -> None:
+    drive(arm, 0.1, FORWARD)
+    arm.inject(ArmFault.SILENT)
+    x = arm.world.finger().x
+    assert drive(arm, 0.2, FORWARD) == []
+    assert arm.world.finger().x > x + 0.005
+    arm.clear(ArmFault.SILENT)
+    (state,) = drive(arm, 0.01, FORWARD)
+    assert state.captured == arm.now
+
+
+def test_a_frozen_state_has_fresh_stamps_and_old_values(arm: SimulatedArm) -> None:
+    last = drive(arm, 0.1, FORWARD)[-1]
+    arm.inject(ArmFault.FROZEN)
+    states = drive(arm, 0.2, FORWARD)
+    assert len(states) == 20
+    assert {(s.x, s.twist) for s in states} == {(last.x, last.twist)}
+    assert states[-1].captured == arm.now
+    assert arm.world.finger().x > last.x + 0.005
+
+
+def test_a_stale_state_has_old_stamps_too(arm: SimulatedArm) -> None:
+    last = drive(arm, 0.1, FORWARD)[-1]
+    arm.inject(ArmFault.STALE)
+    states = drive(arm, 0.2, FORWARD)
+    assert {s.captured for s in states} == {last.captured}
+    assert states[-1].received == arm.now
+
+
+def test_a_biased_force_sensor_is_biased_in_its_own_frame(build: Any) -> None:
+    turned = build.cupboard(start=Pose(-0.2, 0.0, math.pi / 2))
+    arm = arm_in(turned, ArmSettings(bias=(3.0, 0.0, 0.1)))
+    arm.inject(ArmFault.BIASED)
+    state = wait(arm, 0.01)[-1]
+    assert (state.fx, state.fy, state.mz) == pytest.approx((0.0, 3.0, 0.1))
+    arm.clear(ArmFault.BIASED)
+    state = wait(arm, 0.01)[-1]
+    assert (state.fx, state.fy, state.mz) == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("fault", [ArmFault.ESTOP, ArmFault.FAULT])
+def test_a_stop_latches_until_an_operator_enables(arm: SimulatedArm, fault: ArmFault) -> None:
+    drive(arm, 0.2, FORWARD)
+    arm.inject(fault)
+    state = drive(arm, 0.05, FORWARD)[-1]
+    assert state.mode == fault.value
+    assert math.hypot(state.twist.vx, state.twist.vy) < 1e-3
+    assert arm.counters["not_enabled"] == 5
+    assert not arm.enable()  # the cause is still there
+    arm.clear(fault)
+    x = state.x
+    assert drive(arm, 0.2, FORWARD)[-1].mode == fault.value  # it clears nothing by itself
+    assert arm.world.finger().x == pytest.approx(x, abs=1e-3)
+    assert arm.enable()
+    assert wait(arm, 0.01)[-1].mode == "ready"
+    assert drive(arm, 0.1, FORWARD)[-1].mode == "moving"
+
+
+def test_the_e_stop_outranks_a_fault(arm: SimulatedArm) -> None:
+    arm.inject(ArmFault.ESTOP)
+    arm.inject(ArmFault.FAULT)
+    assert arm.mode == "estop"
+    arm.clear(ArmFault.ESTOP)
+    assert not arm.enable()
+
+
+def test_latency_delays_commands_and_states(build: Any) -> None:
+    arm = arm_in(build.cupboard(), ArmSettings(command_latency=0.03, state_latency=0.02))
+    sent = arm.now
+    states = drive(arm, 0.2, FORWARD)
+    moved = next(s for s in states if s.twist.vx > 0.001)
+    assert seconds_between(sent, moved.captured) == pytest.approx(0.04, abs=0.006)
+    assert all(seconds_between(s.captured, s.received) == pytest.approx(0.02) for s in states)
+    assert states[-1].captured == arm.now - 20_000_000
+    # A command on its way when its time is up is never obeyed.
+    slow = arm_in(build.cupboard(), ArmSettings(command_latency=0.06))
+    slow.command(FORWARD, slow.now, 0.05)
+    wait(slow, 0.3)
+    assert slow.world.finger().x == -0.2
+
+
+def test_noise_has_the_given_spread_and_the_seeds_bits(build: Any) -> None:
+    noisy = ArmSettings(
+        position_noise=1e-4, heading_noise=1e-3, speed_noise=2e-3, turn_noise=3e-3,
+        force_noise=0.1, moment_noise=0.02,
+    )  # fmt: skip
+
+    def record() -> list[ArmState]:
+        arm = arm_in(build.cupboard(), noisy)
+        return [state for _ in range(10) for state in wait(arm, 1.0)]
+
+    states = record()
+    assert states == record()
+    spread = {
+        "x": 1e-4, "y": 1e-4, "heading": 1e-3, "fx": 0.1, "fy": 0.1, "mz": 0.02
+    }  # fmt: skip
+    for name, sigma in spread.items():
+        values = [getattr(state, name) for state in states]
+        assert np.std(values) == pytest.approx(sigma, rel=0.12), name
+    assert np.std([s.twist.vy for s in states]) == pytest.approx(2e-3, rel=0.12)
+    assert np.std([s.twist.omega for s in states]) == pytest.approx(3e-3, rel=0.12)
+
+
+def test_buffers_are_bounded_and_losses_counted(build: Any) -> None:
+    arm = arm_in(build.cupboard(), ArmSettings(command_latency=10.0, state_latency=100.0))
+    for _ in range(MAX_PENDING + 7):
+        arm.command(FORWARD, arm.now)
+    assert arm.counters["overflow"] == 7
+    assert wait(arm, (MAX_UNREAD + 50) * 0.01) == []
+    assert arm.counters["states_lost"] == 50
+    arm.inject(ArmFault.SILENT)
+    assert len(wait(arm, 100.0)) == MAX_UNREAD
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"state_rate": 50.0},
+        {"state_rate": 130.0},
+        {"state_rate": 400.0},
+        {"state_rate": math.nan},
+        {"command_latency": -0.01},
+        {"state_latency": math.inf},
+        {"force_noise": math.nan},
+        {"bias": (math.nan, 0.0, 0.0)},
+    ],
+)
+def test_settings_no_arm_has_are_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(change))):
+        ArmSettings(**change)
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
+@pytest.mark.parametrize("name", ["v_max", "omega_max", "f_max", "m_max"])
+def test_limits_that_do_not_limit_are_refused(name: str, bad: float) -> None:
+    figures = {"v_max": 0.05, "omega_max": 0.3, "f_max": 10.0, "m_max": 1.5, name: bad}
+    with pytest.raises(ValueError, match=name):
+        ArmLimits(**figures)
+
+
+def test_a_trial_is_a_function_of_its_seed(build: Any) -> None:
+    def trial() -> list[ArmState]:
+        scene = build.cupboard(build.box(0.05, 0.005), build.disc(0.12, -0.01))
+        arm = arm_in(scene, ArmSettings(force_noise=0.1, command_latency=0.003))
+        return drive(arm, 4.0, FORWARD, period=0.008)
+
+    assert trial() == trial()
