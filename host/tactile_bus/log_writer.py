@@ -25,6 +25,13 @@ log = logging.getLogger(__name__)
 RETRY_MAX = 10.0
 """s: longest pause between attempts to open a file again."""
 
+SYNC_PERIOD = 0.5
+"""s: data is on the disk, not only in the kernel, at least this often. A `kill -9` spares what the
+kernel has; a power cut does not."""
+
+SPACE_PERIOD = 1.0
+"""s between looks at the free space: a dozen boards log some 10 MB in that time."""
+
 LATCHED_MAX = 64
 """Latched messages repeated in each file: one geometry a board, more boards than one host has."""
 
@@ -37,7 +44,7 @@ class RecorderSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     min_free_bytes: Size = 1 << 30  # logging stops, loudly, when less is free (faults.md row 30)
     max_files: Count | None = None  # retention: the oldest go when there are more; None keeps all
     max_bytes: Count | None = None
-    flush_period: FlushPeriod = 0.5  # what `kill -9` may cost, plus the time of one write
+    flush_period: FlushPeriod = 0.25  # what `kill -9` may cost, plus the time of one write
     chunk_bytes: Count = 1 << 20
     queue_messages: Count = 16384  # 27 s of one board's six streams at 100 Hz
     queue_bytes: Count = 64 << 20
@@ -104,6 +111,8 @@ class LogWriter:
         self._in_file: set[int] = set()
         self._file: McapFile | None = None
         self._opened = 0.0
+        self._synced = 0.0
+        self._space_checked = 0.0
         self._retry_at = 0.0
         self._retry_pause = settings.retry_seconds
 
@@ -158,7 +167,7 @@ class LogWriter:
             self.flush()
 
     def flush(self, last: bool = False) -> None:
-        """Write all that waits, and make it durable. ``last``: try at once, without a pause."""
+        """Write all that waits. ``last``: try at once, without the pause after a failure."""
         if self._pending is None and self._chunk.messages:
             self._pending = self._chunk.seal(self._compressor)
             self._chunk = ChunkBuffer()
@@ -182,9 +191,11 @@ class LogWriter:
         now = time.monotonic()
         if self._file is None and now < self._retry_at and not last:
             return False
-        if self._storage.free(self._set.directory) < self._settings.min_free_bytes:
-            self._stop_for_space()
-            return False
+        if now - self._space_checked >= SPACE_PERIOD or self._file is None:
+            self._space_checked = now
+            if self._storage.free(self._set.directory) < self._settings.min_free_bytes:
+                self._stop_for_space()
+                return False
         size = len(self._pending.data) if self._pending else 0
         file = self._file
         if file is not None and (
@@ -217,59 +228,65 @@ class LogWriter:
             self._set.current, self._storage, f"tactile-reach {version('tactile-reach')}"
         )
         try:
-            place = {
-                "set": self._identity,
-                "file": str(self.files),
-                "started_ns": str(self._now_ns()),
-            }
+            started_ns = str(self._now_ns())
+            place = {"set": self._identity, "file": str(self.files), "started_ns": started_ns}
             file.add_metadata("file", place)
             for write in self._extras.values():
                 write(file)
             self._in_file = set()
-            self._register(file, self._channels)
+            self._define(file, self._channels)
+            file.commit()
             file.sync()
         except OSError:
             file.abandon()
             raise
+        self._in_file = set(self._channels)
         self._unwritten.clear()
         self._file = file
         self._opened = time.monotonic()
         self.files += 1
 
     def _write_waiting(self) -> None:
-        file = self._file
+        """Write all that waits in one go: the fewer calls, the less waiting for other threads."""
+        file, pending = self._file, self._pending
         if file is None:
             return
-        for extra in tuple(self._unwritten):
+        for extra in self._unwritten:
             self._extras[extra](file)
-            del self._unwritten[extra]
         for reason in self.gaps:
             file.add_metadata(GAP, self.gaps[reason].metadata(reason))
-            del self.gaps[reason]
-        if self._pending is not None:
-            self._register(file, self._pending.counts)
-            file.add_chunk(self._pending)
-            self.written += self._pending.messages
+        if pending is not None:
+            self._define(file, pending.counts)
+            file.add_chunk(pending)
+        file.commit()
+        self._unwritten.clear()
+        self.gaps = Gaps()
+        if pending is not None:
+            self._in_file |= pending.counts.keys()
+            self.written += pending.messages
             self._pending = None
             self._latched |= self._new_latched
             self._new_latched = {}
-        file.sync()
+        now = time.monotonic()
+        if now + self._settings.flush_period - self._synced > SYNC_PERIOD:
+            file.sync()
+            self._synced = now
 
-    def _register(self, file: McapFile, numbers: Iterable[int]) -> None:
-        """Write the schemas and channels that this file does not have yet."""
+    def _define(self, file: McapFile, numbers: Iterable[int]) -> None:
+        """Stage the schemas and channels that this file does not have yet."""
+        types = {self._channels[number].topic.msgtype for number in self._in_file}
         for number in numbers:
             if number in self._in_file:
                 continue
             channel = self._channels[number]
             schema = codec().schema(channel.topic)
             identity = self._schemas.setdefault(schema.name, len(self._schemas) + 1)
-            types = {self._channels[other].topic.msgtype for other in self._in_file}
             if schema.name not in types:
                 file.add_schema(identity, schema.name, schema.encoding, schema.data)
+                types.add(schema.name)
             # Both keys are those rosbag2 writes.
             metadata = {"offered_qos_profiles": "", "topic_type_hash": schema.type_hash}
             file.add_channel(number, identity, channel.path, "cdr", metadata)
-            self._in_file.add(number)
 
     def _repeat_latched(self) -> None:
         """Give a new file the values that hold: with their old numbers, so no gap is seen."""
@@ -279,6 +296,7 @@ class LogWriter:
         for number, item in self._latched.items():
             chunk.add(number, item.sequence, self._pending.start_ns, item.publish_ns, item.data)
         self._file.add_chunk(chunk.seal(self._compressor))
+        self._file.commit()
 
     def _end_file(self) -> None:
         file, self._file = self._file, None

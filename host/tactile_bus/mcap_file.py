@@ -13,7 +13,7 @@ import os
 import struct
 import zlib
 from array import array
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -188,13 +188,15 @@ class SealedChunk:
 
 
 class McapFile:
-    """Writer of one file. Every method may raise OSError, and then has changed nothing."""
+    """Writer of one file: ``add_*`` stage records, `commit` writes all of them or none."""
 
     def __init__(self, path: Path, storage: Storage, library: str, profile: str = "ros2") -> None:
+        """Create the file and write its start; OSError (FileExistsError) when that fails."""
         self.path = path
         self.size = 0
         self.messages = 0
         self._storage = storage
+        self._staged: list[tuple[bytes, Callable[[int], None]]] = []
         self._schemas: list[bytes] = []
         self._channels: list[bytes] = []
         self._chunk_index = bytearray()
@@ -213,46 +215,83 @@ class McapFile:
             raise
 
     def add_schema(self, schema: int, name: str, encoding: str, data: bytes) -> None:
-        """Write a schema under the id ``schema`` (1 and up)."""
+        """Stage a schema under the id ``schema`` (1 and up)."""
         body = struct.pack("<H", schema) + _string(name) + _string(encoding)
         record = _record(SCHEMA, body + struct.pack("<I", len(data)) + data)
-        self._put(record)
-        self._schemas.append(record)
+        self._stage(record, lambda _: self._schemas.append(record))
 
     def add_channel(
         self, channel: int, schema: int, topic: str, encoding: str, metadata: Mapping[str, str]
     ) -> None:
-        """Write a channel under the id ``channel``; its schema must have been written."""
+        """Stage a channel under the id ``channel``; its schema must come before it."""
         body = struct.pack("<HH", channel, schema) + _string(topic) + _string(encoding)
         record = _record(CHANNEL, body + _map(metadata))
-        self._put(record)
-        self._channels.append(record)
+        self._stage(record, lambda _: self._channels.append(record))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Write a named table of texts."""
+        """Stage a named table of texts."""
         record = _record(METADATA, _string(name) + _map(values))
-        offset = self.size
-        self._put(record)
-        index = struct.pack("<QQ", offset, len(record)) + _string(name)
-        self._metadata_index.append(_record(METADATA_INDEX, index))
+
+        def note(offset: int) -> None:
+            index = struct.pack("<QQ", offset, len(record)) + _string(name)
+            self._metadata_index.append(_record(METADATA_INDEX, index))
+
+        self._stage(record, note)
 
     def add_attachment(
         self, name: str, media_type: str, data: bytes, log_ns: int, create_ns: int
     ) -> None:
-        """Write a file within the file."""
+        """Stage a file within the file."""
         body = struct.pack("<QQ", log_ns, create_ns) + _string(name) + _string(media_type)
         body += struct.pack("<Q", len(data)) + data
         record = _record(ATTACHMENT, body + struct.pack("<I", zlib.crc32(body)))
-        offset = self.size
-        self._put(record)
-        index = struct.pack("<QQQQQ", offset, len(record), log_ns, create_ns, len(data))
-        index += _string(name) + _string(media_type)
-        self._attachment_index.append(_record(ATTACHMENT_INDEX, index))
+        times_and_size = log_ns, create_ns, len(data)
+
+        def note(offset: int) -> None:
+            index = struct.pack("<QQQQQ", offset, len(record), *times_and_size)
+            index += _string(name) + _string(media_type)
+            self._attachment_index.append(_record(ATTACHMENT_INDEX, index))
+
+        self._stage(record, note)
 
     def add_chunk(self, chunk: SealedChunk) -> None:
-        """Write a chunk and its indexes; its channels must have been written."""
+        """Stage a chunk and its indexes; its channels must come before it."""
+        self._stage(chunk.data, lambda offset: self._note_chunk(chunk, offset))
+
+    def commit(self) -> None:
+        """Write what is staged in one go. OSError: then nothing of it is in the file."""
+        staged, self._staged = self._staged, []
         offset = self.size
-        self._put(chunk.data)
+        self._put(b"".join(record for record, _ in staged))
+        for record, note in staged:
+            note(offset)
+            offset += len(record)
+
+    def sync(self) -> None:
+        """Make what was written survive a power cut."""
+        if self._dirty:
+            self._storage.sync(self._fd)
+            self._dirty = False
+
+    def finish(self) -> None:
+        """Commit, write the summary and close. After an OSError it is closed without one."""
+        try:
+            self.commit()
+            self._put(self._summary())
+            self.sync()
+        finally:
+            self._storage.close(self._fd)
+
+    def abandon(self) -> None:
+        """Close without a summary: every record so far stays readable."""
+        self._storage.close(self._fd)
+
+    def _stage(self, record: bytes, note: Callable[[int], None]) -> None:
+        """Keep a record for `commit`, which calls ``note`` with its offset once it is written."""
+        self._staged.append((record, note))
+
+    def _note_chunk(self, chunk: SealedChunk, offset: int) -> None:
+        """Take a chunk that stands at ``offset`` into the summary to come."""
         if not self.messages:
             self._start_ns, self._end_ns = chunk.start_ns, chunk.end_ns
         self._start_ns = min(self._start_ns, chunk.start_ns)
@@ -271,26 +310,10 @@ class McapFile:
         body += struct.pack("<QQ", chunk.compressed_size, chunk.uncompressed_size)
         self._chunk_index += _record(CHUNK_INDEX, body)
 
-    def sync(self) -> None:
-        """Make what was written survive a power cut."""
-        if self._dirty:
-            self._storage.sync(self._fd)
-            self._dirty = False
-
-    def finish(self) -> None:
-        """Write the summary and close. After an OSError the file is closed without a summary."""
-        try:
-            self._put(self._summary())
-            self.sync()
-        finally:
-            self._storage.close(self._fd)
-
-    def abandon(self) -> None:
-        """Close without a summary: every record so far stays readable."""
-        self._storage.close(self._fd)
-
     def _put(self, data: bytes) -> None:
         """Append all of ``data``, or cut the file back to where it was and raise OSError."""
+        if not data:
+            return
         left = memoryview(data)
         self._dirty = True
         try:

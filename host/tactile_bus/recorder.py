@@ -30,8 +30,8 @@ __all__ = ["Recorder", "RecorderError", "RecorderSettings", "RecorderStats"]
 
 log = logging.getLogger(__name__)
 
-BATCH = 64
-"""Messages the writer takes at once, about 0.1 ms: then other threads may run."""
+BATCH = 512
+"""Messages the writer takes at once, about 1 ms of work: then other threads may run."""
 
 POLL = 0.02
 """s between looks at the queue: waking the writer for every message would cost both threads."""
@@ -45,8 +45,8 @@ class RecorderError(Exception):
 class RecorderStats:
     """State of a log. ``state``: recording, disk_full, io_error, low_space, failed or closed.
 
-    ``written``: messages on the disk. ``dropped``: messages lost, by reason; their sum is that of
-    the log's gap records once it is closed. ``queued``: messages not yet on the disk.
+    ``written``: messages in the files. ``dropped``: messages lost, by reason; their sum is that of
+    the log's gap records once it is closed. ``queued``: messages not yet there.
     """
 
     state: str

@@ -110,6 +110,7 @@ class _Copy:
             self._attachment(self._file, event)
         else:
             self._block(self._file, event)
+        self._file.commit()
 
     def finish(self) -> None:
         """Close the target; `LogError` when there is nothing in it."""

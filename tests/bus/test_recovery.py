@@ -35,6 +35,7 @@ def write_log(path: Path, payload: bytes, chunks: int = CHUNKS, finish: bool = T
     file.add_metadata("software", {"version": "1.2.3"})
     file.add_attachment("cal.toml", "application/toml", b"x = 1\n" * 50, BASE_NS, BASE_NS)
     offsets = []
+    file.commit()
     for number in range(chunks):
         offsets.append(file.size)
         chunk = ChunkBuffer()
@@ -42,6 +43,7 @@ def write_log(path: Path, payload: bytes, chunks: int = CHUNKS, finish: bool = T
             sequence = number * PER_CHUNK + i
             chunk.add(1, sequence, BASE_NS + sequence * 10_000_000, BASE_NS, payload)
         file.add_chunk(chunk.seal(zstandard.ZstdCompressor()))
+        file.commit()
     offsets.append(file.size)
     if finish:
         file.finish()
@@ -125,6 +127,7 @@ def test_whole_blocks_of_a_chunk_that_is_cut_off_are_kept(tmp_path: Path) -> Non
     file = McapFile(path, DiskStorage(), "test")
     file.add_channel(1, 0, "/raw", "", {})
     file.add_chunk(chunk.seal(zstandard.ZstdCompressor()))
+    file.commit()
     file.abandon()
     path.write_bytes(path.read_bytes()[:300_000])
     report = recovered(path)
