@@ -32,6 +32,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("file", type=Path, help="MCAP log of tactiled, whole or cut off")
     parser.add_argument("--out", type=Path, help="PNG to write (default: FILE with .png)")
+    parser.add_argument(
+        "--what",
+        choices=("auto", "taxels", "reach"),
+        default="auto",
+        help="the skin, or a reach from above (default: a reach if the log holds one)",
+    )
     parser.add_argument("--name", help="board to draw (default: the one with the most taxels)")
     parser.add_argument(
         "--at", type=float, metavar="S", help="moment of the taxel maps, s (default: strongest)"
@@ -43,6 +49,9 @@ def run(options: argparse.Namespace) -> int:
     """Draw; 0 when the picture was written, 2 for a bad argument, 3 for an unreadable log."""
     out = options.out or options.file.with_suffix(".png")
     try:
+        if options.what != "taxels" and _drew_reach(options.file, out, options.what == "reach"):
+            print(f"wrote {out}")
+            return 0
         boards = read_boards(options.file)
         if options.name is not None and options.name not in boards:
             print(
@@ -61,6 +70,19 @@ def run(options: argparse.Namespace) -> int:
         return 3
     print(f"wrote {out}")
     return 0
+
+
+def _drew_reach(path: Path, out: Path, must: bool) -> bool:
+    """Draw the reach in a log; False when it holds none, which is an error only if it must."""
+    from tactile_tools.plot_reach import draw_reach
+
+    try:
+        draw_reach(path, out)
+    except LogUnreadableError:
+        if must:
+            raise
+        return False
+    return True
 
 
 def draw(

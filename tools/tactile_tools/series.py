@@ -60,15 +60,18 @@ class BoardSeries:
         return force
 
 
-def messages(path: Path) -> Iterator[tuple[Topic, str, Any]]:
-    """Yield (topic, name, message) of a log in file order, also of one that was cut off."""
+def messages(path: Path, wanted: frozenset[Topic] = WANTED) -> Iterator[tuple[Topic, str, Any]]:
+    """Yield (topic, name, message) of a log in file order, also of one that was cut off.
+
+    LogUnreadableError when the file cannot be read, or when a message is not what it says.
+    """
     decode = codec().decode
     found: dict[str, tuple[Topic, str] | None] = {}
     try:
         for channel, record in read_messages(path):
             if channel.topic not in found:
                 found[channel.topic] = find_topic(channel.topic)
-            if (known := found[channel.topic]) is not None and known[0] in WANTED:
+            if (known := found[channel.topic]) is not None and known[0] in wanted:
                 yield *known, decode(known[0], record.data)
     except (LogError, DecodeError) as error:
         raise LogUnreadableError(str(error)) from error

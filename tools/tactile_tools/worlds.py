@@ -1,0 +1,48 @@
+"""Scenes and engines by the names a user gives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sim_device.world.base import World
+from sim_device.world.generate import generate
+from sim_device.world.recorded import load_recorded
+from sim_device.world.scenes import Scene, SceneError
+
+RECORDED = "recorded:"
+
+
+def load_scene(source: str, seed: int) -> Scene:
+    """Scene ``seed`` of a generator or of ``recorded:FILE.json.gz``, or the one in ``FILE.json``.
+
+    ValueError that says what there is.
+    """
+    if source.startswith(RECORDED):
+        path = Path(source.removeprefix(RECORDED))
+        scenes = {scene.seed: scene for scene in load_recorded(path)}
+        if seed not in scenes:
+            raise SceneError(
+                f"{path} has no scene {seed}; it has {min(scenes)} to {max(scenes)}: set --seed"
+            )
+        return scenes[seed]
+    if source.endswith(".json"):
+        try:
+            return Scene.from_json(Path(source).read_text(encoding="utf-8"))
+        except OSError as error:
+            raise SceneError(f"cannot read the scene {source}: {error.strerror}") from error
+    return generate(source, seed)
+
+
+def make_world(engine: str, scene: Scene) -> World:
+    """Build ``scene`` in "mujoco" or "pymunk"; ValueError where the engine is not installed."""
+    if engine == "mujoco":
+        from sim_device.world.mujoco_world import MujocoWorld
+
+        return MujocoWorld(scene)
+    try:
+        from sim_device.world.pymunk_world import PymunkWorld
+    except ImportError as error:
+        raise ValueError(
+            "the engine pymunk is not installed: pip install 'tactile-reach[crosscheck]'"
+        ) from error
+    return PymunkWorld(scene)
