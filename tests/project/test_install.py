@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-COMMANDS = ("tactiled", "simdevice", "tactile")
+COMMANDS = ("tactiled", "reachd", "simdevice", "tactile")
 TOP_LEVEL = {"sensor_proto", "sim_device", "tactile_bus", "tactiled", "reachd", "tactile_tools"}
 
 
