@@ -232,9 +232,10 @@ class Daemon:
                 continue
             if port.trouble is not None:
                 return str(port.trouble)
-            for station in list(port.stations.values()):
-                if station.refusal is not None:
-                    return f"{station.refusal.problem}; {station.refusal.remedy}"
+            refusals = [station.refusal for station in list(port.stations.values())]
+            first = refusals[0] if refusals else None
+            if first is not None and None not in refusals:
+                return f"{first.problem}; {first.remedy}"
         return None
 
     # The pipeline's thread
@@ -256,6 +257,7 @@ class Daemon:
                     self.done.set()
             for port in self.ports:
                 port.farewell()
+            self._abandon_requests()
         except BaseException as error:  # noqa: BLE001 - thread boundary: the daemon must end loudly
             self._fail(error)
 
@@ -276,6 +278,14 @@ class Daemon:
                 future.set_result(work())
             except (ValueError, ServiceError, CalibrationError) as error:
                 future.set_exception(error)
+
+    def _abandon_requests(self) -> None:
+        """Answer everyone who still waits, so that zenoh can close at once."""
+        error = ServiceError("tactiled is stopping")
+        while self._calls:
+            self._calls.popleft()[1].set_exception(error)
+        for station in self.stations:
+            station.abandon_requests(error)
 
     def _each_second(self, now: Instant) -> None:
         outlet = self._outlet

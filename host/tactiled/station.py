@@ -225,6 +225,14 @@ class Station:
         self._tares.append(future)
         return future
 
+    def abandon_requests(self, error: Exception) -> None:
+        """Fail every request under way."""
+        waiting: list[Future[Any]] = [*self._answers.values(), *self._tares]
+        for future in waiting:
+            future.set_exception(error)
+        self._answers.clear()
+        self._tares.clear()
+
     def flush(self) -> None:
         """Send the cycle under way, as it stands."""
         if self.pipeline is not None:

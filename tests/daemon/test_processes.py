@@ -278,6 +278,30 @@ def test_ctrl_c_leaves_a_whole_log_that_replays_on_keys_of_its_own(lab: Lab) -> 
     assert not live.heard
 
 
+def test_whoever_waits_for_an_answer_is_told_that_the_daemon_stops(lab: Lab) -> None:
+    board = lab.boards("--pty", "board0", "--seed", "1", link="board0")
+    daemon = lab.tactiled("--port", "board0", "--no-log")
+    session = lab.listen()
+    Ear(session).wait(10)
+    board.process.send_signal(signal.SIGSTOP)
+    answers: list[str] = []
+
+    def tare() -> None:
+        try:
+            ask(session, "tare", timeout=SLOW)
+        except ServiceError as error:
+            answers.append(str(error))
+
+    thread = threading.Thread(target=tare)
+    thread.start()
+    time.sleep(0.5)
+    daemon.process.terminate()
+    thread.join(SLOW)
+    assert daemon.wait() == 0, daemon.said
+    assert answers
+    assert "did not end in time" not in daemon.said
+
+
 def test_silence_ends_the_features_and_never_repeats_one(lab: Lab) -> None:
     board = lab.boards("--pty", "board0", "--seed", "1", link="board0")
     daemon = lab.tactiled("--port", "board0", "--no-log")
