@@ -24,6 +24,7 @@ _COMMON_SAFETY: dict[str, Any] = {
     "features_latch": 1.0,
     "arm_age": 0.05,
     "arm_latch": 1.0,  # an arm that was away for so long shall not start off by itself
+    "frozen_after": 0.3,  # by then the slowest watched command has gone 0.6 mm
     "future": 0.01,  # the board clock's mapping errs by a few ms; more is a fault
     "lateness": 0.05,
     "period": 0.01,

@@ -23,6 +23,7 @@ from reachd.limits import (
 )
 from reachd.safety_settings import MOVING_MODES, PAUSED_MODE, Check, SafetySettings
 from reachd.seam import ZERO, ArmState, Goal, Touch, Twist
+from reachd.stillness import Stillness
 from tactile_bus.instant import Instant, seconds_between
 
 Effect = Literal["ignored", "limited", "stopped", "latched", "refused"]
@@ -76,6 +77,7 @@ class SafetyGate:
         self._last = ZERO
         self._stepped: Instant | None = None
         self._felt: Instant | None = None  # when the last valid features were captured
+        self._still = Stillness()
 
     @property
     def armed(self) -> bool:
@@ -127,6 +129,7 @@ class SafetyGate:
             self._hold = None
             self._proven = True
             self._last = ZERO
+            self._still = Stillness()
         return tuple(refusals)
 
     def step(
@@ -271,6 +274,9 @@ class SafetyGate:
         if not finite(arm.x, arm.y, arm.heading, arm.fx, arm.fy, arm.mz):
             text = "the arm's state holds a number that is not finite"
             stops.append(Intervention(Check.ARM_NOT_FINITE, "stopped", text))
+        elif self._still.frozen(arm, self._last, now, s) and self._on(Check.ARM_FROZEN):
+            text = "the arm's state does not change although the arm is told to move"
+            faults.append(Intervention(Check.ARM_FROZEN, "latched", text))
         if arm.mode == PAUSED_MODE:
             if self._on(Check.ARM_STOPPED):
                 text = "the arm stopped by itself because commands had ceased"

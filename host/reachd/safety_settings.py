@@ -25,6 +25,7 @@ class Check(StrEnum):
     ARM_LOST = "arm_lost"
     ARM_FUTURE = "arm_future"
     ARM_NOT_FINITE = "arm_not_finite"
+    ARM_FROZEN = "arm_frozen"
     ARM_MODE = "arm_mode"
     ARM_STOPPED = "arm_stopped"
     ARM_LIMITS = "arm_limits"
@@ -79,6 +80,7 @@ class SafetySettings:
     features_latch: float = number("s", "age of the last valid features at which the gate latches")
     arm_age: float = number("s", "age of the arm's state at which motion ends")
     arm_latch: float = number("s", "age of the arm's state at which the gate latches")
+    frozen_after: float = number("s", "motion commanded but none reported, at which it latches")
     future: float = number("s", "how far ahead of now an input may be stamped", 0, 1, above=False)
     lateness: float = number("s", "lateness of the control loop at which motion ends")
     period: float = number("s", "period of the control loop", 0.0, 0.1)

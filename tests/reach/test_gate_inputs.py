@@ -248,6 +248,73 @@ def test_an_arm_state_that_is_not_finite_stops(
     assert passes(r.step())
 
 
+STEP = Twist(0.04, 0.0, 0.0)
+
+
+def still(r: Rig, cycles: int, wanted: Twist = STEP, **values: object) -> list[Decision]:
+    """Cycles in which the arm, told to move, reports the same values with fresh stamps."""
+    return [r.step(wanted, arm=r.fresh_arm(-r.period, **values)) for _ in range(cycles)]
+
+
+def test_a_frozen_arm_state_latches(rig: Callable[..., Rig]) -> None:
+    """The first cycle commands, the second sees the first, and 300 ms after it is too long."""
+    r = rig()
+    held = [d.held for d in still(r, 33)]
+    assert held.index(Check.ARM_FROZEN) == 32
+    assert passes(still(rig(Check.ARM_FROZEN), 100)[-1])
+    r.now = after(r.now, 0.01)
+    assert r.request() == set()
+    assert all(passes(d) for d in still(r, 30)), "it begins to count anew"
+
+
+@pytest.mark.parametrize(
+    ("values", "frozen"),
+    [
+        ({"fx": -math.nextafter(1.0, 0)}, True),
+        ({"fx": -1.0}, False),
+        ({"fx": -9.0}, False),
+        ({"fx": -9.0, "twist": Twist(0.03, 0.0, 0.0)}, True),
+        ({"fx": -9.0, "twist": Twist(0.0, 0.0011, 0.0)}, True),
+        ({"fx": -9.0, "twist": Twist(0.001, 0.0, 0.001)}, False),
+        ({"fx": -9.0, "twist": Twist(0.0, 0.0, -0.002)}, True),
+    ],
+)
+def test_a_jammed_arm_is_not_a_frozen_one(
+    values: dict, frozen: bool, rig: Callable[..., Rig]
+) -> None:
+    assert (still(rig(), 60, **values)[-1].held is Check.ARM_FROZEN) == frozen
+
+
+@pytest.mark.parametrize(
+    ("wanted", "frozen"),
+    [
+        (ZERO, False),
+        (Twist(0.0019, 0.0, 0.0), False),
+        (Twist(0.0021, 0.0, 0.0), True),
+        (Twist(0.0, 0.0, 0.012), False),  # 1.9 mm/s at the tip
+        (Twist(0.0, 0.0, -0.014), True),
+    ],
+)
+def test_an_arm_at_rest_is_not_a_frozen_one(
+    wanted: Twist, frozen: bool, rig: Callable[..., Rig]
+) -> None:
+    assert (still(rig(), 60, wanted)[-1].held is Check.ARM_FROZEN) == frozen
+
+
+@pytest.mark.parametrize("name", ["x", "y", "heading"])
+@pytest.mark.parametrize(("step", "frozen"), [(1.1e-5, False), (1e-6, True)])
+def test_an_arm_that_moves_is_not_a_frozen_one(
+    name: str, step: float, frozen: bool, rig: Callable[..., Rig]
+) -> None:
+    for sign in (1.0, -1.0):
+        r = rig()
+        at = 0.0 if name != "x" else -0.2
+        for k in range(40):
+            decision = r.step(STEP, arm=r.fresh_arm(-r.period, **{name: at + sign * k * step}))
+        # A creep of a micrometre a cycle adds up to motion after ten of them.
+        assert decision.held is (Check.ARM_FROZEN if frozen and k * step < 1e-5 else None)
+
+
 # --- loop -------------------------------------------------------------------------------------
 
 

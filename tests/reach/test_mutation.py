@@ -65,5 +65,5 @@ def test_a_noticed_mutant_is_killed_and_another_survives(tmp_path: Path) -> None
     made = [m for m in mutation.mutants("limits.py", source) if "part" in m.before]
     caught = next(m for m in made if m.after == "1.0 + part")
     missed = next(m for m in mutation.mutants("limits.py", source) if m.before == "force > 0.0")
-    assert mutation.judge(caught, [str(test)], 60.0) == "killed"
-    assert mutation.judge(missed, [str(test)], 60.0) == "survived"
+    assert mutation.judge(mutation.PACKAGE, caught, [str(test)], 60.0) == "killed"
+    assert mutation.judge(mutation.PACKAGE, missed, [str(test)], 60.0) == "survived"

@@ -59,8 +59,9 @@ class Bench:
 
     def arm(self) -> ArmState:
         limits = self.p.safety.arm_limits
+        force = self.force or (-5.0 if self.stuck else 0.0)  # what does not move is pressed
         return ArmState(
-            self.now, self.now, self.x, self.y, self.heading, self.twist, self.force, 0.0, 0.0,
+            self.now, self.now, self.x, self.y, self.heading, self.twist, force, 0.0, 0.0,
             self.mode, limits.v_max, limits.omega_max, limits.f_max, limits.m_max,
         )  # fmt: skip
 

@@ -27,7 +27,7 @@ from rich.progress import Progress
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "host" / "reachd"
-FILES = ("safety.py", "limits.py")
+FILES = ("safety.py", "limits.py", "stillness.py")
 TESTS = ("test_gate_limits.py", "test_gate_inputs.py", "test_gate_random.py")
 RANDOM_INPUTS = "2000"
 """Inputs of the random test for each mutant: what it finds it finds among the first."""
@@ -154,13 +154,11 @@ def trial(overlay: str, tests: Sequence[str]) -> None:
     sys.exit(pytest.main([*options, *tests]))
 
 
-def judge(mutant: Mutant | None, tests: Sequence[str], limit: float) -> str:
-    """Fate of one mutant, or of the package as it is where there is none."""
+def judge(package: Path, mutant: Mutant | None, tests: Sequence[str], limit: float) -> str:
+    """Fate of one mutant of ``package``, or of the package as it is where there is none."""
     context = multiprocessing.get_context("forkserver")
     with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
-        shutil.copytree(
-            PACKAGE, Path(folder) / "reachd", ignore=shutil.ignore_patterns("__pycache__")
-        )
+        _copy(package, Path(folder) / "reachd")
         if mutant is not None:
             (Path(folder) / "reachd" / mutant.file).write_text(mutant.source, encoding="utf-8")
         process = context.Process(target=trial, args=(folder, tests), daemon=True)
@@ -175,9 +173,12 @@ def judge(mutant: Mutant | None, tests: Sequence[str], limit: float) -> str:
         return "survived" if process.exitcode == 0 else "killed"
 
 
+def _copy(source: Path, target: Path) -> None:
+    shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
+
+
 def run(options: argparse.Namespace) -> int:
     """Judge every mutant, several at a time, and report the survivors."""
-    console = Console()
     folder = ROOT / "tests" / "reach"
     if not folder.is_dir() or not PACKAGE.is_dir():
         print(
@@ -185,24 +186,40 @@ def run(options: argparse.Namespace) -> int:
             file=sys.stderr,
         )
         return 3
-    tests = [str(folder / name) for name in TESTS]
-    made = [m for f in options.file for m in mutants(f, (PACKAGE / f).read_text(encoding="utf-8"))]
+    with tempfile.TemporaryDirectory(prefix="mutation-") as frozen:
+        # Copies, so that work on the checkout does not disturb a run of many minutes.
+        package, tests = Path(frozen) / "reachd", Path(frozen) / "tests"
+        _copy(PACKAGE, package)
+        _copy(folder, tests)
+        return _judge_all(package, [str(tests / name) for name in TESTS], options)
+
+
+def _judge_all(package: Path, tests: Sequence[str], options: argparse.Namespace) -> int:
+    made = [m for f in options.file for m in mutants(f, (package / f).read_text(encoding="utf-8"))]
     total = len(made)
     if options.sample is not None and options.sample < total:
         made = random.Random(options.seed).sample(made, options.sample)
     multiprocessing.get_context("forkserver").set_forkserver_preload(
         ["pytest", "numpy", "hypothesis", "scipy.integrate"]
     )
-    if judge(None, tests, options.limit) != "survived":
+    if judge(package, None, tests, options.limit) != "survived":
         print("the tests fail on the package as it is: mend that first", file=sys.stderr)
         return 3
     verdicts = []
+    console = Console()
     with Progress(console=console, transient=True) as bar, ThreadPoolExecutor(options.jobs) as pool:
         task = bar.add_task(f"{len(made)} of {total} mutants", total=len(made))
-        jobs = {pool.submit(judge, m, tests, options.limit): m for m in made}
+        jobs = {pool.submit(judge, package, m, tests, options.limit): m for m in made}
         for job in as_completed(jobs):
             verdicts.append(Verdict(jobs[job], job.result()))
             bar.advance(task)
+    return _report(verdicts, total, console, options)
+
+
+def _report(
+    verdicts: list[Verdict], total: int, console: Console, options: argparse.Namespace
+) -> int:
+    """Print and write what survived; 1 when that is more than was allowed."""
     survivors = sorted(
         (v.mutant for v in verdicts if v.fate == "survived"), key=lambda m: (m.file, m.line)
     )
@@ -210,24 +227,23 @@ def run(options: argparse.Namespace) -> int:
     for mutant in survivors:
         text = f"{mutant.file}:{mutant.line}: {mutant.before}  →  {mutant.after}"
         console.print(text, markup=False, soft_wrap=True)
-    killed = len(made) - len(survivors)
     console.print(
-        f"{len(made)} mutants of {total}: {killed} killed ({slow} by the time limit), "
-        f"{len(survivors)} survived"
+        f"{len(verdicts)} mutants of {total}: {len(verdicts) - len(survivors)} killed "
+        f"({slow} by the time limit), {len(survivors)} survived"
     )
     if options.json:
-        _write(options.json, made, survivors, slow)
+        _write(options.json, len(verdicts), survivors, slow)
     allowed = options.max_survivors
     return 1 if allowed is not None and len(survivors) > allowed else 0
 
 
-def _write(path: Path, made: list[Mutant], survivors: list[Mutant], slow: int) -> None:
+def _write(path: Path, judged: int, survivors: list[Mutant], slow: int) -> None:
     def plain(mutant: Mutant) -> dict[str, Any]:
         return {k: v for k, v in asdict(mutant).items() if k != "source"}
 
     found = {
-        "mutants": len(made),
-        "killed": len(made) - len(survivors),
+        "mutants": judged,
+        "killed": judged - len(survivors),
         "timeouts": slow,
         "survivors": [plain(m) for m in survivors],
     }
