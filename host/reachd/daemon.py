@@ -1,0 +1,370 @@
+"""The daemon: threads and I/O round the pure parts.
+
+Threads: the control loop's (`loop`), the reporter's (`publish`), the log's writer (`recorder`),
+zenoh's own for services and for what is logged, and the main thread, which watches. Each that dies
+takes the daemon down loudly; the arm then stops by itself, for commands have ceased.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import json
+import logging
+import platform
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from reachd.arms import Arm, ArmError, BusArm
+from reachd.cycle import Controller, Cycle, Inputs
+from reachd.listen import Listener
+from reachd.lock import ArmLock, LockError
+from reachd.loop import ControlLoop
+from reachd.operator_requests import OperatorRequests, RefusedError
+from reachd.outcome import Outcome
+from reachd.publish import Reporter
+from reachd.report import as_json
+from reachd.safety import SafetyGate
+from reachd.seam import Goal, Strategy
+from reachd.services import ReachServices
+from reachd.settings import Settings
+from reachd.supervisor import State, Supervisor
+from reachd.touch_input import TouchInput
+from tactile_bus.instant import Instant, WallClock, monotonic_now, seconds_between
+from tactile_bus.messages import codec
+from tactile_bus.recorder import Recorder, RecorderError
+from tactile_bus.session import BusError, close_session, open_session
+from tactile_bus.streams import list_alive
+from tactile_bus.topics import ARM_STATE, FEATURES, alive_key, commander_key
+
+log = logging.getLogger(__name__)
+
+SWITCH_INTERVAL = 0.0002
+"""s after which Python hands the interpreter on: the control loop must get it soon after it
+wakes."""
+
+ASK_COMMANDERS = 0.3
+"""s to ask the bus whether somebody else commands the arm."""
+
+STOP_TIMEOUT = 0.3
+"""s for the control loop to end: a cycle takes 10 ms."""
+
+COLLECT_EVERY = 10.0
+"""s between collections of garbage while nothing moves."""
+
+NAMES_TIMEOUT = 0.5
+"""s to ask the bus for the names of boards, for an error message."""
+
+
+class StartError(Exception):
+    """The environment does not allow a reach; the message holds the remedy."""
+
+
+class Daemon:
+    """Everything between `start` and `stop`; used from the main thread.
+
+    ``failure``: what a thread died of. ``done``: set when there is nothing more to do.
+    """
+
+    def __init__(self, settings: Settings, strategy: Strategy) -> None:
+        self.settings = settings
+        self.failure: tuple[str, BaseException] | None = None
+        self.done = threading.Event()
+        self.recorder: Recorder | None = None
+        self._wall = WallClock.take()
+        self._lock = ArmLock(settings.arm)
+        self._session: zenoh.Session | None = None
+        self._arm: Arm | None = None
+        self._touch: TouchInput | None = None
+        self._reporter: Reporter | None = None
+        self._listener: Listener | None = None
+        self._services: ReachServices | None = None
+        self._requests: OperatorRequests | None = None
+        self._tokens: list[zenoh.LivelinessToken] = []
+        self._log_state = "recording"
+        self._collected = monotonic_now()
+        p = settings.parameters
+        supervisor = Supervisor(strategy, p, settings.home, auto_reset=settings.auto_reset)
+        self.loop = ControlLoop(
+            Controller(supervisor, SafetyGate(p.safety), p.safety),
+            p.safety.period,
+            p.safety.command_expiry,
+            self._sense,
+            self._act,
+            self._report,
+            self.fail,
+            settings.priority,
+        )
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What a reach was made with."""
+        s = self.settings
+        return {"strategy": s.strategy, "set": s.parameters.name, "seed": s.seed}
+
+    def start(self) -> None:
+        """Bring everything up, disarmed; `StartError`, and all down again, when that cannot be."""
+        try:
+            self._start()
+        except (LockError, BusError, RecorderError, ArmError) as error:
+            self.stop()
+            raise StartError(str(error)) from error
+        except StartError:
+            self.stop()
+            raise
+
+    def _start(self) -> None:
+        settings, safety = self.settings, self.settings.parameters.safety
+        self._lock.acquire(settings.name)
+        sys.setswitchinterval(SWITCH_INTERVAL)
+        codec()
+        self._session = session = open_session(settings.bus)
+        self._claim(session)
+        if settings.log is not None:
+            self.recorder = self._open_log(settings.log)
+            self._listener = Listener(
+                session, self.recorder, self._wall, settings.board, settings.arm
+            )
+        self._touch = TouchInput(
+            session, settings.board, safety.features_age, remote=settings.remote_board
+        )
+        self._arm = BusArm(
+            session, settings.arm, self._wall, safety.arm_age, remote=settings.remote_arm
+        )
+        self._arm.open()
+        self._reporter = Reporter(
+            session,
+            self.recorder,
+            self._wall,
+            settings.name,
+            settings.arm,
+            settings.strategy,
+            self.fail,
+        )
+        self._requests = OperatorRequests(self.loop, self._arm, settings.parameters, self._reporter)
+        # What lives now is taken out of the collector's sight, which must not stop the loop.
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        self.loop.start()
+        self._services = ReachServices(session, settings.name, self._requests, self.summary)
+
+    def _claim(self, session: zenoh.Session) -> None:
+        """Say who commands the arm; refuse when somebody on another machine does."""
+        arm, name = self.settings.arm, self.settings.name
+        mine = commander_key(arm, f"{name}-{str(session.zid())[:32]}")
+        self._tokens = [
+            session.liveliness().declare_token(key) for key in (mine, alive_key(name, "reach"))
+        ]
+        replies = session.liveliness().get(f"arm/{arm}/commander/*", timeout=ASK_COMMANDERS)
+        others = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None} - {mine}
+        if others:
+            who = others.pop().rsplit("/", 1)[1].rpartition("-")[0]
+            raise StartError(
+                f"arm {arm!r} is commanded by another reachd (reach {who!r}) on this bus: stop "
+                "that one, or name another --arm"
+            )
+
+    def wait_ready(self, stopping: threading.Event) -> None:
+        """Wait until valid features and the arm's state come; `StartError` when they do not."""
+        safety = self.settings.parameters.safety
+        deadline = time.monotonic() + self.settings.wait
+        while not (stopping.is_set() or self.done.is_set()):
+            cycle = self.loop.last
+            if cycle is not None:
+                touch, arm = cycle.inputs.touch, cycle.inputs.arm
+                felt = touch is not None and touch.valid and cycle.touch_age < safety.features_age
+                if felt and arm is not None and cycle.arm_age < safety.arm_age:
+                    return
+            if time.monotonic() >= deadline:
+                raise StartError(self._missing())
+            stopping.wait(0.02)
+
+    def reach(self, goal: Goal) -> None:
+        """Arm and begin a reach; `StartError` when either is refused."""
+        requests, touch = self._requests, self._touch
+        if requests is None or touch is None:
+            raise RuntimeError("reach() before start()")
+        try:
+            requests.arm()
+            if not touch.calibrated:
+                log.warning("board %s is not calibrated: its forces are rough", self.settings.board)
+            requests.reach(goal.x, goal.y, goal.radius, goal.time_limit)
+        except RefusedError as error:
+            raise StartError(f"nothing moves: {error}") from error
+
+    def cancel(self, text: str) -> None:
+        """Stop a reach that is under way, with an outcome: the next cycle sends the zero twist."""
+        if self._requests is None or not self.moving:
+            return
+        try:
+            self._requests.stop(text)
+        except RefusedError as error:
+            log.debug("%s", error)
+            return
+        cycles, deadline = self.loop.lateness.cycles, time.monotonic() + STOP_TIMEOUT
+        while self.loop.lateness.cycles == cycles and time.monotonic() < deadline:
+            time.sleep(0.001)
+
+    @property
+    def moving(self) -> bool:
+        """Whether a trial is under way."""
+        return self.loop.controller.supervisor.state in (State.HOMING, State.REACHING)
+
+    def conclude(self, outcome: Outcome, goal: Goal) -> str:
+        """Write an outcome into the log; returns it as JSON."""
+        text = as_json(outcome, goal, self.about)
+        if self.recorder is not None:
+            self.recorder.metadata("outcome", {"json": text})
+        return text
+
+    def watch(self) -> None:
+        """Look after log and garbage; called a few times a second by the main thread."""
+        if self.recorder is not None:
+            stats = self.recorder.stats
+            if stats.state != self._log_state:
+                self._log_state = stats.state
+                level = logging.INFO if stats.state == "recording" else logging.ERROR
+                log.log(level, "log %s: %s %s", stats.path, stats.state, stats.last_error)
+        now = monotonic_now()
+        if not self.moving and seconds_between(self._collected, now) > COLLECT_EVERY:
+            self._collected = now
+            gc.collect()
+
+    def stop(self) -> bool:
+        """End in order: zero twist, services, reports, log (at most 1 s), arm, bus, lock.
+
+        False when a thread is still inside somebody's code: the interpreter must then not be taken
+        down under it, which would abort the process.
+        """
+        clean = self.loop.stop(STOP_TIMEOUT)
+        if self._services is not None:
+            self._services.close()
+        if self._listener is not None:
+            self._listener.close()
+        if self._reporter is not None:
+            clean &= self._reporter.close()
+        if self.recorder is not None:
+            self.recorder.metadata("lateness", _texts(self.loop.lateness.summary()))
+            if not self.recorder.close():
+                log.error("the log was not closed in time; see `tactile log recover`")
+        if self._arm is not None and clean:
+            self._arm.close()
+        if self._touch is not None:
+            self._touch.close()
+        if self._session is not None:
+            clean &= close_session(self._session)
+            self._session = None
+        self._lock.release()
+        return clean
+
+    def summary(self) -> dict[str, Any]:
+        """Everything worth knowing, for the status service. s, m, N."""
+        cycle, touch, arm = self.loop.last, self._touch, self._arm
+        values: dict[str, Any] = self.about | {
+            "board": self.settings.board,
+            "arm": self.settings.arm,
+            "cycles": self.loop.lateness.cycles,
+            "deadlines_missed": self.loop.missed,
+            "real_time": self.loop.real_time,
+            "lateness_s": self.loop.lateness.summary(),
+            "features": {} if touch is None else touch.counters(),
+            "arm_state": {} if arm is None else arm.counters(),
+            "reports_dropped": 0 if self._reporter is None else self._reporter.dropped,
+        }
+        if cycle is not None:
+            status, held = cycle.status, cycle.decision.held
+            values |= {
+                "state": str(status.state),
+                "activity": status.activity,
+                "text": status.text,
+                "elapsed": status.elapsed,
+                "distance": status.distance if status.distance == status.distance else None,
+                "goal": None if status.goal is None else dataclasses.asdict(status.goal),
+                "armed": held is None,
+                "held": None if held is None else str(held),
+                "interventions": [i.text for i in cycle.decision.interventions],
+                "outcome": status.outcome,
+            }
+        if self.recorder is not None:
+            values["log"] = dataclasses.asdict(self.recorder.stats)
+        return values
+
+    # What the control loop calls
+
+    def _sense(self, now: Instant) -> Inputs:
+        touch, arm = self._touch, self._arm
+        if touch is None or arm is None:
+            return Inputs(None, None)
+        newest, state = touch.newest(now), arm.state(now)
+        return Inputs(newest, state, touch.duplicated(now) or arm.duplicated(now))
+
+    def _act(self, twist: Any, expiry: float, now: Instant) -> None:
+        if self._arm is not None:
+            self._arm.command(twist, expiry, now)
+
+    def _report(self, cycle: Cycle) -> None:
+        if self._reporter is not None:
+            self._reporter.cycle(cycle)
+
+    def fail(self, error: BaseException) -> None:
+        """A thread, the caller's or the one it speaks for, has failed."""
+        if self.failure is None:
+            name = threading.current_thread().name
+            self.failure = (name, error)
+            log.critical("thread %s failed", name, exc_info=error)
+        self.done.set()
+
+    def _open_log(self, destination: Path) -> Recorder:
+        settings = self.settings
+        recorder = Recorder(destination, settings.recorder, prefix=settings.name, clock=self._wall)
+        about = {key: str(value) for key, value in self.about.items()}
+        machine = {"python": platform.python_version(), "host": platform.platform()}
+        names = {"board": settings.board, "arm": settings.arm, "reach": settings.name}
+        recorder.metadata("reachd", about | names | machine)
+        values = json.dumps(dataclasses.asdict(settings.parameters), default=sorted, indent=1)
+        recorder.attach("parameters.json", "application/json", values.encode())
+        if settings.config_path is not None:
+            text = settings.config_path.read_bytes()
+            recorder.attach(settings.config_path.name, "application/toml", text)
+        return recorder
+
+    def _missing(self) -> str:
+        """Which input does not come, or is no good, and what to do about it."""
+        s, cycle, touch = self.settings, self.loop.last, self._touch
+        seen = None if cycle is None else cycle.inputs.touch
+        problems = []
+        if cycle is None or seen is None or touch is None:
+            names = [] if self._session is None else list_alive(self._session, NAMES_TIMEOUT)
+            there = f"boards on the bus: {', '.join(names)}" if names else "no board is on the bus"
+            problems.append(
+                f"no features came on {FEATURES.key(s.board)} within {s.wait:g} s: is tactiled "
+                f"running, and is this the board's name (--board)? {there}"
+            )
+        elif not seen.valid:
+            problems.append(f"the features of {s.board} are not valid: {', '.join(touch.reasons)}")
+        elif not abs(cycle.touch_age) < s.parameters.safety.features_age:
+            problems.append(
+                f"the features of {s.board} are {cycle.touch_age:.3f} s old: has tactiled stopped? "
+                'If it runs on another machine, set [inputs] board_clock = "remote"'
+            )
+        if cycle is None or cycle.inputs.arm is None:
+            problems.append(
+                f"no state came on {ARM_STATE.key(s.arm)} within {s.wait:g} s: is the arm's driver "
+                "running, and is this its name (--arm)?"
+            )
+        elif not abs(cycle.arm_age) < s.parameters.safety.arm_age:
+            problems.append(
+                f"the state of arm {s.arm!r} is {cycle.arm_age:.3f} s old: has its driver stopped? "
+                'If it runs on another machine, set [inputs] arm_clock = "remote"'
+            )
+        return "; ".join(problems) or "features and arm come too seldom to start"
+
+
+def _texts(values: dict[str, float]) -> dict[str, str]:
+    return {key: f"{value:.6f}" for key, value in values.items()}

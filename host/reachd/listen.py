@@ -1,0 +1,57 @@
+"""Everything that is said on the bus about a trial, into the log as it came."""
+
+from __future__ import annotations
+
+import zenoh
+
+from tactile_bus.instant import WallClock, monotonic_now
+from tactile_bus.recorder import Recorder
+from tactile_bus.streams import BusSample, Tap
+from tactile_bus.topics import ARM_STATE, NAME, WORLD, find_topic, service_key
+
+MAX_NAMES = 16
+"""Names of streams that are logged: a board's, an arm's and a world's, and some to spare; so that
+a publisher that makes up names cannot fill the log with channels."""
+
+
+class Listener:
+    """Logs all streams of ``board``, the state of ``arm`` and the objects of every world.
+
+    ``refused``: samples of topics or names that are not logged.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, recorder: Recorder, wall: WallClock, board: str, arm: str
+    ) -> None:
+        self.refused = 0
+        self._recorder = recorder
+        self._wall = wall
+        self._names: set[str] = set()
+        keys = (f"tactile/{board}/*", ARM_STATE.key(arm), WORLD.template.format(name="*"))
+        self._taps = [Tap(session, key, self._take) for key in keys]
+        # The board's geometry was published when it was identified, before this began to listen;
+        # asked for, it is published once more. Nobody waits for the answer.
+        session.get(service_key(board, "geometry"), lambda _: None, timeout=5.0)
+
+    def close(self) -> None:
+        """Stop listening."""
+        for tap in self._taps:
+            tap.close()
+
+    def _take(self, sample: BusSample) -> None:
+        found = find_topic(sample.key)
+        if found is None or not self._known(found[1]):
+            self.refused += 1
+            return
+        topic, name = found
+        now_ns = self._wall.wall_ns(monotonic_now())
+        stamp_ns = now_ns if sample.wall_ns is None else sample.wall_ns
+        self._recorder.write(topic, name, sample.data, now_ns, stamp_ns)
+
+    def _known(self, name: str) -> bool:
+        if name in self._names:
+            return True
+        if len(self._names) >= MAX_NAMES or not NAME.fullmatch(name):
+            return False
+        self._names.add(name)
+        return True

@@ -1,0 +1,188 @@
+"""The control loop's thread: absolute deadlines, newest inputs, one command a cycle."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from typing import Any, TypeVar
+
+import numpy as np
+
+from reachd.arms.base import ArmError
+from reachd.cycle import Controller, Cycle, Inputs
+from reachd.seam import ZERO, Twist
+from tactile_bus.instant import NS_PER_S, Instant, monotonic_now, seconds_between
+
+log = logging.getLogger(__name__)
+
+CALLS = 32
+"""Requests that may wait for the control loop; it serves them every cycle."""
+
+LATENESS_KEPT = 60_000
+"""Cycles of which the lateness is kept for the status: ten minutes."""
+
+LAST_ZEROS = 3
+"""Zero twists sent at the end: one may be lost on the way."""
+
+R = TypeVar("R")
+
+
+class Schedule:
+    """Absolute deadlines ``period`` s apart; those that were missed are skipped, not made up for.
+
+    Pure. ``missed`` counts them.
+    """
+
+    def __init__(self, period: float, start: Instant) -> None:
+        self._period_ns = round(period * NS_PER_S)
+        self.deadline = Instant(start + self._period_ns)
+        self.missed = 0
+
+    def begin(self, now: Instant) -> float:
+        """A cycle begins at ``now``: returns its lateness in s and sets the next deadline."""
+        late_ns = max(0, now - self.deadline)
+        skipped = late_ns // self._period_ns
+        self.missed += skipped
+        self.deadline = Instant(self.deadline + (skipped + 1) * self._period_ns)
+        return late_ns / NS_PER_S
+
+
+class Lateness:
+    """Distribution of the lateness of cycles, in s."""
+
+    def __init__(self) -> None:
+        self._kept: deque[float] = deque(maxlen=LATENESS_KEPT)
+        self.cycles = 0
+
+    def add(self, lateness: float) -> None:
+        """Take one cycle's."""
+        self._kept.append(lateness)
+        self.cycles += 1
+
+    def summary(self) -> dict[str, float]:
+        """Percentiles of the cycles kept, empty before the first."""
+        kept = np.array(list(self._kept))
+        if not kept.size:
+            return {}
+        p50, p99, p999 = np.percentile(kept, [50, 99, 99.9]).tolist()
+        return {"p50": p50, "p99": p99, "p99.9": p999, "max": float(kept.max())}
+
+
+class ControlLoop:
+    """Runs a controller at its period until `stop`. ``failure``: what it died of.
+
+    ``sense`` fetches the newest inputs, ``act`` sends a twist with its expiry in s, ``report`` is
+    told of every cycle; none of them may block. ``priority``: of real time, 0 for none.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        period: float,
+        expiry: float,
+        sense: Callable[[Instant], Inputs],
+        act: Callable[[Twist, float, Instant], None],
+        report: Callable[[Cycle], None],
+        failed: Callable[[BaseException], None],
+        priority: int = 0,
+    ) -> None:
+        self.controller = controller
+        self.lateness = Lateness()
+        self.missed = 0
+        self.beat = monotonic_now()
+        self.last: Cycle | None = None
+        self.real_time = False
+        self._period = period
+        self._expiry = expiry
+        self._sense = sense
+        self._act = act
+        self._report = report
+        self._failed = failed
+        self._priority = priority
+        self._stopping = False
+        self._calls: deque[tuple[Callable[[Instant], Any], Future[Any]]] = deque()
+        self._thread = threading.Thread(target=self._run, name="control", daemon=True)
+
+    def start(self) -> None:
+        """Begin to run; disarmed, it sends zero twists."""
+        self.beat = monotonic_now()
+        self._thread.start()
+
+    def stop(self, timeout: float) -> bool:
+        """Zero twists, then the end; False when the thread does not end within ``timeout`` s.
+
+        Then the zero twist is sent from here: the thread is stuck in somebody's code.
+        """
+        self._stopping = True
+        if self._thread.ident is None:
+            return True
+        self._thread.join(timeout)
+        if self._thread.is_alive():
+            self._halt()
+            return False
+        return True
+
+    def call(self, work: Callable[[Instant], R]) -> Future[R]:
+        """Have ``work`` done by the loop's thread between two cycles, told the instant."""
+        future: Future[R] = Future()
+        if len(self._calls) >= CALLS:
+            future.set_exception(ValueError(f"{CALLS} requests are waiting already"))
+        else:
+            self._calls.append((work, future))
+        return future
+
+    def _run(self) -> None:
+        try:
+            self._raise_priority()
+            schedule = Schedule(self._period, monotonic_now())
+            while not self._stopping:
+                remaining = seconds_between(monotonic_now(), schedule.deadline)
+                if remaining > 0:
+                    time.sleep(remaining)
+                now = monotonic_now()
+                lateness = schedule.begin(now)
+                self.missed = schedule.missed
+                self._cycle(now, lateness)
+        except BaseException as error:  # noqa: BLE001 - thread boundary: the daemon must end loudly
+            self._failed(error)
+        finally:
+            self._halt()
+
+    def _cycle(self, now: Instant, lateness: float) -> None:
+        cycle = self.controller.cycle(self._sense(now), now, lateness)
+        self._act(cycle.decision.twist, cycle.decision.expiry, now)
+        self.last = cycle
+        self.beat = now
+        self.lateness.add(lateness)
+        self._report(cycle)
+        while self._calls:
+            work, future = self._calls.popleft()
+            try:
+                future.set_result(work(monotonic_now()))
+            except (ValueError, TypeError) as error:
+                future.set_exception(error)
+
+    def _halt(self) -> None:
+        for _ in range(LAST_ZEROS):
+            with suppress(ArmError):  # it stops by itself, then
+                self._act(ZERO, self._expiry, monotonic_now())
+
+    def _raise_priority(self) -> None:
+        """Ask for real time, so that other programs' load does not make the loop late."""
+        if self._priority == 0 or not hasattr(os, "sched_setscheduler"):
+            return
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(self._priority))
+            self.real_time = True
+        except OSError as error:
+            log.info(
+                "the control loop runs without real-time priority (%s): allow it with `ulimit -r` "
+                "or LimitRTPRIO= if it is late under load",
+                error.strerror,
+            )

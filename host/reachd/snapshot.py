@@ -1,0 +1,192 @@
+"""The newest of each input of control: who may publish it, and how old it is. Pure.
+
+Ages are judged on this host's monotonic clock. A stamp is taken at its word only as the stamp of
+this machine's own clock; a sender on another machine has to be named in the settings, for then
+the clock it stamps with is another. A sender that is not named shows up as stamps far from now,
+which the gate refuses. Any doubt so ends in standing still.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum, auto
+from typing import Any, Generic, TypeVar
+
+from reachd.seam import ArmState, Touch, Twist
+from tactile_bus.geometry import Side
+from tactile_bus.instant import Instant, seconds_between
+from tactile_bus.messages import DecodeError, codec
+from tactile_bus.streams import BusSample
+from tactile_bus.topics import Topic
+
+T = TypeVar("T")
+
+DUPLICATE_FOR = 1.0
+"""s after the last sample of a second publisher until it is taken to be gone."""
+
+DRIFT = 2e-4
+"""s/s by which the clocks of two machines may drift apart: twice what bad quartzes do."""
+
+
+class Verdict(Enum):
+    """What becomes of a sample."""
+
+    ACCEPTED = auto()
+    REPEATED = auto()  # the very sample before, brought by a second link
+    DUPLICATE = auto()  # from a second publisher, or one that pretends to be the first
+    ANONYMOUS = auto()  # its publisher does not say who it is, so it cannot be told from others
+
+
+class SourcePin:
+    """Holds an input to its first publisher for as long as that one is heard.
+
+    Once it was silent for ``takeover`` s, by which time nothing moves on its word, the next
+    publisher is as good as a restart of the first.
+    """
+
+    def __init__(self, takeover: float) -> None:
+        self._takeover = takeover
+        self._source: bytes | None = None
+        self._sequence = 0
+        self._data = b""
+        self._heard: Instant | None = None
+        self._foreign: Instant | None = None
+
+    @property
+    def source(self) -> bytes | None:
+        """Id of the publisher it is held to."""
+        return self._source
+
+    def judge(self, sample: BusSample, now: Instant) -> Verdict:
+        """Whether a sample received at ``now`` may be used."""
+        if sample.source is None or sample.sequence is None:
+            return self._note_foreign(now) if self._live(now) else Verdict.ANONYMOUS
+        if sample.source != self._source:
+            if self._live(now):
+                return self._note_foreign(now)
+            self._source = sample.source
+        elif sample.sequence == self._sequence and sample.data == self._data:
+            return Verdict.REPEATED
+        elif sample.sequence <= self._sequence:
+            return self._note_foreign(now)
+        self._sequence, self._data, self._heard = sample.sequence, sample.data, now
+        return Verdict.ACCEPTED
+
+    def duplicated(self, now: Instant) -> bool:
+        """Whether a second publisher was heard of late."""
+        return self._foreign is not None and seconds_between(self._foreign, now) < DUPLICATE_FOR
+
+    def _live(self, now: Instant) -> bool:
+        return self._heard is not None and seconds_between(self._heard, now) < self._takeover
+
+    def _note_foreign(self, now: Instant) -> Verdict:
+        self._foreign = now
+        return Verdict.DUPLICATE
+
+
+class RemoteClock:
+    """Maps another machine's monotonic stamps to this one's: the least delay seen counts as none.
+
+    What comes later than the quickest did is that much older, so a queue that fills up on the way
+    shows as age. The quickest is forgotten no faster than clocks drift.
+    """
+
+    def __init__(self) -> None:
+        self._offset: float | None = None
+        self._at = Instant(0)
+
+    def here(self, stamp: int, received: Instant) -> Instant:
+        """Instant of this host for ``stamp``; never later than ``received``."""
+        offset = received - stamp
+        if self._offset is not None:
+            offset = min(offset, round(self._offset + DRIFT * (received - self._at)))
+        self._offset, self._at = offset, received
+        return Instant(stamp + offset)
+
+
+class Input(Generic[T]):
+    """One input: newest value, and what was not used, by reason.
+
+    ``make`` turns a message, its captured and its received instant into the value, and may raise
+    ValueError. ``remote``: the sender's monotonic clock is not this machine's.
+    """
+
+    def __init__(
+        self,
+        topic: Topic,
+        make: Callable[[Any, Instant, Instant], T],
+        takeover: float,
+        *,
+        remote: bool = False,
+    ) -> None:
+        self.value: T | None = None
+        self.message: Any = None
+        self.pin = SourcePin(takeover)
+        self.counters = {"accepted": 0, "malformed": 0} | {
+            verdict.name.lower(): 0 for verdict in Verdict
+        }
+        self._topic = topic
+        self._make = make
+        self._codec = codec()
+        self._remote = remote
+        self._clock = RemoteClock()
+        self._clock_of: bytes | None = None
+
+    def take(self, sample: BusSample, now: Instant) -> None:
+        """Take in a sample received at ``now``; what cannot be used is counted."""
+        verdict = self.pin.judge(sample, now)
+        if verdict is not Verdict.ACCEPTED:
+            self.counters[verdict.name.lower()] += 1
+            return
+        try:
+            message = self._codec.decode(self._topic, sample.data)
+            value = self._make(message, self._captured(message, now), now)
+        except (DecodeError, ValueError):
+            self.counters["malformed"] += 1
+            return
+        self.value, self.message = value, message
+        self.counters["accepted"] += 1
+
+    def _captured(self, message: Any, now: Instant) -> Instant:
+        stamp = int(message.captured_ns)
+        if not self._remote:
+            return Instant(stamp)
+        if self._clock_of != self.pin.source:
+            self._clock, self._clock_of = RemoteClock(), self.pin.source
+        return self._clock.here(stamp, now)
+
+
+def make_touch(message: Any, captured: Instant, received: Instant) -> Touch:
+    """``ContactFeatures`` as strategies see them; ValueError for a side that does not exist."""
+    return Touch(
+        captured=captured,
+        received=received,
+        valid=bool(message.valid),
+        peak_force=float(message.peak_force),
+        peak_side=Side(message.peak_side),
+        peak_x=float(message.peak_position.x),
+        peak_y=float(message.peak_position.y),
+        total_force=float(message.normal_force),
+        tip_force=float(message.tip_force),
+    )
+
+
+def make_arm_state(message: Any, captured: Instant, received: Instant) -> ArmState:
+    """``ArmState.msg`` as strategies and gate see it."""
+    linear, angular = message.twist.linear, message.twist.angular
+    return ArmState(
+        captured=captured,
+        received=received,
+        x=float(message.x),
+        y=float(message.y),
+        heading=float(message.heading),
+        twist=Twist(float(linear.x), float(linear.y), float(angular.z)),
+        fx=float(message.wrench.force.x),
+        fy=float(message.wrench.force.y),
+        mz=float(message.wrench.torque.z),
+        mode=str(message.mode),
+        v_max=float(message.v_max),
+        omega_max=float(message.omega_max),
+        f_max=float(message.f_max),
+        m_max=float(message.m_max),
+    )
