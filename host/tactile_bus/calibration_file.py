@@ -104,7 +104,7 @@ def loads(text: str, source: str = "calibration") -> BoardCalibration:
     created, provenance = top.text("created"), top.text("provenance")
     nominal = top.take("nominal")
     if not isinstance(nominal, bool):
-        raise top.wrong("nominal", nominal, "true or false")
+        raise top.wrong("nominal", repr(nominal), "true or false")
     arrays = top.take("array")
     if not isinstance(arrays, list) or not arrays:
         raise top.wrong("array", arrays, "at least one [[array]] table")

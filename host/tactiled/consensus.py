@@ -33,9 +33,14 @@ the start carries noise of its own (a proposal's few taxels, the cycle before), 
 the inliers."""
 MODEL_ERROR_UT = 1.5
 """µT rms by which chips differ in a uniform field: 3 % sensitivity in 50 µT."""
-MIN_SUPPORT = 0.4
-"""Least fraction of an array's healthy taxels that must agree. Half of them may be in contact;
-chance and crosstalk take a tenth more."""
+MIN_SUPPORT = 0.5
+"""Least fraction of an array's healthy taxels that must agree on a plane by themselves. Of sixteen
+random presses of 1–3 N some plane has six or seven within its gate by chance."""
+LONE_SUPPORT = 0.65
+"""The same while nothing else tells, neither another array nor an earlier cycle."""
+CONFIRMED_SUPPORT = 0.3
+CONFIRMED_UT = 15.0
+"""The same for a plane within this many µT of where the rest of the board says it must be."""
 FOLLOW_SUPPORT = 0.65
 """Support from which a plane has no rival on arrays of nine taxels and more."""
 MIN_INLIERS = 3
@@ -48,9 +53,11 @@ board's own vote: 150 µT/m over 10 cm."""
 BOARD_BONUS = 0.8
 """The board's constant is preferred to an array's own proposal that is not clearly better."""
 IMPOSTOR_UT = 50.0
-"""µT from the board's constant beyond which a plane with the support of less than
-`IMPOSTOR_SUPPORT` is a uniform press (0.4 N) rather than the ambient field."""
-IMPOSTOR_SUPPORT = 0.75
+"""µT from what the board's arrays have in common, or saw in the cycle before, beyond which a plane
+is a uniform press (a third of a newton) and not the ambient field."""
+MAX_SLOPE_UT_PER_M = 1000.0
+"""Steeper planes are pressure that falls off evenly, as under a tilted wall: the field of the room
+is not that uneven until a magnet is closer than a hand's breadth."""
 MAX_LEVERAGE = 1.0
 """Variance of the plane at its worst taxel over that of one sample, beyond which the free taxels
 are too few or too much to one side to tell its slope; shrinkage sets in."""
@@ -77,6 +84,14 @@ class Fit:
     valid: Bool
     common: Float
     whole: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """Where the board's ``constant`` (3,) µT in ``ee`` must be, to within ``reach`` µT."""
+
+    constant: list[float]
+    reach: float
 
 
 class Consensus:
@@ -107,8 +122,9 @@ class Consensus:
         self._stiff = np.zeros((arrays, 3, 3))
         # the constant's 1e-9 keeps an array without any weight invertible; `_judge` refuses it
         self._stiff[:, 0, 0] = 1e-9
-        self._stiff[:, 1, 1] = self._stiff[:, 2, 2] = np.where(few, 1e9, 1e-9) * layout.counts
+        self._stiff[:, 1, 1] = self._stiff[:, 2, 2] = np.where(few, 1e9, 1e-12) * layout.counts
         self._few = few
+        self._steep: list[float] = (layout.scale * MAX_SLOPE_UT_PER_M).tolist()
         self._ample = AMPLE_WEIGHT * layout.counts
         self._shrink = 1.0 / (layout.scale * SLOPE_UT_PER_M) ** 2
         self._variance = 1.0
@@ -121,18 +137,26 @@ class Consensus:
         # mean of a taxel's squared distance when a quarter of them are at the gate
         self._doubtful = (0.25 * self._gate + 0.75 * 3.3 * self._variance) * self._layout.counts
 
-    def fit(self, field_ee: Float, forces: Float, healthy: Bool) -> Fit:
-        """Fit of one cycle; see `Compensator.update` for the arguments."""
+    def fit(self, field_ee: Float, forces: Float, healthy: Bool, prior: Prior | None = None) -> Fit:
+        """Fit of one cycle; see `Compensator.update` for the arguments.
+
+        ``prior``: what the board saw before; None when it has seen nothing yet.
+        """
         weight = healthy.astype(np.float64)
         theta, score = self._vote(field_ee, healthy)
         if len(theta) > 1 and np.count_nonzero(score > self._doubtful):
             self._prefer_common(theta, score, field_ee, weight)
         theta = self._refine(theta, field_ee, weight, FIRST_REACH**2 * self._variance)
         target = self._target(theta, field_ee, forces)
+        if self._model.decouples:
+            theta = self._refine(theta, target, weight, FIRST_REACH**2 * self._variance)
+            target = self._target(theta, field_ee, forces)
         theta = self._refine(theta, target, weight, LAST_REACH**2 * self._variance, shrink=True)
-        return self._judge(theta, target, healthy)
+        return self._judge(theta, target, healthy, prior)
 
-    def follow(self, theta: Float, field_ee: Float, forces: Float, healthy: Bool) -> Fit | None:
+    def follow(
+        self, theta: Float, field_ee: Float, forces: Float, healthy: Bool, prior: Prior | None
+    ) -> Fit | None:
         """Fit of a cycle that continues the earlier fit ``theta``; None when a vote is needed.
 
         Taken only where the vote could not come out otherwise: two planes share no more than
@@ -141,13 +165,13 @@ class Consensus:
         target = self._target(theta, field_ee, forces)
         weight = healthy.astype(np.float64)
         theta = self._refine(theta, target, weight, FIRST_REACH**2 * self._variance, shrink=True)
-        fit = self._judge(theta, target, healthy)
+        fit = self._judge(theta, target, healthy, prior)
         return fit if fit.whole and fit.support.min() >= FOLLOW_SUPPORT else None
 
     def check(self, theta: Float, field_ee: Float, forces: Float, healthy: Bool) -> Fit:
         """How far the present cycle bears out the earlier fit ``theta``."""
         target = self._target(theta, field_ee, forces)
-        return self._judge(theta, target, healthy)
+        return self._judge(theta, target, healthy, None)
 
     def _all(self, healthy: Bool) -> bool:
         return int(np.count_nonzero(healthy)) == self._layout.taxels
@@ -230,7 +254,7 @@ class Consensus:
         refined: Float = right @ inverse  # symmetric: each row is the solution of one component
         return refined
 
-    def _judge(self, theta: Float, target: Float, healthy: Bool) -> Fit:
+    def _judge(self, theta: Float, target: Float, healthy: Bool, prior: Prior | None) -> Fit:
         """Whether the taxels bear out a fit."""
         away = target - theta @ self._design
         squared = np.einsum("acn,acn->an", away, away)
@@ -244,13 +268,21 @@ class Consensus:
         middle = theta[:, :, 0].tolist()
         limit = 3.0 * MAX_RESIDUAL_RATIO**2 * self._variance
         support = [k / h if h else 0.0 for k, h in zip(inliers, sound, strict=True)]
-        valid = [
-            s >= MIN_SUPPORT and k >= MIN_INLIERS and q <= limit * k
-            for s, k, q in zip(support, inliers, sums, strict=True)
+        steepest = np.abs(theta[:, :, 1:]).max(axis=(1, 2)).tolist()
+        fair = [
+            k >= MIN_INLIERS and q <= limit * k and slope <= most
+            for k, q, slope, most in zip(inliers, sums, steepest, self._steep, strict=True)
         ]
+        valid = [ok and s >= MIN_SUPPORT for ok, s in zip(fair, support, strict=True)]
         residual = [math.sqrt(q / (3 * max(k, 1))) for q, k in zip(sums, inliers, strict=True)]
-        if len(valid) > 1 and any(valid) and min(support) < IMPOSTOR_SUPPORT:
-            _expose(middle, inliers, support, valid)
+        agreed = _agreed(middle, inliers, valid, prior)
+        for a, centre in enumerate(middle):
+            if agreed is None:
+                valid[a] = valid[a] and support[a] >= LONE_SUPPORT
+            else:
+                off = math.dist(centre, agreed.constant)
+                confirmed = fair[a] and support[a] >= CONFIRMED_SUPPORT and off <= CONFIRMED_UT
+                valid[a] = confirmed or (valid[a] and off <= agreed.reach)
         common = _shared(middle, inliers, valid)
         return Fit(
             theta,
@@ -262,22 +294,25 @@ class Consensus:
         )
 
 
-def _expose(
-    middle: list[list[float]], inliers: list[float], support: list[float], valid: list[bool]
-) -> None:
-    """Take away the validity of presses that pass for an ambient field on their array."""
-    votes = [
-        sum(
-            k
-            for other, k, ok in zip(middle, inliers, valid, strict=True)
-            if ok and math.dist(centre, other) <= IMPOSTOR_UT
-        )
-        for centre in middle
-    ]
-    agreed = middle[max((a for a, ok in enumerate(valid) if ok), key=votes.__getitem__)]
-    for a, centre in enumerate(middle):
-        if support[a] < IMPOSTOR_SUPPORT and math.dist(centre, agreed) > IMPOSTOR_UT:
-            valid[a] = False
+def _agreed(
+    middle: list[list[float]], inliers: list[float], valid: list[bool], prior: Prior | None
+) -> Prior | None:
+    """Where the ambient field must be near; None when nothing tells.
+
+    The constant that two arrays or more have in common: presses on arrays that face different
+    ways cannot agree in ``ee``. Else what the board saw before.
+    """
+    most, agreed = 0.0, prior
+    for middling, sound in zip(middle, valid, strict=True):
+        if sound:
+            near = [
+                count
+                for other, count, ok in zip(middle, inliers, valid, strict=True)
+                if ok and math.dist(middling, other) <= IMPOSTOR_UT
+            ]
+            if len(near) > 1 and sum(near) > most:
+                most, agreed = sum(near), Prior(middling, IMPOSTOR_UT)
+    return agreed
 
 
 def _shared(

@@ -41,11 +41,13 @@ class ConsensusCompensator:
     def update(self, field_ee: Float, forces: Float, healthy: Bool, captured: Instant) -> Estimate:
         """Estimate for one cycle."""
         if self._fitted is None or captured - self._fitted >= self._period:
+            prior = self._tracker.prior(captured)
             fit = None
             if self._sound:
-                fit = self._consensus.follow(self._tracker.theta, field_ee, forces, healthy)
+                theta = self._tracker.theta
+                fit = self._consensus.follow(theta, field_ee, forces, healthy, prior)
             if fit is None:
-                fit = self._consensus.fit(field_ee, forces, healthy)
+                fit = self._consensus.fit(field_ee, forces, healthy, prior)
             self._fitted, self._sound = captured, fit.whole
             return self._tracker.take(fit, captured)
         fit = self._consensus.check(self._tracker.theta, field_ee, forces, healthy)

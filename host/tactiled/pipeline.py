@@ -124,9 +124,11 @@ class BoardPipeline:
         health = self._monitor.update(raw, temperature, status, present, captured)
         rest = self._rest
         known = rest.known  # before: a first tare takes effect from the next cycle on
+        field = model.taxel_field(raw, temperature)
+        if rest.taring:
+            self._advance_tare(field, health, bool(present.all()), captured, group.sequence)
         if known and np.count_nonzero(rest.unrested):
             health[rest.unrested] |= np.uint8(TaxelHealth.OUT_OF_RANGE)
-        field = model.taxel_field(raw, temperature)
         masked = int(np.count_nonzero(health))
         sick = masked > 0
         healthy = layout.real
@@ -134,8 +136,6 @@ class BoardPipeline:
             healthy = layout.real & (health == 0)
             # what an unhealthy taxel reads must not leak into its neighbours' forces
             np.copyto(field, model.plane_field(self._theta), where=~healthy[:, None])
-        if rest.taring:
-            self._advance_tare(field, healthy, bool(present.all()), captured, group.sequence)
         forces = model.forces(field)
         if known:
             in_ee = model.field_in_ee(field)
@@ -235,10 +235,17 @@ class BoardPipeline:
         )
 
     def _advance_tare(
-        self, field: Float, healthy: Bool, whole: bool, captured: Instant, sequence: int
+        self,
+        field: Float,
+        health: NDArray[np.uint8],
+        whole: bool,
+        captured: Instant,
+        sequence: int,
     ) -> None:
         """Take one cycle into the tare under way; its end begins contacts and fits anew."""
-        shift = self._rest.advance(field, healthy, whole, captured, sequence)
+        healthy = self._layout.real & (health == 0)
+        usable = np.where(healthy[:, None], field, 0.0)
+        shift = self._rest.advance(usable, healthy, whole, captured, sequence)
         report = self._rest.report
         if shift is None or report is None:
             return

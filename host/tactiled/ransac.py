@@ -6,7 +6,6 @@ period are fitted in the cycles of that period one after another instead of all 
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -21,33 +20,8 @@ from tactiled.tracking import FieldTracker
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-MAX_TRIALS = 100
-"""scikit-learn's default."""
 MIN_TAXELS = 4
 """Healthy taxels below which there is nothing to draw three from and check on another."""
-
-
-def fit_plane(
-    surface: Float, values: Float, rng: np.random.Generator, max_trials: int = MAX_TRIALS
-) -> Float | None:
-    """(3,) value at the origin and slopes of the RANSAC plane through ``values`` (n,) at
-    ``surface`` (n, 2), by scikit-learn's defaults; None when it finds no consensus.
-    """
-    from sklearn.linear_model import LinearRegression, RANSACRegressor  # 1.1 s: only when asked for
-
-    regressor = RANSACRegressor(
-        LinearRegression(),
-        max_trials=max_trials,
-        random_state=int(rng.integers(2**32)),
-    )
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            regressor.fit(surface, values)
-    except ValueError:  # "RANSAC could not find a valid consensus set"
-        return None
-    plane = regressor.estimator_
-    return np.array([plane.intercept_, *plane.coef_])
 
 
 class RansacCompensator:
@@ -58,6 +32,9 @@ class RansacCompensator:
     def __init__(
         self, layout: Layout, checker: Consensus, period_s: float, rng: np.random.Generator
     ) -> None:
+        from tactiled.ransac_plane import fit_plane  # scikit-learn: 1.1 s, only when asked for
+
+        self._fit_plane = fit_plane
         self._layout = layout
         self._checker = checker
         self._rng = rng
@@ -104,7 +81,7 @@ class RansacCompensator:
             use = healthy[a]
             plane = None
             if use.sum() >= MIN_TAXELS:
-                plane = fit_plane(
+                plane = self._fit_plane(
                     self._layout.design[a, 1:, use], field[a, component, use], self._rng
                 )
             if component == 0:

@@ -22,7 +22,7 @@ from tactiled.consensus import Consensus
 from tactiled.force_model import ForceModel
 from tactiled.layout import Layout
 from tactiled.pipeline import BoardPipeline, PipelineSettings
-from tactiled.ransac import fit_plane
+from tactiled.ransac_plane import fit_plane
 
 Float = NDArray[np.float64]
 
@@ -140,7 +140,7 @@ def bench_consensus(surfaces: int = 10, repeats: int = 5, seed: int = 0) -> dict
             start = time.perf_counter()
             for a in range(layout.arrays):
                 for component in range(3):
-                    found = fit_plane(places, field[a, component], rng)
+                    found = fit_plane(places, field[a, component], rng, plain=True)
                     if found is not None:
                         planes[1][a, component] = found
             theirs.append(time.perf_counter() - start)

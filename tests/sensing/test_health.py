@@ -1,0 +1,110 @@
+"""Rows 5 and 7 of the fault table as far as one taxel goes: flagged, masked, never zero force."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tactiled.blocks import TaxelHealth
+from tactiled.pipeline import BoardPipeline, PipelineSettings
+
+
+@pytest.fixture
+def flow(board, stream):
+    return stream(BoardPipeline(board(coupling=0.02), PipelineSettings()))
+
+
+@pytest.fixture
+def noise():
+    rng = np.random.default_rng(8)
+    return lambda: rng.normal(0, 5, (48, 3))
+
+
+@pytest.mark.parametrize("bit", [TaxelHealth.SATURATED, TaxelHealth.STALE, TaxelHealth.READ_FAILED])
+def test_what_the_board_flags_is_masked_in_the_same_cycle(flow, noise, bit):
+    status = np.zeros(48, np.uint8)
+    status[20] = bit
+    field = noise()
+    field[20] = 32_000.0
+    cycle = flow.one(field, status)
+    assert cycle.health[20] == bit
+    assert np.isnan(cycle.force[20]).all()
+    assert np.isnan(cycle.field_ut[20]).all()
+    assert np.isfinite(np.delete(cycle.force, 20, axis=0)).all()
+    assert cycle.features.taxels_masked == 1
+    assert cycle.features.valid
+    assert np.abs(np.delete(cycle.force, 20, axis=0)).max() < 0.5  # no leak into neighbours
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 60_000.0])
+def test_impossible_readings_are_masked_at_once(flow, noise, value):
+    field = noise()
+    field[5, 1] = value
+    cycle = flow.one(field)
+    assert cycle.health[5] == TaxelHealth.OUT_OF_RANGE
+    assert np.isnan(cycle.force[5]).all()
+    assert np.isfinite(np.delete(cycle.force, 5, axis=0)).all()
+    assert np.isfinite(cycle.ambient.plane).all()
+
+
+@pytest.mark.parametrize("temperature", [-998.1, 451.8, float("nan")])
+def test_an_impossible_temperature_condemns_the_array(flow, noise, temperature):
+    block = flow.block(0, noise())
+    flow.pipeline.feed(dataclasses.replace(block, temperature_c=np.array([temperature])))
+    flow.pipeline.feed(flow.block(1, noise()))
+    (cycle,) = flow.pipeline.feed(flow.block(2, noise()))
+    assert (cycle.health[:16] == TaxelHealth.OUT_OF_RANGE).all()
+    assert not cycle.features.valid
+    assert "taxels masked: left 100%" in cycle.features.reasons
+
+
+def test_a_frozen_taxel_is_unhealthy_within_a_second_and_recovers(flow, noise):
+    stuck = np.array([3.0, 4.0, 5.0])
+    flagged = None
+    for k in range(100):
+        field = noise()
+        field[7] = stuck
+        cycle = flow.one(field)
+        if cycle.health[7] and flagged is None:
+            flagged = k
+    assert flagged is not None
+    assert flagged * 0.01 <= 1.0
+    assert cycle.health[7] == TaxelHealth.FROZEN
+    assert np.isnan(cycle.force[7]).all()
+    assert (np.delete(cycle.health, 7) == 0).all()
+    assert flow.one(noise()).health[7] == 0
+
+
+def test_at_low_rates_two_equal_readings_do_not_condemn(flow, noise):
+    field = noise()
+    for _ in range(3):
+        flow.sequence += 99  # one reading a second
+        cycle = flow.one(field)
+    assert (cycle.health == 0).all()
+    flow.sequence += 99
+    assert (flow.one(field).health == TaxelHealth.FROZEN).all()
+
+
+def test_too_many_masked_taxels_make_features_invalid(flow, noise):
+    status = np.zeros(48, np.uint8)
+    status[32:36] = TaxelHealth.READ_FAILED  # a quarter of the tip is tolerated
+    assert flow.one(noise(), status).features.valid
+    status[36] = TaxelHealth.READ_FAILED
+    features = flow.one(noise(), status).features
+    assert not features.valid
+    assert features.reasons == ("taxels masked: tip 31%",)
+    assert features.taxels_masked == 5
+
+
+def test_a_masked_taxel_in_contact_is_not_shown_as_zero_force(flow, noise, board, field_of):
+    force = np.zeros((48, 3))
+    force[33, 2] = -2.0
+    pressed = field_of(board(coupling=0.02), force)
+    assert flow.one(noise() + pressed).features.peak_force == pytest.approx(2.0, abs=0.3)
+    status = np.zeros(48, np.uint8)
+    status[33] = TaxelHealth.SATURATED
+    cycle = flow.one(noise() + pressed, status)
+    assert np.isnan(cycle.force[33]).all()
+    assert cycle.features.taxels_masked == 1
