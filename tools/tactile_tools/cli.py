@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.metadata import version
 
-TOOLS = ("log", "plot", "reach", "bench", "demo", "fuzz", "crash")
+TOOLS = ("log", "plot", "reach", "fidelity", "bench", "demo", "fuzz", "crash")
 """Modules of this package that add a subcommand; each defines ``add_parser(subparsers)``."""
 
 
