@@ -14,6 +14,18 @@ if TYPE_CHECKING:
 
 Handler = Callable[[argparse.Namespace], int]
 
+ARM_HELP = """\
+faults of the arm, parted by commas: silent, frozen, stale, biased, refuses_limits, fault, estop;
+each from the start, @Ts or @Ts+Ds (T s after the start, for D s), such as silent@5s+1s,estop@8s.
+fault and estop are given for 0.2 s where D is left out, and hold the arm until it is cleared.
+noise of the arm, parted by commas: position (m), heading (rad), speed (m/s), turn (rad/s),
+force (N), moment (N·m), each =STD, such as position=1e-4,force=0.1
+
+services, JSON: arm/NAME/srv/limits {v_max, omega_max, f_max, m_max} (m/s, rad/s, N, N·m),
+arm/NAME/srv/clear, arm/NAME/srv/status; world/WORLD/srv/reset {seed} (left out: the same scene),
+world/WORLD/srv/status. Objects, finger and goal are at world/WORLD/objects at 10 Hz.
+"""
+
 MAX_SPEED = 1000.0
 """Times real time; beyond, the terminal and not the recording sets the pace."""
 
@@ -27,7 +39,8 @@ def make_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     """Parser whose result has the ``handler`` of its command, from ``handlers`` by name."""
     parser = argparse.ArgumentParser(
         "simdevice",
-        description="Simulated taxel boards on pseudo-terminals and CAN buses.",
+        description="Simulated taxel boards on pseudo-terminals and CAN buses, on their own or on "
+        "the finger of a simulated arm in a cupboard.",
         epilog="Exit: 0 done (also on Ctrl-C, SIGTERM), 2 bad argument, 3 refused by the system.",
     )
     parser.add_argument(
@@ -35,6 +48,7 @@ def make_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_boards(commands).set_defaults(handler=handlers["boards"])
+    _add_cupboard(commands).set_defaults(handler=handlers["cupboard"])
     _add_replay(commands).set_defaults(handler=handlers["replay"])
     _add_calibration(commands).set_defaults(handler=handlers["calibration"])
     shown = commands.add_parser("version", help="print the version")
@@ -100,6 +114,77 @@ def _add_boards(commands: Commands) -> argparse.ArgumentParser:
     )  # fmt: skip
     _add_duration(boards)
     return boards
+
+
+def _add_cupboard(commands: Commands) -> argparse.ArgumentParser:
+    from sim_device.cupboard_scene import DEFAULT_RECORDED, ENGINES
+    from tactile_bus.options import add_bus
+    from tactile_bus.session import PORTS
+
+    cupboard = commands.add_parser(
+        "cupboard",
+        help="simulate a cluttered cupboard with an arm and its finger boards",
+        description="Simulate a cluttered cupboard and an arm whose finger reaches into it, in "
+        "real time: the taxels of the finger's boards on --pty and --slcan, the arm over zenoh.",
+        epilog=ARM_HELP + FAULTS_HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = cupboard.add_argument_group("world").add_argument
+    add(
+        "--scene", default="authors_sim", metavar="SCENE",
+        help="authors_sim, hardware, FILE.json or recorded:N (default authors_sim)",
+    )  # fmt: skip
+    add(
+        "--seed", type=_whole, default=0, metavar="N",
+        help="of scene, boards and noise (default 0); board number k has N + k",
+    )  # fmt: skip
+    add(
+        "--engine", choices=ENGINES, default=ENGINES[0],
+        help=f"physics engine (default {ENGINES[0]})",
+    )  # fmt: skip
+    add(
+        "--recorded", type=Path, default=DEFAULT_RECORDED, metavar="FILE.json.gz",
+        help="file of the recorded scenes (default: in ../shared beside the checkout)",
+    )  # fmt: skip
+    add(
+        "--world", default="world", metavar="WORLD",
+        help="name of the world on the bus (default world)",
+    )  # fmt: skip
+    add("--print-goal", action="store_true", help="print the scene's goal as X,Y in m, and end")
+    boards = cupboard.add_argument_group("boards of the finger, each more than once")
+    boards.add_argument(
+        "--pty", action="append", default=[], type=Path, metavar="LINK",
+        help="board on a pseudo-terminal; LINK becomes a symbolic link to it",
+    )  # fmt: skip
+    boards.add_argument(
+        "--slcan", action="append", default=[], type=Path, metavar="LINK",
+        help="board behind a simulated USB-CAN adapter (slcan) on a pseudo-terminal",
+    )  # fmt: skip
+    boards.add_argument(
+        "--fd", action="store_true",
+        help="CAN FD on --slcan (default CAN 2.0B, which at 1 Mbit/s carries one finger at 60 Hz)",
+    )  # fmt: skip
+    boards.add_argument(
+        "--rate", type=_number(0.1, 1000), metavar="HZ",
+        help="sample rate after power-on in Hz (default 100)",
+    )  # fmt: skip
+    boards.add_argument("--faults", default="", metavar="SPEC", help="faults to inject, see below")
+    add = cupboard.add_argument_group("arm").add_argument
+    add("--arm", default="arm", metavar="NAME", help="its name on the bus (default arm)")
+    add(
+        "--arm-rate", type=int, choices=(100, 200), default=100,
+        help="states a second (default 100)",
+    )  # fmt: skip
+    add(
+        "--arm-latency", type=_number(0, 10), default=0.0, metavar="S",
+        help="s each way: from a command's receipt to its effect, and from a state's capture to "
+        "its sending (default 0)",
+    )  # fmt: skip
+    add("--arm-noise", default="", metavar="SPEC", help="noise of its sensors, see below")
+    add("--arm-fault", default="", metavar="SPEC", help="faults to inject, see below")
+    add_bus(cupboard, PORTS["arm"])
+    _add_duration(cupboard)
+    return cupboard
 
 
 def _add_replay(commands: Commands) -> argparse.ArgumentParser:

@@ -15,10 +15,14 @@ from typing import TYPE_CHECKING, NoReturn
 from sim_device.arguments import Handler, make_parser
 
 if TYPE_CHECKING:
+    from sim_device.cupboard_plan import CupboardRequest
     from sim_device.runner import Runner
     from sim_device.stations import BoardsRequest, Planned
 
 OK, BAD_ARGUMENT, REFUSED = 0, 2, 3
+
+SWITCH_INTERVAL = 0.0005
+"""s after which Python hands the interpreter on, where several threads work."""
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -27,6 +31,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command; 0 done, 2 bad argument, 3 refused by the environment."""
     handlers: dict[str, Handler] = {
         "boards": _boards,
+        "cupboard": _cupboard,
         "replay": _replay,
         "calibration": _calibration,
         "version": _version,
@@ -82,6 +87,53 @@ def _request(arguments: argparse.Namespace) -> BoardsRequest:
         unplugged=tuple(arguments.unplug),
         temperature_c=arguments.temperature,
         field_ut=arguments.field,
+    )
+
+
+def _cupboard(arguments: argparse.Namespace) -> int:
+    from sim_device.cupboard_plan import goal_text, plan_cupboard
+    from sim_device.cupboard_scene import EngineMissing
+    from sim_device.world.base import WorldError
+
+    try:
+        request = _cupboard_request(arguments)
+        if arguments.print_goal:
+            print(goal_text(request.source.load(request.seed)))
+            return OK
+        planned = plan_cupboard(request)
+        # Services answer on other threads: the world must get its turn within a tick.
+        sys.setswitchinterval(SWITCH_INTERVAL)
+        return _serve(planned, arguments.duration)
+    except ValueError as error:
+        raise _Refusal(BAD_ARGUMENT, error) from error
+    except (EngineMissing, WorldError) as error:
+        raise _Refusal(REFUSED, error) from error
+
+
+def _cupboard_request(arguments: argparse.Namespace) -> CupboardRequest:
+    from sim_device.arm_options import arm_settings, parse_arm_faults
+    from sim_device.cupboard_plan import CupboardRequest
+    from sim_device.cupboard_scene import SceneSource
+    from sim_device.stations import BoardsRequest
+    from tactile_bus.options import BusTable, bus_config
+
+    return CupboardRequest(
+        source=SceneSource(arguments.scene, arguments.recorded),
+        seed=arguments.seed,
+        engine=arguments.engine,
+        arm=arguments.arm,
+        world=arguments.world,
+        settings=arm_settings(arguments.arm_rate, arguments.arm_latency, arguments.arm_noise),
+        arm_faults=parse_arm_faults(arguments.arm_fault),
+        boards=BoardsRequest(
+            ptys=tuple(arguments.pty),
+            slcans=tuple(arguments.slcan),
+            fd=arguments.fd,
+            seed=arguments.seed,
+            rate=arguments.rate,
+            faults=arguments.faults,
+        ),
+        bus=bus_config(arguments, BusTable(), "arm"),
     )
 
 
@@ -171,9 +223,12 @@ def _serve(planned: Sequence[Planned], duration: float | None) -> int:
 def _open(runner: Runner) -> None:
     from sim_device.ports import LinkRefused
     from tactile_bus.can_bus import CanUnavailable, Trouble
+    from tactile_bus.session import BusError
 
     try:
         runner.open()
+    except BusError as error:
+        raise _Refusal(REFUSED, error) from error
     except LinkRefused as error:
         remedy = "give another path, or remove it yourself" if error.foreign else "end that one"
         code = BAD_ARGUMENT if error.foreign else REFUSED

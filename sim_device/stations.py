@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from sensor_proto.canseg import CanFrame
 from sim_device.anyskin_board import CONVERSION_RATE, LOOP_RATE, AnySkinBoard
 from sim_device.catalogue import build_skin, identity
@@ -16,6 +18,7 @@ from sim_device.environment import (
     Environment,
     EnvironmentParameters,
     parse_rotation,
+    rotation_about,
     still,
 )
 from sim_device.faults import FaultPlan, Window
@@ -26,6 +29,8 @@ from sim_device.runner import Board, CanStation, MakeBoard, SerialStation, Stati
 from sim_device.skin import Contact
 from tactile_bus.can_bus import DEFAULT_BITRATE, CanSpec
 from tactile_bus.geometry import SkinGeometry
+
+UP = np.array([0.0, 0.0, 1.0])
 
 NODES = range(127)
 """Node ids a board may have on a CAN bus; 127 addresses all of them."""
@@ -40,7 +45,11 @@ _HEX = re.compile(r"(?:0x)?([0-9A-Fa-f]{1,16})")
 
 @dataclass(frozen=True, slots=True)
 class BoardsRequest:
-    """What `simdevice boards` was asked for; units as in its help."""
+    """What `simdevice boards` was asked for; units as in its help.
+
+    ``touched`` and ``heading``: of boards on a finger that something else moves, contacts on the
+    skin now and rad counter-clockwise from above, instead of ``press`` and ``rotate``.
+    """
 
     ptys: tuple[Path, ...] = ()
     slcans: tuple[Path, ...] = ()
@@ -57,16 +66,22 @@ class BoardsRequest:
     unplugged: tuple[Window, ...] = ()
     temperature_c: float = EnvironmentParameters().room_c
     field_ut: float = EnvironmentParameters().field_ut
+    touched: Callable[[], Sequence[Contact]] | None = None
+    heading: Callable[[], float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """A station not yet open. ``lines``: what to tell the user of each of its boards."""
+    """A station not yet open. ``lines``: what to tell the user of each of its boards.
+
+    ``note``: how it is, for a status line.
+    """
 
     station: Station
     name: str
     connect: str
     lines: tuple[str, ...] = field(default=())
+    note: Callable[[], str] | None = None
 
 
 def parse_window(text: str) -> Window:
@@ -135,7 +150,7 @@ class _Maker:
     def __init__(self, request: BoardsRequest) -> None:
         self.request = request
         self._plan = FaultPlan.parse(request.faults)
-        self._turn: AttitudeScript = parse_rotation(request.rotate) if request.rotate else still
+        self._turn = _turn(request)
         self._parameters = EnvironmentParameters(
             room_c=request.temperature_c, field_ut=request.field_ut
         )
@@ -213,6 +228,9 @@ class _Maker:
         )
 
     def _contacts(self, powered: float) -> Callable[[float], Sequence[Contact]] | tuple[()]:
+        touched = self.request.touched
+        if touched is not None:
+            return lambda _: touched()
         if self.request.press is None:
             return ()
         if self._indenter is None:
@@ -220,3 +238,11 @@ class _Maker:
             self._indenter = load_script(self.request.press, geometry)
         indenter = self._indenter
         return lambda seconds: indenter.contacts(seconds + powered)
+
+
+def _turn(request: BoardsRequest) -> AttitudeScript:
+    """How the boards are turned over time."""
+    heading = request.heading
+    if heading is not None:
+        return lambda _: rotation_about(UP, heading())
+    return parse_rotation(request.rotate) if request.rotate else still

@@ -30,7 +30,8 @@ class StatusLine:
         for plan, count, earlier in zip(self._planned, now, counts, strict=True):
             rate = (count - earlier) / span if span > 0 else 0.0
             losses = sum(plan.station.losses.values())
-            parts.append(f"{plan.name} {rate:.0f}/s" + (f" lost {losses}" if losses else ""))
+            part = f"{plan.name} {rate:.0f}/s" + (f" lost {losses}" if losses else "")
+            parts.append(part if plan.note is None else f"{part}  {plan.note()}")
         text = f"{seconds:8.1f} s  " + "  ".join(parts)
         self._stream.write("\r" + text.ljust(self._width))
         self._stream.flush()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -45,6 +46,15 @@ def add_log_and_bus(parser: argparse.ArgumentParser, port: int) -> None:
         help=f"MCAP file to write, or folder for dated files (default folder ./{DEFAULT_LOG})",
     )
     add("--no-log", action="store_true", help="log nothing")
+    _add_bus(add, port)
+
+
+def add_bus(parser: argparse.ArgumentParser, port: int) -> None:
+    """Add --listen, --connect and --insecure; ``port``: the role's own."""
+    _add_bus(parser.add_argument_group("bus").add_argument, port)
+
+
+def _add_bus(add: Callable[..., object], port: int) -> None:
     add(
         "--listen",
         action="append",

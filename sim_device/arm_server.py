@@ -1,0 +1,255 @@
+"""The simulated arm and its cupboard on the bus, as a real arm's driver would be there."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+import msgspec
+import zenoh
+
+from sim_device.arm_commands import CommandInput
+from sim_device.cupboard import Cupboard, NotNow
+from sim_device.world.base import World, WorldError
+from sim_device.world.scene_markers import FRAME, scene_markers
+from sim_device.world.scenes import Scene, SceneError
+from tactile_bus.arm_types import ArmLimits, ArmState
+from tactile_bus.instant import Instant, WallClock, after, monotonic_now, seconds_between
+from tactile_bus.messages import MSG, codec, header
+from tactile_bus.services import Service, ServiceError, declare_service
+from tactile_bus.session import BusConfig, BusError, close_session, open_session
+from tactile_bus.streams import Latest, Publisher, Tap, declare_publisher, latest
+from tactile_bus.topics import ARM_STATE, COMMAND, WORLD, alive_key, service_key
+
+log = logging.getLogger(__name__)
+
+NAME_TIMEOUT = 0.3
+"""s to ask the bus whether an arm of this name is there."""
+
+MARKER_PERIOD: Final = 1 / WORLD.rate
+
+SEQUENCES = 2**32
+"""Sequence numbers of states begin again after so many."""
+
+
+class ResetRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``seed``: of the next scene, None for the same scene again."""
+
+    seed: int | None = None
+
+
+class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A request that says nothing."""
+
+
+def state_message(state: ArmState, sequence: int, wall_ns: int) -> Any:
+    """``ArmState.msg`` of a state captured at ``wall_ns``."""
+    twist = state.twist
+    return MSG.ArmState(
+        header=header(wall_ns, FRAME),
+        captured_ns=state.captured,
+        sequence=sequence,
+        x=state.x,
+        y=state.y,
+        heading=state.heading,
+        twist=MSG.Twist(MSG.Vector3(twist.vx, twist.vy, 0.0), MSG.Vector3(0.0, 0.0, twist.omega)),
+        wrench=MSG.Wrench(MSG.Vector3(state.fx, state.fy, 0.0), MSG.Vector3(0.0, 0.0, state.mz)),
+        mode=state.mode,
+        v_max=state.v_max,
+        omega_max=state.omega_max,
+        f_max=state.f_max,
+        m_max=state.m_max,
+    )
+
+
+def describe_scene(scene: Scene) -> dict[str, object]:
+    """What machines are told of a scene; m and rad in ``cupboard``."""
+    return {
+        "scene": scene.source,
+        "parameters": scene.parameters,
+        "seed": scene.seed,
+        "objects": len(scene.objects),
+        "start": [scene.start.x, scene.start.y, scene.start.heading],
+        "goal": list(scene.goal),
+    }
+
+
+class ArmServer:
+    """A `sim_device.runner.Station`: `service` it every millisecond. BusError from `open`.
+
+    ``load``: scene for a seed (None: the present one's name again), SceneError when there is none.
+    ``make_world``: builds it. Services run on zenoh's threads and share the cupboard by a lock.
+    """
+
+    def __init__(
+        self,
+        cupboard: Cupboard,
+        name: str,
+        world_name: str,
+        bus: BusConfig,
+        load: Callable[[int], Scene],
+        make_world: Callable[[Scene], World],
+    ) -> None:
+        self.cupboard = cupboard
+        self.name = name
+        self.world_name = world_name
+        self.sent = 0
+        self.commands = CommandInput()
+        self._bus = bus
+        self._load = load
+        self._make_world = make_world
+        self._wall = WallClock.take()
+        self._codec = codec()
+        self._lock = threading.Lock()
+        self._session: zenoh.Session | None = None
+        self._inputs: Latest | None = None
+        self._watch: Tap | None = None
+        self._states: Publisher | None = None
+        self._markers: Publisher | None = None
+        self._services: list[Service] = []
+        self._token: zenoh.LivelinessToken | None = None
+        self._next_markers = Instant(0)
+        self._polled = Instant(0)
+
+    @property
+    def finished(self) -> bool:
+        """Never."""
+        return False
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """Commands not obeyed, by reason, and what came late."""
+        arm = self.cupboard.counters
+        oversized = 0 if self._inputs is None else self._inputs.refused
+        kept = {k: v for k, v in arm.items() if k not in ("accepted", "clamped", "expired")}
+        return {**self.commands.refused, "oversized": oversized, **kept}
+
+    def note(self) -> str:
+        """How the arm is and how far from the goal, for a status line."""
+        return f"{self.cupboard.arm.mode}  goal {self.cupboard.distance * 100:.1f} cm"
+
+    def fileno(self) -> int:
+        """There is nothing to wait on: commands are fetched every tick."""
+        return -1
+
+    def open(self) -> None:
+        """Join the bus and let the world begin."""
+        session = self._session = open_session(self._bus)
+        try:
+            self._refuse_namesake(session)
+            now = self._polled = self._next_markers = monotonic_now()
+            self.cupboard.begin(now)
+            self._states = declare_publisher(session, ARM_STATE, self.name)
+            self._markers = declare_publisher(session, WORLD, self.world_name)
+            self._inputs = latest(session, COMMAND.key(self.name))
+            # The newest sample may hide another sender's, so that all are looked at beside it.
+            self._watch = Tap(
+                session,
+                COMMAND.key(self.name),
+                lambda sample: self.commands.watch(sample, monotonic_now()),
+            )
+            self._services = [
+                declare_service(session, key, handler, request)
+                for key, handler, request in self._handlers()
+            ]
+            self._token = session.liveliness().declare_token(alive_key(self.name, "arm"))
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Leave the bus; an arm that was moving has its power cut with the process."""
+        session, self._session = self._session, None
+        if session is not None and not close_session(session):
+            log.debug("the bus still waits for a stopped peer")
+
+    def service(self, now: Instant) -> None:
+        """Move the world on, obey the newest command, publish what is due."""
+        if self._inputs is None or self._states is None or self._markers is None:
+            return
+        with self._lock:
+            states = self.cupboard.advance(now)
+            sample = self._inputs.newest()
+            twist = None if sample is None else self.commands.take(sample, now)
+            if twist is not None:
+                # It came since the last look, nobody knows when: taken as having come right then.
+                self.cupboard.command(twist, now, seconds_between(self._polled, now))
+            self._polled = now
+        for state in states:
+            self.sent += 1
+            wall_ns = self._wall.wall_ns(state.captured)
+            message = state_message(state, self.sent % SEQUENCES, wall_ns)
+            self._states.put(self._codec.encode(ARM_STATE, message), wall_ns)
+        if now >= self._next_markers:
+            self._next_markers = max(now, after(self._next_markers, MARKER_PERIOD))
+            wall_ns = self._wall.wall_ns(now)
+            markers = scene_markers(self.cupboard.world, wall_ns)
+            self._markers.put(self._codec.encode(WORLD, markers), wall_ns)
+
+    def _refuse_namesake(self, session: zenoh.Session) -> None:
+        replies = session.liveliness().get(alive_key(self.name, "arm"), timeout=NAME_TIMEOUT)
+        if any(reply.ok is not None for reply in replies):
+            raise BusError(
+                f"an arm called {self.name!r} is on this bus: end it, or give --arm NAME"
+            )
+
+    def _handlers(self) -> Sequence[tuple[str, Callable[[Any], object], Any]]:
+        arm, world = self.name, self.world_name
+        return (
+            (service_key(arm, "limits", "arm"), self._set_limits, ArmLimits),
+            (service_key(arm, "clear", "arm"), self._clear, Nothing),
+            (service_key(arm, "status", "arm"), self._arm_status, Nothing),
+            (service_key(world, "reset", "world"), self._reset, ResetRequest),
+            (service_key(world, "status", "world"), self._world_status, Nothing),
+        )
+
+    def _set_limits(self, limits: ArmLimits) -> ArmLimits:
+        with self._lock:
+            return self.cupboard.request_limits(limits)
+
+    def _clear(self, _: Nothing) -> dict[str, str]:
+        try:
+            with self._lock:
+                return {"mode": self.cupboard.clear()}
+        except NotNow as error:
+            raise ServiceError(str(error)) from error
+
+    def _arm_status(self, _: Nothing) -> dict[str, object]:
+        with self._lock:
+            arm = self.cupboard.arm
+            counters = self.cupboard.counters | self.losses
+            return {
+                "mode": arm.mode,
+                "limits": arm.limits,
+                "states": self.sent,
+                "commander": self.commands.commander,
+                "counters": counters,
+            }
+
+    def _world_status(self, _: Nothing) -> dict[str, object]:
+        with self._lock:
+            world, distance = self.cupboard.world, self.cupboard.distance
+            resets = self.cupboard.resets
+            return describe_scene(world.scene) | {
+                "time": world.time,
+                "ejected": world.ejected,
+                "distance": distance if math.isfinite(distance) else None,
+                "resets": resets,
+            }
+
+    def _reset(self, request: ResetRequest) -> dict[str, object]:
+        scene = self.cupboard.world.scene
+        try:
+            scene = scene if request.seed is None else self._load(request.seed)
+            world = self._make_world(scene)
+        except (SceneError, WorldError, ValueError) as error:
+            raise ServiceError(str(error)) from error
+        try:
+            with self._lock:
+                self.cupboard.reset(world)
+        except NotNow as error:
+            raise ServiceError(str(error)) from error
+        return describe_scene(scene)

@@ -1,0 +1,71 @@
+"""From what `simdevice cupboard` is asked for to an arm in a world and boards on its finger."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sim_device.arm_server import ArmServer
+from sim_device.cupboard import Cupboard, ScheduledFault
+from sim_device.cupboard_scene import SceneSource, world_maker
+from sim_device.stations import BoardsRequest, Planned, plan_boards
+from sim_device.world.arm import ArmSettings
+from sim_device.world.scenes import Scene
+from tactile_bus.session import BusConfig
+from tactile_bus.topics import NAME
+
+
+@dataclass(frozen=True, slots=True)
+class CupboardRequest:
+    """What `simdevice cupboard` was asked for; units as in its help."""
+
+    source: SceneSource
+    seed: int
+    engine: str
+    arm: str
+    world: str
+    settings: ArmSettings
+    arm_faults: tuple[ScheduledFault, ...]
+    boards: BoardsRequest
+    bus: BusConfig
+
+
+def plan_cupboard(request: CupboardRequest) -> list[Planned]:
+    """Arm and boards, all made and nothing open.
+
+    ValueError (SceneError is one) for what does not fit together, `EngineMissing`, WorldError.
+    """
+    for name in (request.arm, request.world):
+        if not NAME.fullmatch(name):
+            raise ValueError(f"{name!r} is no name; allowed: letters, digits, _ and -, at most 64")
+    make_world = world_maker(request.engine)
+    scene = request.source.load(request.seed)
+    cupboard = Cupboard(
+        make_world(scene),
+        request.settings,
+        request.arm_faults,
+        np.random.default_rng([request.seed, 2]),
+    )
+    server = ArmServer(
+        cupboard, request.arm, request.world, request.bus, request.source.reseeded, make_world
+    )
+    boards = plan_boards(
+        replace(request.boards, touched=cupboard.contacts, heading=cupboard.heading)
+    )
+    gx, gy = scene.goal
+    arm = "" if request.arm == "arm" else f" --arm {request.arm}"
+    connect = (
+        f"reachd --strategy hybrid_event --set {scene.parameters} --target {goal_text(scene)}{arm}"
+    )
+    line = (
+        f"{scene.source} seed {scene.seed}, {len(scene.objects)} objects, {scene.fill:.0%} full, "
+        f"goal {gx:.3f} {gy:.3f} m, {request.engine}"
+    )
+    return [Planned(server, f"arm {request.arm}", connect, (line,), server.note), *boards]
+
+
+def goal_text(scene: Scene) -> str:
+    """Goal as `reachd --target` takes it, to the tenth of a millimetre."""
+    x, y = scene.goal
+    return f"{x:.4f},{y:.4f}"
