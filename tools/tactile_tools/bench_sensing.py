@@ -193,12 +193,13 @@ def bench_rotation(
     all.
     """
     out: dict[str, float] = {}
+    skins = [(seed + 17 * k, _calibrated(seed + 17 * k)) for k in range(contact_sets)]
     for percent in (0, 25, 50):
         for method in methods or ("off", "ransac", "consensus"):
             for noisy in (True, False):
                 turns = [
-                    _turn(percent / 100, method, noisy, steps, seed + 17 * k)
-                    for k in range(contact_sets)
+                    _turn(percent / 100, method, noisy, steps, skin, calibration)
+                    for skin, calibration in skins
                 ]
                 label = "uncompensated" if method == "off" else method
                 kind = "rms" if noisy else "systematic"
@@ -223,7 +224,16 @@ def _relative(turn: _Turn, reference: Float) -> Float:
     return error
 
 
-def _turn(share: float, method: str, noisy: bool, steps: int, seed: int) -> _Turn:
+def _calibrated(seed: int) -> BoardCalibration:
+    """Calibration of the skin that `_turn` makes of ``seed``: its tolerances are drawn first."""
+    return nominal_calibration(
+        SkinModel(finger(), SkinParameters(), np.random.default_rng(seed)), SERIAL
+    )
+
+
+def _turn(
+    share: float, method: str, noisy: bool, steps: int, seed: int, calibration: BoardCalibration
+) -> _Turn:
     """Turn the default finger once with a share of every array's taxels pressed."""
     rng = np.random.default_rng(seed)
     geometry = finger()
@@ -233,7 +243,6 @@ def _turn(share: float, method: str, noisy: bool, steps: int, seed: int) -> _Tur
             parameters, chip=replace(parameters.chip, noise_xy_ut=0.0, noise_z_ut=0.0)
         )
     model = SkinModel(geometry, parameters, rng)
-    calibration = nominal_calibration(model, SERIAL)
     settings = PipelineSettings(method=method, frozen_after_s=None)
     pipeline = BoardPipeline(calibration, settings)
     room = EnvironmentParameters(self_heating_k=0.0, room_c=parameters.chip.reference_c)
