@@ -31,17 +31,6 @@ from tactile_bus.arm_types import Twist
 _FALLEN = -0.02
 """m below the shelf at which an object counts as fallen; contacts give way by less than 1 mm."""
 
-_FATAL = tuple(
-    int(w)
-    for w in (
-        mujoco.mjtWarning.mjWARN_BADQPOS,
-        mujoco.mjtWarning.mjWARN_BADQVEL,
-        mujoco.mjtWarning.mjWARN_BADQACC,
-        mujoco.mjtWarning.mjWARN_CONTACTFULL,
-        mujoco.mjtWarning.mjWARN_CNSTRFULL,
-    )
-)
-
 # Otherwise MuJoCo prints, and writes MUJOCO_LOG.TXT wherever the process happens to stand.
 mujoco.set_mju_user_warning(logging.getLogger(__name__).debug)
 
@@ -79,7 +68,8 @@ class MujocoWorld:
         self._finger_push = data.qfrc_constraint[-3:]
         self._objects_qpos = data.qpos[: 4 * n].reshape(n, 4)
         self._objects_qvel = data.qvel[: 4 * n].reshape(n, 4)
-        self._warnings = data.warning
+        # Counts by kind; none is harmless here, see mjtWarning.
+        self._warnings = data.warning.number
         self._start = scene.start
         self._steps = 0
         self._work = 0.0
@@ -120,8 +110,8 @@ class MujocoWorld:
         mass, _, inertia = self._finger_mass
         total_x = total_y = total_m = work = 0.0
         u0, v0, w0 = self._finger_qvel.tolist()
-        for _ in range(count):
-            pose = tuple(self._finger_qpos.tolist())
+        for left in range(count - 1, -1, -1):
+            pose = self._finger_qpos.tolist()
             mujoco.mj_step(model, data)
             u1, v1, w1 = self._finger_qvel.tolist()
             fx, fy, mz = self._finger_push.tolist()
@@ -134,33 +124,35 @@ class MujocoWorld:
             u0, v0, w0 = u1, v1, w1
             if fx or fy or mz:
                 total_x, total_y, total_m = total_x + fx, total_y + fy, total_m + mz
-                self._keep_touches(pose)
+                self._touches.append(self._touched(pose, copied=left > 0))
         self._work += work / 2
         self._steps += count
         self._count = count
         self._wrench = (total_x / count, total_y / count, total_m / count)
-        warnings = self._warnings
-        for kind in _FATAL:
-            if warnings[kind].number:
-                raise WorldError(
-                    f"physics gave up at {self.time:.3f} s of scene {self._scene.seed} "
-                    f"({self._scene.source})"
-                )
-
-    def _keep_touches(self, pose: tuple[float, ...]) -> None:
-        """Copy what `contacts` will need of this physics step; it may never be asked."""
-        contact = self._data.contact
-        self._touches.append(
-            (
-                contact.geom.copy(),
-                contact.pos.copy(),
-                contact.frame.copy(),
-                contact.dist.copy(),
-                contact.efc_address.copy(),
-                self._data.efc_force.copy(),
-                pose,
+        if self._warnings.any():
+            raise WorldError(
+                f"physics gave up at {self.time:.3f} s of scene {self._scene.seed} "
+                f"({self._scene.source})"
             )
+
+    def _touched(self, pose: list[float], *, copied: bool) -> _Touches:
+        """What `contacts` will need of the physics step just made; it may never be asked.
+
+        Of the last one no copy is needed: the engine leaves it alone until the next.
+        """
+        contact = self._data.contact
+        arrays = (
+            contact.geom,
+            contact.pos,
+            contact.frame,
+            contact.dist,
+            contact.efc_address,
+            self._data.efc_force,
         )
+        geom, pos, frame, dist, address, force = (
+            (array.copy() for array in arrays) if copied else arrays
+        )
+        return geom, pos, frame, dist, address, force, pose
 
     def limit_wrench(self, f_max: float, m_max: float) -> None:
         """Bound the motors, see `World.limit_wrench`."""

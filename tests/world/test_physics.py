@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from sim_device.world.base import WALL, World
+from sim_device.world.base import WALL, World, WorldError
 from sim_device.world.generate import authors_sim
 from sim_device.world.mujoco_model import mean_lever
 from sim_device.world.mujoco_world import MujocoWorld
@@ -294,3 +295,15 @@ def test_a_finger_that_starts_turned_is_turned(engine: Engine, build: Any) -> No
     contacts = world.contacts()
     assert {contact.body for contact in contacts} == {0}
     assert all(contact.x == pytest.approx(TIP, abs=1e-3) for contact in contacts)
+
+
+def test_physics_that_diverges_is_an_error_and_leaves_no_file(
+    build: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    world = MujocoWorld(build.cupboard(build.disc(0.1, 0.0)))
+    world.step(0.01, FORWARD)
+    world.data.qvel[0] = math.nan
+    with pytest.raises(WorldError, match="scene 0"):
+        world.step(0.01, FORWARD)
+    assert list(tmp_path.iterdir()) == []
