@@ -67,8 +67,7 @@ class CanFuzzer:
         before = self.touched
         queues: list[list[CanFrame]] = []
         for board in BOARDS:
-            transfers = self._transfers(board)
-            queues.append(self._spoil(transfers))
+            queues.append(self._spoil(*self._transfers(board)))
         frames = self._interleave(queues)
         self.judge.receive(self._decoder.feed(frames[: len(frames) // 2]))
         self.judge.receive(self._decoder.feed(frames[len(frames) // 2 :]))
@@ -77,30 +76,34 @@ class CanFuzzer:
     def finish(self) -> None:
         """Nothing waits on a bus: an unfinished transfer was spoilt."""
 
-    def _transfers(self, board: int) -> list[list[CanFrame]]:
-        out = []
-        for index in self._rng.permutation(len(self._pool))[:TRANSFERS].tolist():
-            message, names = self._pool[index]
-            self.judge.send(names[board])
-            out.append(list(self._encoders[board].encode(message)))
-        return out
+    def _transfers(self, board: int) -> tuple[list[Hashable], list[list[CanFrame]]]:
+        """Keys and frames of the messages that a board sends in one batch."""
+        chosen = [self._pool[i] for i in self._rng.permutation(len(self._pool))[:TRANSFERS]]
+        names = [keys[board] for _, keys in chosen]
+        for name in names:
+            self.judge.send(name)
+        return names, [list(self._encoders[board].encode(message)) for message, _ in chosen]
 
-    def _spoil(self, transfers: list[list[CanFrame]]) -> list[CanFrame]:
+    def _spoil(self, names: list[Hashable], transfers: list[list[CanFrame]]) -> list[CanFrame]:
         """Frames of one board after each transfer met with its fate."""
         out: list[CanFrame] = []
         delayed: list[CanFrame] = []
         kinds = self._rng.integers(0, len(KINDS), len(transfers)).tolist()
         draws = self._rng.integers(0, 1 << 31, (len(transfers), 4)).tolist()
-        for frames, number, r in zip(transfers, kinds, draws, strict=True):
+        for name, frames, number, r in zip(names, transfers, kinds, draws, strict=True):
             kind = KINDS[number]
             self.kinds[kind] += 1
             spoilt, later = self._one(kind, list(frames), transfers, r)
+            if kind == "repeat_later" and len(frames) == 1:
+                # The whole message was sent twice. Only at once is that told from a new one.
+                self.judge.send(name)
             if spoilt != frames and kind not in _HARMLESS:
                 self.touched += 1
             out += spoilt
             # What stays behind turns up in the middle of whatever is sent two transfers on.
             if len(delayed) > 2 or (delayed and r[3] % 3 == 0):
-                at = len(out) - r[3] % (len(spoilt) + 1)
+                # Not between a frame and its repetition, which would then be a message of its own.
+                at = len(out) - (0 if kind == "duplicate" else r[3] % (len(spoilt) + 1))
                 out[at:at] = delayed
                 self.strays += len(delayed)
                 delayed = []
