@@ -8,6 +8,7 @@ dataclasses: ``MSG.TaxelForces(...)`` for the types the project uses, `message_c
 from __future__ import annotations
 
 import struct
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -187,10 +188,18 @@ class Codec:
         return tuple(found)
 
 
+_building = threading.Lock()
+
+
 @cache
+def _codec() -> Codec:
+    return Codec()
+
+
 def codec() -> Codec:
     """The one codec of this process, built on first call (about 0.2 s)."""
-    return Codec()
+    with _building:  # else two threads that ask first would build two
+        return _codec()
 
 
 class _Messages:

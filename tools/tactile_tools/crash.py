@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -68,6 +69,8 @@ class Result:
     seconds: float = 0.0
     writers: int = 0
     seed: int = 0
+    cores: int = 0
+    load_average: float = 0.0  # of the machine, over the last minutes of the run
     problems: list[str] = field(default_factory=list)
 
 
@@ -118,6 +121,7 @@ def run(options: argparse.Namespace) -> int:
         p50, p99 = np.percentile(losses, [50, 99]).tolist()
         result.lost_s_p50, result.lost_s_p99 = round(p50, 3), round(p99, 3)
         result.lost_s_max = round(max(losses), 3)
+    result.cores, result.load_average = os.cpu_count() or 0, round(os.getloadavg()[1], 1)
     result.seconds = round(time.monotonic() - started, 1)
     text = json.dumps(asdict(result), indent=2)
     if options.json is not None:

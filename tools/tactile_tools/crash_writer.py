@@ -80,8 +80,9 @@ def run(directory: Path, truth: Path, seed: int, seconds: float) -> None:
         raw = rng.integers(0, 256, 600, np.uint8)
         hand_over(RAW, MSG.RawChunk(head, now_ns, 0, *none, raw), now_ns)
         cycle += 1
-        due += 1 / RATE
-        time.sleep(max(due - time.monotonic(), 0.0))
+        now = time.monotonic()
+        due = max(due + 1 / RATE, now)  # a board that was not read in time does not hurry
+        time.sleep(due - now)
     recorder.close()
 
 
