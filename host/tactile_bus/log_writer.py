@@ -151,8 +151,19 @@ class LogWriter:
         self._unwritten["attachment", name] = None
 
     def open_first(self) -> None:
-        """Open the first file; OSError when that fails, FileExistsError when it is there."""
-        self._open()
+        """Open the first file; OSError when that fails.
+
+        FileExistsError when the user named it and it is there; files in a directory get the next
+        free number, since another daemon may have started in the same second.
+        """
+        while True:
+            try:
+                self._open()
+                break
+            except FileExistsError:
+                if self._set.named:
+                    raise
+                self._set.advance()
         enforce(self._set, self._settings.max_files, self._settings.max_bytes)
 
     def add(self, item: Item) -> None:

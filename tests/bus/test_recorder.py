@@ -384,6 +384,19 @@ def test_a_file_that_another_process_writes_is_not_deleted(tmp_path: Path, recor
     assert Path(other.stats.path).exists()
 
 
+def test_two_daemons_may_log_to_one_directory(tmp_path: Path, record: Any, payloads: Any) -> None:
+    both = [record(tmp_path, split_seconds=0.1) for _ in range(2)]
+    for i in range(30):
+        for number, recorder in enumerate(both):
+            data = payloads[topics.LOG]
+            recorder.write(topics.LOG, f"b{number}", data, BASE_NS + i, BASE_NS)
+        time.sleep(0.01)
+    assert all(recorder.close(10) for recorder in both)
+    numbers = sequences(tmp_path)
+    assert numbers["/tactile/b0/log"] == numbers["/tactile/b1/log"] == list(range(30))
+    assert len({log.metadata["file"]["set"] for log in logs(tmp_path)}) == 2
+
+
 def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(b"precious")
