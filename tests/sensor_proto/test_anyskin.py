@@ -92,6 +92,30 @@ def test_values_come_through_exactly(n: int) -> None:
             received.message.field_ut[0, 0] = 1
 
 
+@given(sizes=st.lists(st.integers(1, 9000), min_size=1, max_size=4), seed=st.integers(0, 999))
+@settings(max_examples=30, deadline=None)
+def test_bursts_hold_the_same_frames_as_arrays(sizes: list[int], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    wire = bytearray(b"".join(stream(150, 5)))
+    for at in rng.integers(0, len(wire), 12):
+        wire[at] ^= 1 << int(rng.integers(8))
+    single, burst = AnySkinDecoder(), AnySkinDecoder()
+    at = i = 0
+    while at < len(wire):
+        chunk = bytes(wire[at : at + sizes[i % len(sizes)]])
+        at, i = at + len(chunk), i + 1
+        frames = single.feed(chunk)
+        bursts = burst.feed_bursts(chunk)
+        assert [r.trailing for r in frames] == [t for b in bursts for t in b.trailing]
+        values = [v for b in bursts for v in b.values]
+        status = [s for b in bursts for s in b.status]
+        for received, reading, bits in zip(frames, values, status, strict=True):
+            np.testing.assert_array_equal(received.message.field_ut, reading[:, 1:])
+            np.testing.assert_array_equal(received.message.temperature_c, reading[:, 0])
+            np.testing.assert_array_equal(received.message.status, bits)
+    assert single.counters == burst.counters
+
+
 @given(sizes=st.lists(st.integers(1, 500), min_size=1, max_size=6), n=st.sampled_from([1, 5, 20]))
 @settings(max_examples=40, deadline=None)
 def test_any_chunking_yields_the_same_frames(sizes: list[int], n: int) -> None:
