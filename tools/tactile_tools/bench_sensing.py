@@ -53,13 +53,14 @@ def four_by_sixteen() -> SkinGeometry:
 
 
 def bench_pipeline(
-    cycles: int = 3000, seed: int = 0, method: str = "consensus"
+    *, quick: bool = False, cycles: int | None = None, method: str = "consensus", seed: int = 0
 ) -> dict[str, float]:
     """Milliseconds from the bytes of one cycle to its features, 4 arrays × 16 taxels.
 
     Every tenth cycle begins or ends a press of 2 N that covers a quarter of an array, so that
     contacts and patches are there half of the time.
     """
+    cycles = cycles or (1000 if quick else 5000)
     rng = np.random.default_rng(seed)
     geometry = four_by_sixteen()
     model = SkinModel(geometry, SkinParameters(), rng)
@@ -115,7 +116,9 @@ def bench_pipeline(
     }
 
 
-def bench_consensus(surfaces: int = 10, repeats: int = 5, seed: int = 0) -> dict[str, float]:
+def bench_consensus(
+    *, quick: bool = False, surfaces: int | None = None, repeats: int = 5, seed: int = 0
+) -> dict[str, float]:
     """Consensus beside scikit-learn's default RANSAC on the same surfaces, in one run.
 
     ``surfaces`` cycles of four 4 × 4 arrays for each of 0, 25 and 45 % of the taxels in contact:
@@ -123,6 +126,7 @@ def bench_consensus(surfaces: int = 10, repeats: int = 5, seed: int = 0) -> dict
     shear. Residual: rms over the taxels free of contact about the plane that was found;
     ``_plane_error``: rms over all taxels of that plane about the true one.
     """
+    surfaces = surfaces or (4 if quick else 20)
     rng = np.random.default_rng(seed)
     layout, consensus = _flat_fitter()
     places = layout.design[0, 1:].T
@@ -179,7 +183,12 @@ class _Turn:
 
 
 def bench_rotation(
-    steps: int = 360, contact_sets: int = 4, seed: int = 0, methods: tuple[str, ...] = ()
+    *,
+    quick: bool = False,
+    steps: int | None = None,
+    contact_sets: int | None = None,
+    methods: tuple[str, ...] | None = None,
+    seed: int = 0,
 ) -> dict[str, float]:
     """False forces while the board turns through 360° in 50 µT, uncompensated and compensated.
 
@@ -190,12 +199,15 @@ def bench_rotation(
     error of the pressed taxels' normal force, noise apart, against the same skin in no ambient
     field, in % of the force;
     ``rotation_contact_true_bias_pct_p``: against the true force, curvature of the dipole law and
-    all.
+    all. ``quick`` leaves RANSAC out.
     """
+    steps = steps or (90 if quick else 360)
+    contact_sets = contact_sets or (1 if quick else 2)
+    methods = methods or (("off", "consensus") if quick else ("off", "ransac", "consensus"))
     out: dict[str, float] = {}
     skins = [(seed + 17 * k, _calibrated(seed + 17 * k)) for k in range(contact_sets)]
     for percent in (0, 25, 50):
-        for method in methods or ("off", "ransac", "consensus"):
+        for method in methods:
             for noisy in (True, False):
                 turns = [
                     _turn(percent / 100, method, noisy, steps, skin, calibration)
