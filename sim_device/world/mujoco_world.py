@@ -34,9 +34,7 @@ _FALLEN = -0.02
 # Otherwise MuJoCo prints, and writes MUJOCO_LOG.TXT wherever the process happens to stand.
 mujoco.set_mju_user_warning(logging.getLogger(__name__).debug)
 
-_Touches = tuple[
-    NDArray[np.int32], Float, Float, Float, NDArray[np.int32], Float, tuple[float, ...]
-]
+_Touches = tuple[NDArray[np.int32], Float, Float, Float, NDArray[np.int32], Float, list[float]]
 
 
 class MujocoWorld:
@@ -77,6 +75,7 @@ class MujocoWorld:
         self._wrench = (0.0, 0.0, 0.0)
         self._touches: list[_Touches] = []
         self._contacts: tuple[FingerContact, ...] | None = ()
+        self._state: FingerState | None = None
 
     @property
     def scene(self) -> Scene:
@@ -106,7 +105,7 @@ class MujocoWorld:
         model, data = self._model, self._data
         self._ctrl[:] = (twist.vx, twist.vy, twist.omega)
         self._touches.clear()
-        self._contacts = None
+        self._contacts = self._state = None
         mass, _, inertia = self._finger_mass
         total_x = total_y = total_m = work = 0.0
         u0, v0, w0 = self._finger_qvel.tolist()
@@ -209,17 +208,19 @@ class MujocoWorld:
 
     def finger(self) -> FingerState:
         """Where the finger is, how it moves and what pushes it."""
-        x, y, heading = self._finger_qpos.tolist()
-        fx, fy, mz = self._wrench
-        return FingerState(
-            x=x + self._start.x,
-            y=y + self._start.y,
-            heading=heading,
-            twist=Twist(*self._finger_qvel.tolist()),
-            fx=fx,
-            fy=fy,
-            mz=mz,
-        )
+        if self._state is None:
+            x, y, heading = self._finger_qpos.tolist()
+            fx, fy, mz = self._wrench
+            self._state = FingerState(
+                x=x + self._start.x,
+                y=y + self._start.y,
+                heading=heading,
+                twist=Twist(*self._finger_qvel.tolist()),
+                fx=fx,
+                fy=fy,
+                mz=mz,
+            )
+        return self._state
 
     def poses(self) -> Float:
         """(n, 3) x, y m and yaw rad of each object."""
