@@ -51,6 +51,25 @@ class Adjacency:
             out.append(group)
         return out
 
+    def rings(self, groups: list[list[int]], blind: list[int]) -> list[list[int]]:
+        """Taxels round each of ``groups`` that are in none and not ``blind``; each used once."""
+        taken = sum(1 << taxel for group in groups for taxel in group)
+        taken |= sum(1 << taxel for taxel in blind)
+        out = []
+        for group in groups:
+            near = 0
+            for taxel in group:
+                near |= self.masks[taxel]
+            near &= ~taken
+            taken |= near
+            ring = []
+            while near:
+                bit = near & -near
+                near ^= bit
+                ring.append(bit.bit_length() - 1)
+            out.append(ring)
+        return out
+
 
 def _near(array: ArrayGeometry) -> NDArray[np.bool_]:
     """(n, n) bool, neighbours over the unrolled skin; grids need not be square."""

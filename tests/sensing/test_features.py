@@ -234,3 +234,17 @@ def test_the_tips_time_survives_a_lost_tip_block_in_the_pipeline(board, stream, 
     lost, whole = flow.cycle(field + rng.normal(0, 3, (48, 3)))
     assert "array tip missing" in lost.features.reasons
     assert whole.features.tip_contact_time == pytest.approx(0.11)
+
+
+def test_a_patch_bears_what_lies_below_the_threshold_round_it():
+    features = Feel()(presses(t9=2.0, t8=0.05, t10=0.05, t30=0.05))  # t30 is far away
+    assert features.taxels_in_contact == 1
+    assert features.normal_force == pytest.approx(2.1)
+    assert features.patches[0].normal_force == pytest.approx(2.1)
+    np.testing.assert_allclose(features.patches[0].centroid, POSITION[9])
+
+
+def test_masked_taxels_round_a_patch_are_left_out():
+    force = presses(t9=2.0)
+    force[10] = np.nan
+    assert Feel()(force, masked=1).normal_force == pytest.approx(2.0)
