@@ -36,11 +36,11 @@ hold_s = 2.0
 
 [[press]]            # light, extended contact at the tip, as when an object is pushed along
 array = "tip"
-u_mm = 0.0
-v_mm = 0.0
+u_mm = 6.0
+v_mm = 8.0
 normal_n = 2.0
 shear_n = [0.0, 0.5]
-radius_mm = 7.0
+radius_mm = 5.0
 start_s = 11.0
 ramp_s = 0.5
 hold_s = 2.5
