@@ -135,7 +135,7 @@ class Controller:
         )
         # A fault that goes on makes every request too old: it is the fault that matters.
         causes = [r.text for r in refusals if r.code is not Check.REQUEST_STALE]
-        return tuple(causes or [r.text for r in refusals])
+        return tuple(dict.fromkeys(causes or [r.text for r in refusals]))
 
     def reach(self, goal: Goal, now: Instant) -> str | None:
         """Begin a trial; returns why not."""

@@ -30,6 +30,7 @@ from reachd.outcome import Outcome
 from reachd.publish import Reporter
 from reachd.report import as_json
 from reachd.safety import SafetyGate
+from reachd.safety_settings import SafetySettings
 from reachd.seam import Goal, Strategy
 from reachd.services import ReachServices
 from reachd.settings import Settings
@@ -176,11 +177,8 @@ class Daemon:
         deadline = time.monotonic() + self.settings.wait
         while not (stopping.is_set() or self.done.is_set()):
             cycle = self.loop.last
-            if cycle is not None:
-                touch, arm = cycle.inputs.touch, cycle.inputs.arm
-                felt = touch is not None and touch.valid and cycle.touch_age < safety.features_age
-                if felt and arm is not None and cycle.arm_age < safety.arm_age:
-                    return
+            if cycle is not None and _fit(cycle, safety):
+                return
             if time.monotonic() >= deadline:
                 raise StartError(self._missing())
             stopping.wait(0.02)
@@ -337,6 +335,7 @@ class Daemon:
     def _missing(self) -> str:
         """Which input does not come, or is no good, and what to do about it."""
         s, cycle, touch = self.settings, self.loop.last, self._touch
+        safety = s.parameters.safety
         seen = None if cycle is None else cycle.inputs.touch
         problems = []
         if cycle is None or seen is None or touch is None:
@@ -348,7 +347,7 @@ class Daemon:
             )
         elif not seen.valid:
             problems.append(f"the features of {s.board} are not valid: {', '.join(touch.reasons)}")
-        elif not abs(cycle.touch_age) < s.parameters.safety.features_age:
+        elif not -safety.future <= cycle.touch_age < safety.features_age:
             problems.append(
                 f"the features of {s.board} are {cycle.touch_age:.3f} s old: has tactiled stopped? "
                 'If it runs on another machine, set [inputs] board_clock = "remote"'
@@ -358,12 +357,24 @@ class Daemon:
                 f"no state came on {ARM_STATE.key(s.arm)} within {s.wait:g} s: is the arm's driver "
                 "running, and is this its name (--arm)?"
             )
-        elif not abs(cycle.arm_age) < s.parameters.safety.arm_age:
+        elif not -safety.future <= cycle.arm_age < safety.arm_age:
             problems.append(
                 f"the state of arm {s.arm!r} is {cycle.arm_age:.3f} s old: has its driver stopped? "
                 'If it runs on another machine, set [inputs] arm_clock = "remote"'
             )
         return "; ".join(problems) or "features and arm come too seldom to start"
+
+
+def _fit(cycle: Cycle, safety: SafetySettings) -> bool:
+    """Whether both inputs are there, valid and stamped by a clock like ours."""
+    touch = cycle.inputs.touch
+    return (
+        touch is not None
+        and touch.valid
+        and cycle.inputs.arm is not None
+        and -safety.future <= cycle.touch_age < safety.features_age
+        and -safety.future <= cycle.arm_age < safety.arm_age
+    )
 
 
 def _texts(values: dict[str, float]) -> dict[str, str]:

@@ -155,7 +155,10 @@ class ControlLoop:
             self._halt()
 
     def _cycle(self, now: Instant, lateness: float) -> None:
-        cycle = self.controller.cycle(self._sense(now), now, lateness)
+        inputs = self._sense(now)
+        # Read again: an input captured since then must not seem to come from the future.
+        now = monotonic_now()
+        cycle = self.controller.cycle(inputs, now, lateness)
         self._act(cycle.decision.twist, cycle.decision.expiry, now)
         self.last = cycle
         self.beat = now

@@ -1,0 +1,250 @@
+"""A lab without hardware: an arm that obeys twists, a board's features, and reachd itself."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from tactile_bus.arm_types import ARM_LIMITS, ArmLimits
+from tactile_bus.instant import WallClock, monotonic_now
+from tactile_bus.messages import MSG, codec, header
+from tactile_bus.services import call, declare_service
+from tactile_bus.session import BusConfig, close_session, open_session
+from tactile_bus.streams import declare_publisher
+from tactile_bus.topics import ARM_STATE, COMMAND, REACH_EVENT, REACH_STATE, service_key
+
+SLOW = 40.0
+"""s that anything may take on a busy machine before a test gives it up."""
+
+EXPIRY = 0.06
+"""s for which the arm follows a command."""
+
+
+def until(done: Callable[[], object], seconds: float = SLOW) -> None:
+    end = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < end, "waited too long"
+        time.sleep(0.01)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@dataclass(frozen=True)
+class Heard:
+    """A command and when it came, in s of the monotonic clock."""
+
+    at: float
+    vx: float
+    vy: float
+    omega: float
+
+    @property
+    def still(self) -> bool:
+        return self.vx == self.vy == self.omega == 0.0
+
+
+class FakeArm:
+    """Obeys twists without inertia, each for `EXPIRY` s; its tip starts at the shelf's edge."""
+
+    def __init__(self, endpoint: str, name: str = "arm") -> None:
+        self.name = name
+        self.x, self.y, self.heading = -0.158, 0.0, 0.0
+        self.force = (0.0, 0.0, 0.0)
+        self.mode = "ready"
+        self.paused = False
+        self.deaf_to_limits = False
+        self.limits = ArmLimits(0.5, 1.0, 100.0, 20.0)
+        self.heard: list[Heard] = []
+        self.travelled = 0.0
+        self.session = open_session(BusConfig(listen=(endpoint,), connect=()))
+        self._wall = WallClock.take()
+        self._stopping = threading.Event()
+        self._key = COMMAND.key(name)
+        self._subscriber = self.session.declare_subscriber(self._key, self._hear)
+        key = service_key(name, "limits", "arm")
+        self._service = declare_service(self.session, key, self._limit, ArmLimits)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    @property
+    def moving(self) -> bool:
+        return self.speed != (0.0, 0.0, 0.0)
+
+    @property
+    def speed(self) -> tuple[float, float, float]:
+        last = self.heard[-1] if self.heard else None
+        if last is None or time.monotonic() - last.at > EXPIRY or self.mode in ("estop", "fault"):
+            return (0.0, 0.0, 0.0)
+        return (last.vx, last.vy, last.omega)
+
+    def close(self) -> None:
+        self._stopping.set()
+        self._thread.join()
+        close_session(self.session)
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        twist = codec().decode(COMMAND, sample.payload.to_bytes()).twist
+        heard = Heard(time.monotonic(), twist.linear.x, twist.linear.y, twist.angular.z)
+        assert all(math.isfinite(v) for v in (heard.vx, heard.vy, heard.omega))
+        self.heard.append(heard)
+
+    def _limit(self, limits: ArmLimits) -> ArmLimits:
+        if not self.deaf_to_limits:
+            self.limits = limits
+        return self.limits
+
+    def _run(self) -> None:
+        publisher = declare_publisher(self.session, ARM_STATE, self.name)
+        sequence, last = 0, time.monotonic()
+        while not self._stopping.wait(0.005):
+            now = time.monotonic()
+            vx, vy, omega = self.speed
+            self.x += vx * (now - last)
+            self.y += vy * (now - last)
+            self.heading += omega * (now - last)
+            self.travelled += math.hypot(vx, vy) * (now - last)
+            last = now
+            if not self.paused:
+                sequence += 1
+                data = codec().encode(ARM_STATE, self._state(sequence))
+                publisher.put(data, self._wall.wall_ns(monotonic_now()))
+
+    def _state(self, sequence: int) -> Any:
+        now, limits = monotonic_now(), self.limits
+        vx, vy, omega = self.speed
+        fx, fy, mz = self.force
+        return MSG.ArmState(
+            header=header(self._wall.wall_ns(now), "cupboard"),
+            captured_ns=now,
+            sequence=sequence,
+            x=self.x,
+            y=self.y,
+            heading=self.heading,
+            twist=MSG.Twist(MSG.Vector3(vx, vy, 0.0), MSG.Vector3(0.0, 0.0, omega)),
+            wrench=MSG.Wrench(MSG.Vector3(fx, fy, 0.0), MSG.Vector3(0.0, 0.0, mz)),
+            mode=self.mode,
+            v_max=limits.v_max,
+            omega_max=limits.omega_max,
+            f_max=limits.f_max,
+            m_max=limits.m_max,
+        )
+
+
+class Program:
+    """A process with its output in a file."""
+
+    def __init__(self, folder: Path, words: list[str]) -> None:
+        self.output = folder / f"{time.monotonic_ns()}.txt"
+        with self.output.open("wb") as file:
+            self.process = subprocess.Popen(
+                [sys.executable, *words],
+                stdout=file, stderr=subprocess.STDOUT, cwd=folder,
+                env=os.environ | {"TACTILE_RUNTIME_DIR": str(folder), "COLUMNS": "200"},
+            )  # fmt: skip
+
+    @property
+    def said(self) -> str:
+        return self.output.read_text(errors="replace")
+
+    def signal(self, number: signal.Signals) -> None:
+        self.process.send_signal(number)
+
+    def wait(self) -> int:
+        return self.process.wait(SLOW)
+
+    def end(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+
+
+class Lab:
+    """Starts what a test needs, and hears what reachd says."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.reachd_at = f"tcp/127.0.0.1:{free_port()}"
+        self.arm_at = f"tcp/127.0.0.1:{free_port()}"
+        self.events: list[Any] = []
+        self.states: list[Any] = []
+        self._arm: FakeArm | None = None
+        self._programs: list[Program] = []
+
+    @property
+    def arm(self) -> FakeArm:
+        if self._arm is None:
+            self._arm = FakeArm(self.arm_at)
+            session = self._arm.session
+            for topic, into in ((REACH_EVENT, self.events), (REACH_STATE, self.states)):
+                session.declare_subscriber(topic.key("reach"), _into(topic, into))
+        return self._arm
+
+    def board(self, name: str = "board0", ahead: float = 0.0, prefix: str = "") -> Program:
+        script = str(Path(__file__).with_name("board_process.py"))
+        return self._start([script, self.reachd_at, name, str(ahead), prefix])
+
+    def reachd(self, *words: str, listen: str | None = None) -> Program:
+        bus = ["--listen", listen or self.reachd_at, "--connect", self.arm_at]
+        return self._start(["-m", "reachd", *bus, *words])
+
+    def ask(self, service: str, request: object = None) -> Any:
+        return call(self.arm.session, service_key("reach", service, "reach"), request, SLOW)
+
+    def codes(self, kind: str) -> list[str]:
+        return [event.code for event in list(self.events) if event.kind == kind]
+
+    def reaching(self, program: Program) -> None:
+        """Wait until the arm moves."""
+        until(lambda: self.arm.moving or program.process.poll() is not None)
+        assert program.process.poll() is None, program.said
+
+    def close(self) -> None:
+        for program in self._programs:
+            program.end()
+        if self._arm is not None:
+            self._arm.close()
+
+    def _start(self, words: list[str]) -> Program:
+        program = Program(self.folder, words)
+        self._programs.append(program)
+        return program
+
+
+def _into(topic: Any, into: list[Any]) -> Callable[[zenoh.Sample], None]:
+    return lambda sample: into.append(codec().decode(topic, sample.payload.to_bytes()))
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Iterator[Lab]:
+    made = Lab(tmp_path)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+@pytest.fixture
+def wait_until() -> Callable[..., None]:
+    return until
+
+
+@pytest.fixture
+def hardware_limits() -> ArmLimits:
+    return replace(ARM_LIMITS["hardware"])

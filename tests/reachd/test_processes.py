@@ -1,0 +1,331 @@
+"""reachd as it is run: a real process, a real bus, an arm that obeys, signals."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from tactile_bus.arm_types import ArmLimits
+from tactile_bus.log_info import info
+from tactile_bus.messages import codec
+from tactile_bus.recovery import recover
+from tactile_bus.services import ServiceError
+from tactile_bus.streams import declare_publisher
+from tactile_bus.topics import FEATURES
+
+NEAR = ("--strategy", "straight", "--target", "0.04,0.0", "--seed", "1")
+FAR = ("--strategy", "straight", "--target", "0.36,0.0", "--seed", "1")
+
+Until = Callable[..., None]
+
+
+def stopped(lab: Any) -> bool:
+    """Whether the arm has been told to stand still for good: ten commands in a row."""
+    last = lab.arm.heard[-10:]
+    return len(last) == 10 and all(h.still for h in last)
+
+
+def test_a_reach_from_start_to_outcome_and_one_file_that_holds_it(
+    lab: Any, hardware_limits: ArmLimits
+) -> None:
+    arm, _ = lab.arm, lab.board()
+    program = lab.reachd(*NEAR, "--log", "trial.mcap", "--json", "outcome.json")
+    assert program.wait() == 0, program.said
+    outcome = json.loads((lab.folder / "outcome.json").read_text())
+    assert outcome["success"] is True
+    assert outcome["distance"] <= 0.0075
+    assert (outcome["strategy"], outcome["set"], outcome["seed"]) == ("straight", "hardware", 1)
+    assert "REACHED: " in program.said
+    # Limits were set and confirmed before anything moved, and every command kept them.
+    assert arm.limits.f_max == hardware_limits.f_max
+    assert all(abs(h.omega) <= 0.1 + 1e-9 for h in arm.heard)
+    assert all((h.vx**2 + h.vy**2) ** 0.5 <= arm.limits.v_max + 1e-9 for h in arm.heard)
+    assert arm.heard[-1].still
+    assert lab.codes("outcome") == ["reached"]
+    assert {"limits", "arm", "goal"} <= set(lab.codes("operator"))
+    log = info(lab.folder / "trial.mcap")
+    assert log.closed
+    topics = {channel.topic for channel in log.channels}
+    assert {
+        "/tactile/board0/features",
+        "/arm/arm/state",
+        "/arm/arm/cmd_vel",
+        "/reach/reach/state",
+        "/reach/reach/event",
+    } <= topics
+    assert log.metadata["reachd"]["seed"] == "1"
+    assert json.loads(log.metadata["outcome"]["json"])["reason"] == "reached"
+    assert "parameters.json" in log.attachments
+
+
+def test_silent_features_stop_the_arm_and_lost_ones_end_the_reach(
+    lab: Any, wait_until: Until
+) -> None:
+    """Rows 4, 13, 14 and 19: a stopped, then a killed, tactiled."""
+    arm, board = lab.arm, lab.board()
+    program = lab.reachd(*FAR, "--no-log")
+    lab.reaching(program)
+    board.signal(signal.SIGSTOP)
+    wait_until(lambda: stopped(lab))
+    assert "features_stale" in lab.codes("intervention")
+    board.signal(signal.SIGKILL)
+    assert program.wait() == 1, program.said
+    assert "NOT REACHED (held)" in program.said
+    assert "features_lost" in lab.codes("intervention")
+    assert arm.heard[-1].still
+
+
+def test_a_short_silence_only_pauses_the_reach(lab: Any, wait_until: Until) -> None:
+    arm, board = lab.arm, lab.board()
+    config = lab.folder / "reach.toml"
+    config.write_text("[parameters.safety]\nfeatures_latch = 30.0\n")
+    program = lab.reachd(*FAR, "--no-log", "--config", str(config))
+    lab.reaching(program)
+    board.signal(signal.SIGSTOP)
+    wait_until(lambda: stopped(lab))
+    board.signal(signal.SIGCONT)
+    wait_until(lambda: arm.moving)
+    program.signal(signal.SIGTERM)
+    assert program.wait() == 1
+
+
+def test_an_arm_without_state_is_not_moved_and_ends_the_reach(lab: Any, wait_until: Until) -> None:
+    """Row 24, and the latch after a second."""
+    arm, _ = lab.arm, lab.board()
+    program = lab.reachd(*FAR, "--no-log")
+    lab.reaching(program)
+    arm.paused = True
+    wait_until(lambda: stopped(lab))
+    assert program.wait() == 1, program.said
+    assert {"arm_stale", "arm_lost"} <= set(lab.codes("intervention"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_told_to_end_it_stops_the_arm_first_and_closes_its_log(
+    lab: Any, number: signal.Signals
+) -> None:
+    """Row 34."""
+    arm, _ = lab.arm, lab.board()
+    program = lab.reachd(*FAR, "--log", "trial.mcap")
+    lab.reaching(program)
+    program.signal(number)
+    assert program.wait() == 1, program.said
+    assert "NOT REACHED (stopped)" in program.said
+    assert all(h.still for h in arm.heard[-3:])
+    assert info(lab.folder / "trial.mcap").closed
+    assert not arm.moving
+
+
+def test_killed_its_arm_stops_its_log_recovers_and_the_next_one_starts(
+    lab: Any, wait_until: Until
+) -> None:
+    """Rows 15 and 29: nothing of it stays in the way."""
+    arm, _ = lab.arm, lab.board()
+    program = lab.reachd(*FAR, "--log", "trial.mcap")
+    lab.reaching(program)
+    time.sleep(1.0)
+    program.signal(signal.SIGKILL)
+    program.wait()
+    wait_until(lambda: not arm.moving)
+    report = recover(lab.folder / "trial.mcap", lab.folder / "whole.mcap")
+    assert report.messages > 0
+    again = lab.reachd("--strategy", "straight", "--target", f"{arm.x + 0.17},0", "--no-log")
+    assert again.wait() == 0, again.said
+
+
+def test_stopped_and_continued_it_does_not_move_off_by_itself(lab: Any, wait_until: Until) -> None:
+    """Row 14 for reachd itself: the arm stops without it, and waits for an operator."""
+    arm, _ = lab.arm, lab.board()
+    program = lab.reachd(*FAR, "--no-log")
+    lab.reaching(program)
+    program.signal(signal.SIGSTOP)
+    time.sleep(1.5)
+    assert not arm.moving
+    count = len(arm.heard)
+    program.signal(signal.SIGCONT)
+    assert program.wait() == 1, program.said
+    assert "stood still" in program.said
+    # What was under way when it was stopped may still come; after that nothing but zero.
+    assert sum(not h.still for h in arm.heard[count:]) <= 1
+
+
+def test_served_over_the_bus(lab: Any, wait_until: Until) -> None:
+    """Goals, refusals, rows 22, 26 and 35, in the life of one daemon."""
+    arm, _ = lab.arm, lab.board()
+    program = lab.reachd("--serve", "--strategy", "straight", "--no-log")
+    wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
+    goal = {"x": 0.36, "y": 0.0}
+    for service, request, words in (
+        ("goal", goal, "not armed"),
+        ("goal", {"x": 3.0, "y": 0.0}, "outside the region"),
+        ("goal", {"x": "far"}, "bad request"),
+        ("stop", None, "nothing to stop"),
+        ("reset", None, "a reset follows a reach"),
+    ):
+        with pytest.raises(ServiceError, match=words):
+            lab.ask(service, request)
+    assert not any(not h.still for h in arm.heard)
+
+    second = lab.reachd(*NEAR, "--no-log", listen="tcp/127.0.0.1:0")
+    assert second.wait() == 3
+    assert f"process {program.process.pid}" in second.said
+
+    lab.ask("arm")
+    lab.ask("goal", goal)
+    wait_until(lambda: arm.moving)
+    lab.ask("stop", {"reason": "enough"})
+    wait_until(lambda: stopped(lab))
+    status = lab.ask("status")
+    assert (status["state"], status["armed"]) == ("resetting", True)
+    assert status["outcome"]["text"] == "enough"
+    lab.ask("reset")
+    wait_until(lambda: lab.ask("status")["state"] == "idle")
+
+    lab.ask("goal", goal)
+    wait_until(lambda: arm.moving)
+    arm.mode = "estop"
+    wait_until(lambda: lab.ask("status")["held"] == "arm_mode")
+    with pytest.raises(ServiceError, match="clear it at the arm"):
+        lab.ask("arm")
+    arm.mode = "ready"
+    assert lab.ask("status")["armed"] is False  # the arm's health alone never arms it
+    wait_until(lambda: _armed(lab))
+    lab.ask("reset")
+    wait_until(lambda: lab.ask("status")["state"] == "idle")
+
+    lab.ask("goal", goal)
+    wait_until(lambda: arm.moving)
+    forger = declare_publisher(arm.session, FEATURES, "board0")
+    forger.put(b"forged", 0)
+    wait_until(lambda: lab.ask("status")["held"] == "duplicate_publisher")
+    assert stopped(lab) or not arm.moving
+    wait_until(lambda: _armed(lab))
+
+    program.signal(signal.SIGTERM)
+    assert program.wait() == 0, program.said
+    assert arm.heard[-1].still
+
+
+def _armed(lab: Any) -> bool:
+    """Ask to arm; False as long as it is refused."""
+    try:
+        lab.ask("arm")
+    except ServiceError:
+        return False
+    return True
+
+
+def test_without_features_or_arm_nothing_begins(lab: Any) -> None:
+    """Row 23 as well: a replay is nobody."""
+    lab.board(prefix="replay")
+    program = lab.reachd(*NEAR, "--no-log", "--wait", "1")
+    assert program.wait() == 3
+    assert "no features came on tactile/board0/features" in program.said
+    assert "boards on the bus: board0" in program.said
+    assert "no state came on arm/arm/state" in program.said
+    assert "Traceback" not in program.said
+
+
+def test_a_board_of_another_machine_must_be_named(lab: Any) -> None:
+    arm, _ = lab.arm, lab.board(ahead=500.0)
+    program = lab.reachd(*NEAR, "--no-log", "--wait", "3")
+    assert program.wait() == 3
+    assert 'board_clock = "remote"' in program.said
+    config = lab.folder / "reach.toml"
+    config.write_text('[inputs]\nboard_clock = "remote"\n')
+    assert lab.reachd(*NEAR, "--no-log", "--config", str(config)).wait() == 0
+    assert arm.travelled > 0.02
+
+
+@pytest.mark.parametrize("trouble", ["limits", "bias", "fault", "broken log"])
+def test_an_arm_that_is_not_fit_is_not_armed(lab: Any, trouble: str) -> None:
+    """Rows 26, 27 and 28: refused before anything moves."""
+    arm, _ = lab.arm, lab.board()
+    arm.deaf_to_limits = trouble == "limits"
+    arm.force = (3.0, 0.0, 0.0) if trouble == "bias" else (0.0, 0.0, 0.0)
+    arm.mode = "fault" if trouble == "fault" else "ready"
+    log = ["--log", "/proc/nowhere"] if trouble == "broken log" else ["--no-log"]
+    program = lab.reachd(*NEAR, *log)
+    assert program.wait() == 3
+    words = {
+        "limits": "f_max is 100 N, 15 asked",
+        "bias": "3.00 N and 0.000 N·m in free air",
+        "fault": "mode 'fault'",
+        "broken log": "cannot write a log",
+    }
+    assert words[trouble] in program.said
+    assert "Traceback" not in program.said
+    assert all(h.still for h in arm.heard)
+
+
+def test_a_strategy_that_fails_or_hangs_ends_in_standing_still(lab: Any) -> None:
+    """Row 18, and a strategy that never returns."""
+    (lab.folder / "own.py").write_text(
+        "import time\n"
+        "from reachd.seam import Twist\n"
+        "class Own:\n"
+        "    activity = 'own'\n"
+        "    def __init__(self, parameters, rng):\n"
+        "        self.steps = 0\n"
+        "    def start(self, goal, now):\n"
+        "        pass\n"
+        "    def step(self, touch, arm, goal, now):\n"
+        "        self.steps += 1\n"
+        "        if self.steps > 40:\n"
+        "            self.trouble()\n"
+        "        return Twist(0.04, 0.0, 0.0)\n"
+        "    def trouble(self):\n"
+        "        raise RuntimeError('lost my way')\n"
+        "class Hung(Own):\n"
+        "    def trouble(self):\n"
+        "        while True:\n"
+        "            time.sleep(1)\n"
+    )
+    arm, _ = lab.arm, lab.board()
+    target = ("--target", "0.36,0.0", "--no-log")
+    failing = lab.reachd("--strategy", "own:Own", *target)
+    assert failing.wait() == 1
+    assert "RuntimeError: lost my way" in failing.said
+    assert arm.travelled > 0.0
+    hung = lab.reachd("--strategy", "own:Hung", *target)
+    assert hung.wait() == 1
+    assert "stuck" in hung.said
+    assert arm.heard[-1].still
+
+
+def test_forged_bytes_never_take_the_daemon_down(lab: Any, wait_until: Until) -> None:
+    """Row 22: what is no message, or too large, is counted and not acted on."""
+    lab.arm, lab.board()
+    program = lab.reachd("--serve", "--no-log")
+    wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
+    key = FEATURES.key("board0")
+    before = lab.ask("status")["features"]["accepted"]
+    for data in (
+        b"",
+        b"\x00\x01\x00\x00",
+        b"x" * 70_000,
+        codec().encode(FEATURES.msgtype, _none()),
+    ):
+        lab.arm.session.put(key, data)
+        time.sleep(0.05)
+    wait_until(lambda: lab.ask("status")["features"]["accepted"] > before + 20)
+    status = lab.ask("status")
+    assert program.process.poll() is None
+    # None of them says who it is, so none is even read.
+    assert status["features"]["malformed"] == 0
+    assert status["held"] is not None
+
+
+def _none() -> Any:
+    from tactile_bus.messages import MSG, header
+
+    zero = MSG.Vector3(0.0, 0.0, 0.0)
+    return MSG.ContactFeatures(
+        header(0, "ee"), 0, 0, 0.0, 1, True, [], True, 9.0, 1, MSG.Point(0.0, 0.0, 0.0), 9.0,
+        MSG.Wrench(zero, zero), 0.0, 0.0, 1, 0, [],
+    )  # fmt: skip
