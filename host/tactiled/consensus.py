@@ -5,7 +5,8 @@ skin, nearly the same constant on every array when seen in ``ee`` axes. So: desi
 propose planes, all taxels vote on them by their joint three-component distance, the winner (or
 the constant that the whole board agrees on, where that explains an array better) is refined by
 reweighted least squares, the last time on fields from which the neighbours' contacts were taken.
-Linear in the field wherever the choice of taxels is the same: an added plane comes out exactly.
+Linear in the field wherever the choice of taxels is the same: a uniform field that is added comes
+out exactly, a plane to a fraction of the noise.
 Shapes as in `Layout`.
 """
 
@@ -168,10 +169,12 @@ class Consensus:
         fit = self._judge(theta, target, healthy, prior)
         return fit if fit.whole and fit.support.min() >= FOLLOW_SUPPORT else None
 
-    def check(self, theta: Float, field_ee: Float, forces: Float, healthy: Bool) -> Fit:
-        """How far the present cycle bears out the earlier fit ``theta``."""
+    def check(
+        self, theta: Float, field_ee: Float, forces: Float, healthy: Bool, prior: Prior | None
+    ) -> Fit:
+        """How far the present cycle bears out ``theta``, an earlier fit or another's."""
         target = self._target(theta, field_ee, forces)
-        return self._judge(theta, target, healthy, None)
+        return self._judge(theta, target, healthy, prior)
 
     def _all(self, healthy: Bool) -> bool:
         return int(np.count_nonzero(healthy)) == self._layout.taxels

@@ -50,7 +50,8 @@ class ConsensusCompensator:
                 fit = self._consensus.fit(field_ee, forces, healthy, prior)
             self._fitted, self._sound = captured, fit.whole
             return self._tracker.take(fit, captured)
-        fit = self._consensus.check(self._tracker.theta, field_ee, forces, healthy)
+        prior = self._tracker.prior(captured)
+        fit = self._consensus.check(self._tracker.theta, field_ee, forces, healthy, prior)
         return self._tracker.take(fit, captured, fresh=False)
 
 

@@ -65,10 +65,11 @@ class RansacCompensator:
                 self._begun, self._done, due = captured, 0, 1
         else:
             due = min(surfaces, 1 + (captured - self._begun) * surfaces // self._period)
+        prior = self._tracker.prior(captured)
         if self._fit_surfaces(due, field_ee, healthy):
-            fit = self._checker.check(self._theta, field_ee, forces, healthy)
+            fit = self._checker.check(self._theta, field_ee, forces, healthy, prior)
             return self._tracker.take(replace(fit, valid=fit.valid & self._complete), captured)
-        held = self._checker.check(self._tracker.theta, field_ee, forces, healthy)
+        held = self._checker.check(self._tracker.theta, field_ee, forces, healthy, prior)
         return self._tracker.take(held, captured, fresh=False)
 
     def _fit_surfaces(self, upto: int, field: Float, healthy: Bool) -> bool:
