@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.metadata import version
 
-TOOLS = ("log", "plot", "reach", "fidelity", "bench", "demo", "fuzz", "crash")
+TOOLS = ("log", "plot", "reach", "fidelity", "bench", "demo", "demo_reach", "fuzz", "crash")
 """Modules of this package that add a subcommand; each defines ``add_parser(subparsers)``."""
 
 
@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one tool; its exit code is 0 only when the job was done, 2 for a bad argument."""
     words = list(sys.argv[1:] if argv is None else argv)
     # Only the tool that was named is imported, so that `tactile log` does not wait for matplotlib.
-    named = tuple(tool for tool in TOOLS if words and words[0] == tool)
+    named = tuple(tool for tool in TOOLS if words and words[0] == tool.replace("_", "-"))
     options = build_parser(named or TOOLS).parse_args(words)
     run: Callable[[argparse.Namespace], int] = options.func
     try:

@@ -1,0 +1,96 @@
+"""``tactile demo-reach``: cupboard, tactiled and reachd as three processes, in real time."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from tactile_tools.processes import command, free_port, running, wait_for
+from tactile_tools.series import LogUnreadableError
+
+BOARD = "finger"
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``demo-reach`` to the umbrella command."""
+    parser = subparsers.add_parser(
+        "demo-reach",
+        help="reach into a simulated cupboard with three processes, leave a log and a picture",
+        description="Starts a simulated cupboard with arm and finger, tactiled on the finger's "
+        "board, and reachd; prints the outcome, leaves a log and a picture of the reach. "
+        "Exit: 0 reached, 1 not reached, 2 bad argument, 3 refused by the system.",
+    )
+    parser.add_argument("--out", type=Path, default=Path("demo-reach.mcap"), help="log to leave")
+    parser.add_argument("--png", type=Path, default=Path("demo-reach.png"), help="picture to leave")
+    parser.add_argument("--strategy", default="hybrid_event", help="default %(default)s")
+    parser.add_argument("--scene", default="authors_sim", help="default %(default)s")
+    parser.add_argument("--seed", type=int, default=1, help="of scene and trial (default 1)")
+    parser.set_defaults(func=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the demo; the exit code says whether the target was reached."""
+    with tempfile.TemporaryDirectory(prefix="tactile-demo-") as name:
+        try:
+            code = _run(options, Path(name))
+        except (RuntimeError, OSError, subprocess.SubprocessError) as error:
+            print(f"tactile demo-reach: {error}", file=sys.stderr)
+            return 3
+    if code not in (0, 1):
+        return code
+    from tactile_tools.plot_reach import draw_reach
+
+    try:
+        draw_reach(options.out, options.png)
+    except LogUnreadableError as error:
+        print(f"tactile demo-reach: {error}", file=sys.stderr)
+        return 3
+    print(f"wrote {options.out} and {options.png}")
+    return code
+
+
+def _run(options: argparse.Namespace, folder: Path) -> int:
+    simdevice, tactiled, reachd = command("simdevice"), command("tactiled"), command("reachd")
+    board = folder / BOARD
+    calibration = folder / "finger.cal.toml"
+    scene = ["--scene", options.scene, "--seed", str(options.seed)]
+    goal = subprocess.run(
+        [simdevice, "cupboard", *scene, "--print-goal"], check=True, capture_output=True, text=True
+    ).stdout.strip()
+    subprocess.run(
+        [simdevice, "calibration", "--seed", str(options.seed), "--out", str(calibration)],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
+    options.out.unlink(missing_ok=True)
+    arm, skin, reach = (f"tcp/127.0.0.1:{free_port()}" for _ in range(3))
+    cupboard = [simdevice, "cupboard", *scene, "--pty", str(board), "--listen", arm]
+    sensing = [
+        *(tactiled, "--port", str(board), "--name", BOARD, "--calibration", str(calibration)),
+        *("--listen", skin, "--connect", arm, "--no-log"),
+    ]
+    print(
+        f"A cupboard ({options.scene} {options.seed}), the target at {goal} m, and three processes."
+    )
+    with contextlib.ExitStack() as stack:
+        said = folder / "cupboard.txt"
+        first = stack.enter_context(running([*cupboard, "--connect", skin], said))
+        wait_for(board, first, said)
+        stack.enter_context(running(sensing, folder / "tactiled.txt"))
+        done = subprocess.run(
+            [
+                *(reachd, "--strategy", options.strategy, "--target", goal),
+                *("--set", options.scene if options.scene == "hardware" else "authors_sim"),
+                *("--board", BOARD, "--seed", str(options.seed), "--log", str(options.out)),
+                *("--listen", reach, "--connect", arm, "--connect", skin),
+            ],
+            check=False,
+        )
+        if done.returncode not in (0, 1):
+            for name in ("cupboard.txt", "tactiled.txt"):
+                print(f"--- {name}\n{(folder / name).read_text(errors='replace')[-1500:]}")
+    return done.returncode
