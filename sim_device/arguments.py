@@ -14,6 +14,13 @@ if TYPE_CHECKING:
 
 Handler = Callable[[argparse.Namespace], int]
 
+ENGINES = ("mujoco", "pymunk")
+
+DEFAULT_RECORDED = Path(__file__).resolve().parents[1] / (
+    "../shared/data/authors_scenes/scenes_1_60.json.gz"
+)
+"""Where the recorded scenes lie beside a checkout."""
+
 ARM_HELP = """\
 faults of the arm, parted by commas: silent, frozen, stale, biased, refuses_limits, fault, estop;
 each from the start, @Ts or @Ts+Ds (T s after the start, for D s), such as silent@5s+1s,estop@8s.
@@ -117,7 +124,6 @@ def _add_boards(commands: Commands) -> argparse.ArgumentParser:
 
 
 def _add_cupboard(commands: Commands) -> argparse.ArgumentParser:
-    from sim_device.cupboard_scene import DEFAULT_RECORDED, ENGINES
     from tactile_bus.options import add_bus
     from tactile_bus.session import PORTS
 

@@ -13,7 +13,7 @@ import zenoh
 
 from sim_device.arm_commands import CommandInput
 from sim_device.cupboard import Cupboard, NotNow
-from sim_device.world.base import World, WorldError
+from sim_device.world.base import PHYSICS_STEP, World, WorldError
 from sim_device.world.scene_markers import FRAME, scene_markers
 from sim_device.world.scenes import Scene, SceneError
 from tactile_bus.arm_types import ArmLimits, ArmState
@@ -113,6 +113,7 @@ class ArmServer:
         self._token: zenoh.LivelinessToken | None = None
         self._next_markers = Instant(0)
         self._polled = Instant(0)
+        self._obeyed: Instant | None = None
 
     @property
     def finished(self) -> bool:
@@ -123,13 +124,21 @@ class ArmServer:
     def losses(self) -> dict[str, int]:
         """Commands not obeyed, by reason, and what came late."""
         arm = self.cupboard.counters
-        oversized = 0 if self._inputs is None else self._inputs.refused
         kept = {k: v for k, v in arm.items() if k not in ("accepted", "clamped", "expired")}
-        return {**self.commands.refused, "oversized": oversized, **kept}
+        return {**self.commands.refused, "oversized": self._oversized, **kept}
 
     def note(self) -> str:
         """How the arm is and how far from the goal, for a status line."""
-        return f"{self.cupboard.arm.mode}  goal {self.cupboard.distance * 100:.1f} cm"
+        text = f"{self.cupboard.arm.mode}  {self.cupboard.distance * 100:.1f} cm to goal"
+        refused = sum(self.commands.refused.values()) + self._oversized
+        late = self.cupboard.counters["late_steps"] * round(PHYSICS_STEP * 1000)
+        return (
+            text + (f"  refused {refused}" if refused else "") + (f"  late {late} ms" * (late > 0))
+        )
+
+    @property
+    def _oversized(self) -> int:
+        return 0 if self._watch is None else self._watch.refused
 
     def fileno(self) -> int:
         """There is nothing to wait on: commands are fetched every tick."""
@@ -174,9 +183,10 @@ class ArmServer:
             states = self.cupboard.advance(now)
             sample = self._inputs.newest()
             twist = None if sample is None else self.commands.take(sample, now)
-            if twist is not None:
-                # It came since the last look, nobody knows when: taken as having come right then.
-                self.cupboard.command(twist, now, seconds_between(self._polled, now))
+            # It came since the last look, nobody knows when: taken as having come right then.
+            waited = seconds_between(self._polled, now)
+            if twist is not None and self.cupboard.command(twist, now, waited):
+                self._obeyed = self._polled
             self._polled = now
         for state in states:
             self.sent += 1
@@ -220,13 +230,13 @@ class ArmServer:
     def _arm_status(self, _: Nothing) -> dict[str, object]:
         with self._lock:
             arm = self.cupboard.arm
-            counters = self.cupboard.counters | self.losses
             return {
                 "mode": arm.mode,
                 "limits": arm.limits,
                 "states": self.sent,
                 "commander": self.commands.commander,
-                "counters": counters,
+                "last_command_ns": self._obeyed,
+                "counters": self.cupboard.counters | self.losses,
             }
 
     def _world_status(self, _: Nothing) -> dict[str, object]:

@@ -101,12 +101,15 @@ def _cupboard(arguments: argparse.Namespace) -> int:
             print(goal_text(request.source.load(request.seed)))
             return OK
         planned = plan_cupboard(request)
-        # Services answer on other threads: the world must get its turn within a tick.
-        sys.setswitchinterval(SWITCH_INTERVAL)
-        return _serve(planned, arguments.duration)
     except ValueError as error:
         raise _Refusal(BAD_ARGUMENT, error) from error
     except (EngineMissing, WorldError) as error:
+        raise _Refusal(REFUSED, error) from error
+    # Services answer on other threads: the world must get its turn within a tick.
+    sys.setswitchinterval(SWITCH_INTERVAL)
+    try:
+        return _serve(planned, arguments.duration)
+    except WorldError as error:
         raise _Refusal(REFUSED, error) from error
 
 

@@ -110,6 +110,7 @@ class Cupboard:
         """Let time run from ``now`` on."""
         self._start = now
         self._arm = SimulatedArm(self._world, self._settings, now, self._rng)
+        self._apply_faults(0.0)
 
     def advance(self, now: Instant) -> list[ArmState]:
         """Move on to ``now``; the states that were received meanwhile, in order."""

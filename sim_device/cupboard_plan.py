@@ -50,9 +50,11 @@ def plan_cupboard(request: CupboardRequest) -> list[Planned]:
     server = ArmServer(
         cupboard, request.arm, request.world, request.bus, request.source.reseeded, make_world
     )
-    boards = plan_boards(
-        replace(request.boards, touched=cupboard.contacts, heading=cupboard.heading)
-    )
+    boards: list[Planned] = []
+    if request.boards.ptys or request.boards.slcans:  # an arm without touch is an arm, too
+        boards = plan_boards(
+            replace(request.boards, touched=cupboard.contacts, heading=cupboard.heading)
+        )
     gx, gy = scene.goal
     arm = "" if request.arm == "arm" else f" --arm {request.arm}"
     connect = (

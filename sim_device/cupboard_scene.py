@@ -13,15 +13,8 @@ from sim_device.world.scenes import Scene, SceneError
 
 RECORDED_PREFIX = "recorded:"
 
-DEFAULT_RECORDED = Path(__file__).resolve().parents[1] / (
-    "../shared/data/authors_scenes/scenes_1_60.json.gz"
-)
-"""Where the recorded scenes lie beside a checkout."""
-
 MAX_SCENE_BYTES = 1 << 20
 """A scene of 200 objects, the most there may be, takes 50 kB of JSON."""
-
-ENGINES = ("mujoco", "pymunk")
 
 
 class EngineMissing(Exception):  # noqa: N818 - names a state of the installation
@@ -36,7 +29,7 @@ class SceneSource:
     """
 
     name: str
-    recorded: Path = DEFAULT_RECORDED
+    recorded: Path
 
     def load(self, seed: int) -> Scene:
         """Scene for ``seed``; a file and ``recorded:N`` have but the one."""

@@ -29,9 +29,12 @@ class StatusLine:
         parts = []
         for plan, count, earlier in zip(self._planned, now, counts, strict=True):
             rate = (count - earlier) / span if span > 0 else 0.0
-            losses = sum(plan.station.losses.values())
-            part = f"{plan.name} {rate:.0f}/s" + (f" lost {losses}" if losses else "")
-            parts.append(part if plan.note is None else f"{part}  {plan.note()}")
+            part = f"{plan.name} {rate:.0f}/s"
+            if plan.note is not None:
+                part += f"  {plan.note()}"
+            elif losses := sum(plan.station.losses.values()):
+                part += f" lost {losses}"
+            parts.append(part)
         text = f"{seconds:8.1f} s  " + "  ".join(parts)
         self._stream.write("\r" + text.ljust(self._width))
         self._stream.flush()

@@ -1,0 +1,196 @@
+"""A cupboard with one heavy disc in the finger's way, on a bus of its own, as a real process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from sim_device.world.scenes import Pose, Scene, SceneObject, Shape
+from tactile_bus.arm_types import ZERO, Twist
+from tactile_bus.instant import NS_PER_S, WallClock, monotonic_now
+from tactile_bus.messages import MSG, codec, header
+from tactile_bus.services import call
+from tactile_bus.session import BusConfig, close_session, open_session
+from tactile_bus.streams import BusSample, Publisher, Tap, declare_publisher
+from tactile_bus.topics import ARM_STATE, COMMAND, service_key
+
+RADIUS = 0.04
+DISC_X = 0.02
+TIP_START = -0.042
+WAY = DISC_X - RADIUS - TIP_START  # m the finger goes until it touches
+LIMITS = {"v_max": 0.05, "omega_max": 0.35, "f_max": 10.0, "m_max": 1.5}
+
+
+def disc_scene(mass: float = 2.0) -> Scene:
+    disc = SceneObject(
+        Shape.DISC, 2 * RADIUS, 2 * RADIUS, height=0.08, mass=mass, x=DISC_X, y=0.01, yaw=0.0
+    )
+    return Scene("test", "authors_sim", 5, 0.375, 0.55, Pose(-0.2, 0.0, 0.0), (0.358, 0.1), (disc,))
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return disc_scene()
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def command_bytes(twist: Twist, frame: str = "cupboard", z: float = 0.0) -> bytes:
+    message = MSG.TwistStamped(
+        header(1, frame),
+        MSG.Twist(MSG.Vector3(twist.vx, twist.vy, z), MSG.Vector3(0.0, 0.0, twist.omega)),
+    )
+    return codec().encode(COMMAND, message)
+
+
+class Commander:
+    """Sends ``twist`` 100 times a second until it is stopped; then nothing, not even a zero."""
+
+    def __init__(self, session: zenoh.Session, twist: Twist) -> None:
+        self._publisher = declare_publisher(session, COMMAND, "arm")
+        self._data = command_bytes(twist)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._publisher.close()
+
+    def _run(self) -> None:
+        wall = WallClock.take()
+        while not self._stop.wait(0.01):
+            self._publisher.put(self._data, wall.wall_ns(monotonic_now()))
+
+
+class Cupboard:
+    """A running ``simdevice cupboard`` and a session on its bus. ``states``: all that came."""
+
+    def __init__(self, folder: Path, scene: str, *arguments: str) -> None:
+        self.folder = folder
+        self.port = free_port()
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "sim_device", "cupboard", "--scene", scene, "--seed", "3",
+             "--pty", "board0", "--listen", f"tcp/127.0.0.1:{self.port}",
+             "--connect", f"tcp/127.0.0.1:{free_port()}", *arguments],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder,
+        )  # fmt: skip
+        assert self.process.stdout is not None
+        self.said = [self.process.stdout.readline() for _ in range(2)]
+        self.session = open_session(BusConfig(listen=(), connect=(f"tcp/127.0.0.1:{self.port}",)))
+        self.states: list[Any] = []
+        self._tap = Tap(self.session, ARM_STATE.key("arm"), self._take)
+        self.call("status")
+
+    def _take(self, sample: BusSample) -> None:
+        self.states.append(codec().decode(ARM_STATE, sample.data))
+
+    def call(self, service: str, request: object = None, kind: str = "arm") -> Any:
+        key = service_key("arm" if kind == "arm" else "world", service, kind)
+        return call(self.session, key, request, timeout=20)
+
+    def publisher(self) -> Publisher:
+        return declare_publisher(self.session, COMMAND, "arm")
+
+    def commander(self, twist: Twist) -> Commander:
+        return Commander(self.session, twist)
+
+    def rest(self) -> None:
+        """Wait until no command is under way: a late one sets an arm off that had stopped."""
+        since = monotonic_now()
+        until(
+            lambda: (
+                self.states
+                and self.states[-1].captured_ns > since + 0.15 * NS_PER_S
+                and self.states[-1].mode != "moving"
+            )
+        )
+
+    def settled(self) -> None:
+        """Arm at rest, another commander welcome, everything back where it was."""
+        self.rest()
+        time.sleep(0.4)
+        self.call("reset", kind="world")
+        self.call("limits", LIMITS)
+
+    def end(self) -> tuple[int, str]:
+        self.process.send_signal(signal.SIGINT)
+        _, errors = self.process.communicate(timeout=20)
+        return self.process.returncode, errors
+
+    def close(self) -> None:
+        close_session(self.session)
+        if self.process.poll() is None:
+            os.kill(self.process.pid, 9)
+            self.process.communicate()
+
+
+def until(condition: Callable[[], object], timeout: float = 30.0) -> None:
+    deadline = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.005)
+
+
+@pytest.fixture(scope="session")
+def wait_until() -> Callable[..., None]:
+    return until
+
+
+@pytest.fixture(scope="session")
+def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "disc.json"
+    path.write_text(disc_scene().to_json())
+    return path
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory, scene_file: Path) -> Iterator[Cupboard]:
+    running = Cupboard(tmp_path_factory.mktemp("run"), str(scene_file))
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def cupboard(shared: Cupboard) -> Cupboard:
+    """The one process of a module, as new."""
+    shared.settled()
+    return shared
+
+
+@pytest.fixture
+def start(tmp_path: Path, scene_file: Path) -> Iterator[Callable[..., Cupboard]]:
+    started: list[Cupboard] = []
+
+    def run(*arguments: str) -> Cupboard:
+        started.append(Cupboard(tmp_path, str(scene_file), *arguments))
+        return started[-1]
+
+    yield run
+    for running in started:
+        running.close()
+
+
+@pytest.fixture(scope="session")
+def encode_command() -> Callable[..., bytes]:
+    return command_bytes
+
+
+__all__ = ["ZERO", "Commander", "Cupboard"]

@@ -1,0 +1,263 @@
+"""The cupboard as a real process: its arm on a real bus, its board on a real terminal."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sim_device.catalogue import factory_calibration
+from tactile_bus.arm_types import Twist
+from tactile_bus.instant import NS_PER_S, monotonic_now
+from tactile_bus.messages import codec
+from tactile_bus.services import ServiceError
+from tactile_bus.streams import latest
+from tactile_bus.topics import WORLD, alive_key
+from tactiled.blocks import Cycle
+from tactiled.events import Sampled
+from tactiled.line import SerialLine
+from tactiled.pipeline import BoardPipeline
+from tactiled.transports.serial_port import SerialTransport
+
+AHEAD, BACK = Twist(0.05, 0.0, 0.0), Twist(-0.05, 0.0, 0.0)
+STILL = 1e-4  # m/s
+
+COMMANDER = textwrap.dedent("""
+    import sys, time
+    from tactile_bus.session import BusConfig, open_session
+    from tactile_bus.streams import Publisher
+    session = open_session(BusConfig(listen=(), connect=(f"tcp/127.0.0.1:{sys.argv[1]}",)))
+    publisher = Publisher(session, "arm/arm/cmd_vel", "geometry_msgs/msg/TwistStamped")
+    data = bytes.fromhex(sys.argv[2])
+    print("ready", flush=True)
+    while True:
+        publisher.put(data, time.time_ns())
+        time.sleep(0.01)
+""")
+
+Wait = Callable[..., None]
+
+
+def rest_after(cupboard: Any) -> float:
+    """s from the last command that the arm obeyed to the last state in which it moves."""
+    cupboard.rest()
+    last = cupboard.call("status")["last_command_ns"]
+    moving = [s.captured_ns for s in cupboard.states if abs(s.twist.linear.x) > STILL]
+    assert moving
+    return float(max(moving) - last) / NS_PER_S
+
+
+def test_it_says_how_to_connect_and_announces_itself(cupboard: Any, wait_until: Wait) -> None:
+    arm, board = cupboard.said
+    assert "reachd --strategy hybrid_event --set authors_sim --target 0.3580,0.1000" in arm
+    assert board.startswith("board0: finger ")
+    assert "tactiled --port board0" in board
+    tokens = cupboard.session.liveliness().get(alive_key("arm", "arm"), timeout=5)
+    assert [str(t.ok.key_expr) for t in tokens if t.ok is not None] == [alive_key("arm", "arm")]
+    status = cupboard.call("status", kind="world")
+    assert status["goal"] == [0.358, 0.1]
+    seen = latest(cupboard.session, WORLD.key("world")).wait(20)
+    assert seen is not None
+    markers = codec().decode(WORLD, seen.data).markers
+    by_name = {(m.ns, m.id): m for m in markers}
+    goal, disc = by_name["goal", 0].pose.position, by_name["objects", 0]
+    assert (goal.x, goal.y) == (0.358, 0.1)
+    assert disc.pose.position.x == pytest.approx(0.02, abs=1e-3)
+    assert disc.scale.x == pytest.approx(0.08)
+    assert ("finger", 0) in by_name
+
+
+def test_states_are_stamped_at_100_hz_whatever_else_goes_on(
+    cupboard: Any, wait_until: Wait
+) -> None:
+    first = len(cupboard.states)
+    wait_until(lambda: len(cupboard.states) >= first + 150)
+    states = cupboard.states[first:]
+    stamps = np.array([s.captured_ns for s in states])
+    # Late ones are sent, too; the bus may drop one when a link is full.
+    assert np.median(np.diff(stamps)) == 10_000_000
+    assert stamps[-1] - stamps[0] <= 1.1 * 0.01 * NS_PER_S * len(states)
+    assert stamps[-1] <= monotonic_now()
+    numbers = [s.sequence for s in states]
+    assert numbers == sorted(set(numbers))
+    assert states[-1].f_max == 10.0
+
+
+def test_a_command_moves_the_arm_and_its_end_stops_it(cupboard: Any, wait_until: Wait) -> None:
+    begin = cupboard.states[-1].x
+    commander = cupboard.commander(AHEAD)
+    wait_until(lambda: cupboard.states[-1].x > begin + 0.01)
+    commander.stop()
+    assert rest_after(cupboard) <= 0.1
+    stood = cupboard.states[-1].x
+    time.sleep(0.2)
+    assert cupboard.states[-1].x == pytest.approx(stood, abs=1e-6)
+
+
+@pytest.fixture
+def other(cupboard: Any, encode_command: Any) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMMANDER, str(cupboard.port), encode_command(AHEAD).hex()],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def test_kill_9_of_the_commander_stops_the_arm(
+    cupboard: Any, other: subprocess.Popen[str], wait_until: Wait
+) -> None:
+    begin = cupboard.states[-1].x
+    wait_until(lambda: cupboard.states[-1].x > begin + 0.005)
+    os.kill(other.pid, signal.SIGSTOP)  # neither closes its socket nor speaks
+    assert rest_after(cupboard) <= 0.1
+    begin = cupboard.states[-1].x
+    os.kill(other.pid, signal.SIGCONT)
+    wait_until(lambda: cupboard.states[-1].x > begin + 0.005)
+    os.kill(other.pid, signal.SIGKILL)
+    assert rest_after(cupboard) <= 0.1
+
+
+def test_a_second_commander_is_refused_until_the_first_is_gone(
+    cupboard: Any, wait_until: Wait
+) -> None:
+    begin = cupboard.states[-1].x
+    foreign = cupboard.call("status")["counters"]["foreign"]
+    first = cupboard.commander(AHEAD)
+    wait_until(lambda: cupboard.states[-1].mode == "moving")
+    second = cupboard.commander(BACK)
+    wait_until(lambda: cupboard.states[-1].x > begin + 0.015)
+    assert cupboard.call("status")["counters"]["foreign"] > foreign
+    assert min(s.twist.linear.x for s in cupboard.states[-100:]) > -STILL
+    first.stop()
+    wait_until(lambda: cupboard.states[-1].twist.linear.x < -0.01)
+    second.stop()
+
+
+def test_damaged_oversized_and_nameless_commands_move_nothing(
+    cupboard: Any, encode_command: Any, wait_until: Wait
+) -> None:
+    before = cupboard.call("status")["counters"]
+    good = encode_command(AHEAD)
+    publisher = cupboard.publisher()
+    nameless = cupboard.session.declare_publisher("arm/arm/cmd_vel")
+    for _ in range(10):
+        publisher.put(good[:40], 1)
+        nameless.put(good)
+        nameless.put(good + bytes(66_000 - len(good)))
+        time.sleep(0.02)
+    publisher.put(encode_command(Twist(float("nan"), 0.0, 0.0)), 1)
+    wait_until(lambda: cupboard.call("status")["counters"]["not_finite"] > before["not_finite"])
+    after = cupboard.call("status")["counters"]
+    for reason in ("malformed", "anonymous", "oversized"):
+        assert after[reason] > before[reason], reason
+    assert after["accepted"] == before["accepted"]
+    assert {s.mode for s in cupboard.states[-20:]} <= {"ready", "stopped"}
+    nameless.undeclare()
+
+
+def test_limits_are_confirmed_and_kept(cupboard: Any, wait_until: Wait) -> None:
+    asked = {"v_max": 0.02, "omega_max": 0.1, "f_max": 5.0, "m_max": 0.5}
+    assert cupboard.call("limits", asked) == asked
+    assert cupboard.call("clear") == {"mode": "ready"}
+    commander = cupboard.commander(AHEAD)
+    wait_until(lambda: cupboard.states[-1].twist.linear.x > 0.019)
+    commander.stop()
+    state = cupboard.states[-1]
+    assert (state.v_max, state.omega_max, state.f_max, state.m_max) == tuple(asked.values())
+    assert max(s.twist.linear.x for s in cupboard.states[-50:]) < 0.0205
+    for bad in ({}, asked | {"f_max": -1}, asked | {"f_max": "much"}):
+        with pytest.raises(ServiceError, match="bad request"):
+            cupboard.call("limits", bad)
+
+
+def test_what_the_finger_runs_into_shows_in_the_bytes_of_its_board(
+    cupboard: Any, wait_until: Wait
+) -> None:
+    port = SerialTransport(str(cupboard.folder / "board0"), 115_200)
+    port.open()
+    line = SerialLine("board0", lambda *_: None, "tactile", 100.0)
+    pipeline = BoardPipeline(factory_calibration("finger", 3))
+    line.connect(monotonic_now())
+    cycles: list[Cycle] = []
+
+    def hear(enough: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + 30
+        while not enough():
+            assert time.monotonic() < deadline, "waited in vain"
+            events = line.tick(monotonic_now())
+            for payload in line.outgoing():
+                port.write(payload)
+            chunk = port.read(0.05)
+            if chunk is not None:
+                events = [*events, *line.receive(chunk)]
+            for event in events:
+                if isinstance(event.event, Sampled):
+                    cycles.extend(pipeline.feed(event.event.block))
+
+    try:
+        hear(lambda: len(cycles) > 80 and cycles[-1].features.valid)
+        free = max(c.features.tip_force for c in cycles[-20:])
+        commander = cupboard.commander(AHEAD)
+        try:
+            hear(lambda: cycles[-1].features.tip_force > free + 2.0)
+        finally:
+            commander.stop()
+    finally:
+        port.close()
+    # 2 kg on the shelf: what keeps it moving is μ·m·g = 0.2 · 2 · 9.81 N; the impact is harder.
+    assert min(s.wrench.force.x for s in cupboard.states[-300:]) < -2.0
+    assert free < 1.0
+
+
+def test_a_reset_brings_arm_and_objects_back(cupboard: Any, wait_until: Wait) -> None:
+    commander = cupboard.commander(AHEAD)
+    wait_until(lambda: cupboard.states[-1].x > -0.17)
+
+    def refused() -> bool:
+        try:
+            cupboard.call("reset", kind="world")
+        except ServiceError as error:
+            return "moving: stop it first" in str(error)
+        return False  # the commander was late, so that the arm rested just then
+
+    wait_until(refused)
+    commander.stop()
+    cupboard.rest()
+    told = cupboard.call("reset", kind="world")
+    assert (told["goal"], told["start"]) == ([0.358, 0.1], [-0.2, 0.0, 0.0])
+    wait_until(lambda: cupboard.states[-1].x < -0.199)
+    assert cupboard.states[-1].f_max == 10.0
+    with pytest.raises(ServiceError, match="is one scene"):
+        cupboard.call("reset", {"seed": 8}, kind="world")
+
+
+def test_an_emergency_stop_cannot_be_cleared_while_pressed_and_ctrl_c_ends_in_order(
+    start: Any, wait_until: Wait
+) -> None:
+    cupboard = start("--arm-fault", "estop@0s+600s,refuses_limits", "--arm-rate", "200")
+    factory = cupboard.call("limits", {"v_max": 0.05, "omega_max": 0.3, "f_max": 5.0, "m_max": 1.0})
+    assert factory["v_max"] == 0.5
+    commander = cupboard.commander(AHEAD)
+    wait_until(lambda: cupboard.call("status")["counters"]["not_enabled"] > 30)
+    with pytest.raises(ServiceError, match="'estop' is still there"):
+        cupboard.call("clear")
+    commander.stop()
+    assert {s.mode for s in cupboard.states} == {"estop"}
+    assert cupboard.states[-1].x == pytest.approx(-0.2, abs=1e-6)
+    code, errors = cupboard.end()
+    assert code == 0
+    assert "not_enabled" in errors
+    assert not (cupboard.folder / "board0").is_symlink()
