@@ -71,8 +71,6 @@ class Controller:
         self.finished: deque[tuple[Outcome, Goal]] = deque(maxlen=MAX_FINISHED)
         self._goal: Goal | None = None
         self._troubles: tuple[str, ...] = ()
-        self.faulted: Instant | None = None
-        """When something last latched, other than limits that the arm does not confirm yet."""
 
     def cycle(self, inputs: Inputs, now: Instant, lateness: float) -> Cycle:
         """Decide what is sent now."""
@@ -80,7 +78,6 @@ class Controller:
         if lateness > self._settings.arm_latch:
             # Stopped and continued, or the machine slept: nobody has watched since.
             self.gate.disarm(now, f"the control loop stood still for {lateness:.1f} s")
-            self.faulted = now
         command = self.supervisor.step(inputs.touch, inputs.arm, now)
         decision = self.gate.step(
             command.wanted,
@@ -92,10 +89,9 @@ class Controller:
             duplicate=inputs.duplicate,
             failure=command.failure,
         )
-        found = decision.interventions
-        if any(i.effect == "latched" and i.code is not Check.ARM_LIMITS for i in found):
-            self.faulted = now
-        self._troubles = tuple(i.text for i in found if i.code is not Check.NOT_ARMED)
+        self._troubles = tuple(
+            i.text for i in decision.interventions if i.code is not Check.NOT_ARMED
+        )
         onsets = self.supervisor.observe(decision, now)
         status = self.supervisor.status(now)
         if self._goal is not None and status.outcome is not None:
@@ -122,9 +118,12 @@ class Controller:
         """
         if self.gate.armed:
             return ()
-        if self.faulted is not None and self.faulted > since:
-            reasons = self._troubles
-            return reasons or ("something failed after the request to arm: look, and ask again",)
+        if any(
+            at > since
+            for code, at in self.gate.latched_at.items()
+            if code is not Check.ARM_LIMITS  # which the request itself is about to set right
+        ):
+            return self._troubles or ("something failed after the request to arm: ask again",)
         refusals = self.gate.arm(
             requested,
             self.inputs.touch,

@@ -11,6 +11,7 @@ import dataclasses
 import gc
 import json
 import logging
+import math
 import platform
 import sys
 import threading
@@ -275,20 +276,23 @@ class Daemon:
             "arm_state": {} if arm is None else arm.counters(),
             "reports_dropped": 0 if self._reporter is None else self._reporter.dropped,
         }
-        if cycle is not None:
-            status, held = cycle.status, cycle.decision.held
-            values |= {
-                "state": str(status.state),
-                "activity": status.activity,
-                "text": status.text,
-                "elapsed": status.elapsed,
-                "distance": status.distance if status.distance == status.distance else None,
-                "goal": None if status.goal is None else dataclasses.asdict(status.goal),
-                "armed": held is None,
-                "held": None if held is None else str(held),
-                "interventions": [i.text for i in cycle.decision.interventions],
-                "outcome": status.outcome,
-            }
+        # Asked themselves, for the last cycle may be older than a request that was just granted.
+        status = self.loop.controller.supervisor.status(monotonic_now())
+        held = self.loop.controller.gate.held
+        values |= {
+            "state": str(status.state),
+            "activity": status.activity,
+            "text": status.text,
+            "elapsed": status.elapsed,
+            "distance": None if math.isnan(status.distance) else status.distance,
+            "goal": None if status.goal is None else dataclasses.asdict(status.goal),
+            "armed": held is None,
+            "held": None if held is None else str(held.code),
+            "interventions": []
+            if cycle is None
+            else [i.text for i in cycle.decision.interventions],
+            "outcome": status.outcome,
+        }
         if self.recorder is not None:
             values["log"] = dataclasses.asdict(self.recorder.stats)
         return values

@@ -73,6 +73,8 @@ class SafetyGate:
             Check.NOT_ARMED, "stopped", "the gate is not armed: arm it by an operator's request"
         )
         self._held_at: Instant | None = None
+        self.latched_at: dict[Check, Instant] = {}
+        """When each reason to hold was last seen, even while the gate was holding already."""
         self._proven = False  # the force sensor read next to nothing in free air
         self._last = ZERO
         self._stepped: Instant | None = None
@@ -177,7 +179,7 @@ class SafetyGate:
 
     def _latch(self, fault: Intervention, now: Instant) -> None:
         """Hold, keeping the first reason; a request to arm must be newer than the last."""
-        self._held_at = now
+        self._held_at = self.latched_at[fault.code] = now
         if self._hold is None:
             self._hold = fault
 
