@@ -6,6 +6,7 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 import msgspec
@@ -77,11 +78,23 @@ def describe_scene(scene: Scene) -> dict[str, object]:
     }
 
 
+@dataclass(frozen=True, slots=True)
+class _Ends:
+    """What an arm has on the bus."""
+
+    states: Publisher
+    markers: Publisher
+    commands: Latest
+    watch: Tap
+    services: list[Service]
+    token: zenoh.LivelinessToken
+
+
 class ArmServer:
     """A `sim_device.runner.Station`: `service` it every millisecond. BusError from `open`.
 
-    ``load``: scene for a seed (None: the present one's name again), SceneError when there is none.
-    ``make_world``: builds it. Services run on zenoh's threads and share the cupboard by a lock.
+    ``load``: scene for another seed, SceneError when there is none. ``make_world``: builds it.
+    Services run on zenoh's threads and share the cupboard by a lock.
     """
 
     def __init__(
@@ -105,12 +118,7 @@ class ArmServer:
         self._codec = codec()
         self._lock = threading.Lock()
         self._session: zenoh.Session | None = None
-        self._inputs: Latest | None = None
-        self._watch: Tap | None = None
-        self._states: Publisher | None = None
-        self._markers: Publisher | None = None
-        self._services: list[Service] = []
-        self._token: zenoh.LivelinessToken | None = None
+        self._ends: _Ends | None = None
         self._next_markers = Instant(0)
         self._polled = Instant(0)
         self._obeyed: Instant | None = None
@@ -132,39 +140,22 @@ class ArmServer:
         text = f"{self.cupboard.arm.mode}  {self.cupboard.distance * 100:.1f} cm to goal"
         refused = sum(self.commands.refused.values()) + self._oversized
         late = self.cupboard.counters["late_steps"] * round(PHYSICS_STEP * 1000)
-        return (
-            text + (f"  refused {refused}" if refused else "") + (f"  late {late} ms" * (late > 0))
-        )
+        text += f"  refused {refused}" if refused else ""
+        return text + (f"  late {late} ms" if late else "")
 
     @property
     def _oversized(self) -> int:
-        return 0 if self._watch is None else self._watch.refused
+        return 0 if self._ends is None else self._ends.watch.refused
 
     def fileno(self) -> int:
         """There is nothing to wait on: commands are fetched every tick."""
         return -1
 
     def open(self) -> None:
-        """Join the bus and let the world begin."""
+        """Join the bus; the world begins with the first `service`."""
         session = self._session = open_session(self._bus)
         try:
             self._refuse_namesake(session)
-            now = self._polled = self._next_markers = monotonic_now()
-            self.cupboard.begin(now)
-            self._states = declare_publisher(session, ARM_STATE, self.name)
-            self._markers = declare_publisher(session, WORLD, self.world_name)
-            self._inputs = latest(session, COMMAND.key(self.name))
-            # The newest sample may hide another sender's, so that all are looked at beside it.
-            self._watch = Tap(
-                session,
-                COMMAND.key(self.name),
-                lambda sample: self.commands.watch(sample, monotonic_now()),
-            )
-            self._services = [
-                declare_service(session, key, handler, request)
-                for key, handler, request in self._handlers()
-            ]
-            self._token = session.liveliness().declare_token(alive_key(self.name, "arm"))
         except BaseException:
             self.close()
             raise
@@ -177,11 +168,14 @@ class ArmServer:
 
     def service(self, now: Instant) -> None:
         """Move the world on, obey the newest command, publish what is due."""
-        if self._inputs is None or self._states is None or self._markers is None:
-            return
+        ends = self._ends
+        if ends is None:
+            if self._session is None:
+                raise RuntimeError("the arm is not open")
+            ends = self._ends = self._begin(self._session, now)
         with self._lock:
             states = self.cupboard.advance(now)
-            sample = self._inputs.newest()
+            sample = ends.commands.newest()
             twist = None if sample is None else self.commands.take(sample, now)
             # It came since the last look, nobody knows when: taken as having come right then.
             waited = seconds_between(self._polled, now)
@@ -192,12 +186,30 @@ class ArmServer:
             self.sent += 1
             wall_ns = self._wall.wall_ns(state.captured)
             message = state_message(state, self.sent % SEQUENCES, wall_ns)
-            self._states.put(self._codec.encode(ARM_STATE, message), wall_ns)
+            ends.states.put(self._codec.encode(ARM_STATE, message), wall_ns)
         if now >= self._next_markers:
             self._next_markers = max(now, after(self._next_markers, MARKER_PERIOD))
             wall_ns = self._wall.wall_ns(now)
             markers = scene_markers(self.cupboard.world, wall_ns)
-            self._markers.put(self._codec.encode(WORLD, markers), wall_ns)
+            ends.markers.put(self._codec.encode(WORLD, markers), wall_ns)
+
+    def _begin(self, session: zenoh.Session, now: Instant) -> _Ends:
+        """Let time run, and be there for others."""
+        self._polled = self._next_markers = now
+        self.cupboard.begin(now)
+        command_key = COMMAND.key(self.name)
+        return _Ends(
+            states=declare_publisher(session, ARM_STATE, self.name),
+            markers=declare_publisher(session, WORLD, self.world_name),
+            commands=latest(session, command_key),
+            # The newest sample may hide another sender's, so that all are looked at beside it.
+            watch=Tap(session, command_key, lambda s: self.commands.watch(s, monotonic_now())),
+            services=[
+                declare_service(session, key, handler, request)
+                for key, handler, request in self._handlers()
+            ],
+            token=session.liveliness().declare_token(alive_key(self.name, "arm")),
+        )
 
     def _refuse_namesake(self, session: zenoh.Session) -> None:
         replies = session.liveliness().get(alive_key(self.name, "arm"), timeout=NAME_TIMEOUT)
