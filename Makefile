@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup test lint demo bench fuzz clean
+.PHONY: setup test lint demo demo-reach bench fuzz crash fidelity mutation clean
 
 setup: $(STAMP)
 
@@ -25,11 +25,24 @@ test: lint
 demo: setup
 	$(BIN)/tactile demo --out demo.mcap --png demo.png
 
+demo-reach: setup
+	$(BIN)/tactile demo-reach --out demo-reach.mcap --png demo-reach.png
+
+# The longer runs. Each leaves its result where docs/results keeps it.
 bench: setup
-	$(BIN)/tactile bench --json bench.json
+	$(BIN)/tactile bench --json docs/results/bench.json
 
 fuzz: setup
 	$(BIN)/tactile fuzz --frames 10000000 --json docs/results/fuzz.json
+
+crash: setup
+	$(BIN)/tactile crash --kills 1000 --json docs/results/crash.json
+
+fidelity: setup
+	$(BIN)/tactile fidelity --json docs/results/fidelity.json
+
+mutation: setup
+	$(BIN)/tactile mutation --json docs/results/mutation.json
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache

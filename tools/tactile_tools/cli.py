@@ -8,7 +8,18 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.metadata import version
 
-TOOLS = ("log", "plot", "reach", "fidelity", "bench", "demo", "demo_reach", "fuzz", "crash")
+TOOLS = (
+    "log",
+    "plot",
+    "reach",
+    "demo",
+    "demo_reach",
+    "bench",
+    "fidelity",
+    "fuzz",
+    "crash",
+    "mutation",
+)
 """Modules of this package that add a subcommand; each defines ``add_parser(subparsers)``."""
 
 
@@ -16,7 +27,7 @@ def build_parser(tools: Sequence[str] = TOOLS) -> argparse.ArgumentParser:
     """Return the parser with the subcommands of ``tools``."""
     parser = argparse.ArgumentParser(
         prog="tactile",
-        description="Inspect, recover and plot logs, run the demo, the benchmarks and the fuzzer.",
+        description="Inspect, recover and plot logs, run reaches, demos, benchmarks and fuzzers.",
     )
     parser.add_argument(
         "--version", action="version", version=f"tactile-reach {version('tactile-reach')}"
