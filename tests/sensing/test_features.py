@@ -244,6 +244,11 @@ def test_a_patch_bears_what_lies_below_the_threshold_round_it():
     np.testing.assert_allclose(features.patches[0].centroid, POSITION[9])
 
 
+def test_a_pulled_neighbour_takes_nothing_from_a_patch():
+    features = Feel()(presses(t9=2.0, t10=-0.5, t8=-0.1))
+    assert features.normal_force == pytest.approx(1.9)
+
+
 def test_masked_taxels_round_a_patch_are_left_out():
     force = presses(t9=2.0)
     force[10] = np.nan
