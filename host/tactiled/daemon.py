@@ -6,7 +6,6 @@ own for services, and the main thread, which watches. Each that dies takes the d
 
 from __future__ import annotations
 
-import gc
 import logging
 import platform
 import sys
@@ -31,6 +30,7 @@ from tactiled.can_line import CanLine
 from tactiled.events import Identity, Refusal
 from tactiled.inbox import MAX_AGE, Inbox, Wake
 from tactiled.line import Line, SerialLine
+from tactiled.memory import Collector, return_large_buffers
 from tactiled.outlet import Outlet
 from tactiled.port import Port, Trouble
 from tactiled.reader import PortReader
@@ -50,12 +50,6 @@ TICK = 0.01
 
 SWITCH_INTERVAL = 0.0005
 """s after which Python hands the interpreter on: a reader must stamp soon after its data came."""
-
-FREEZE_AFTER = 5
-"""s after the start at which what lives then is taken out of the collector's sight for good."""
-
-COLLECT_EVERY = 10
-"""s between collections thereafter; with so few objects left to look at they take 1 ms."""
 
 CALLS = 64
 """Requests that may wait for the pipeline's thread."""
@@ -92,7 +86,7 @@ class Daemon:
         self._services: list[BoardServices] = []
         self._tokens: list[zenoh.LivelinessToken] = []
         self._stopping = threading.Event()
-        self._seconds = 0
+        self._collector = Collector()
         self._log_state = "recording"
         self._thread = threading.Thread(target=self._run, name="pipeline", daemon=True)
         ports = len(settings.ports)
@@ -106,6 +100,7 @@ class Daemon:
     def start(self) -> None:
         """Bring everything up; `StartError`, and everything down again, when that cannot be."""
         sys.setswitchinterval(SWITCH_INTERVAL)
+        return_large_buffers()
         try:
             self._start()
         except (BusError, RecorderError, TransportError, CalibrationError) as error:
@@ -299,7 +294,7 @@ class Daemon:
                 message = diagnostics.message(station.name, values, self.recorder, wall_ns)
                 outlet.send(DIAGNOSTICS, station.name, message, wall_ns)
         self._watch_log(outlet)
-        self._collect_garbage()
+        self._collector.each_second()
 
     def _watch_log(self, outlet: Outlet) -> None:
         if self.recorder is None:
@@ -312,16 +307,6 @@ class Daemon:
         text = f"log {stats.path}: {stats.state}" + (f" ({stats.last_error})" if not good else "")
         for station in self.stations:
             outlet.announce(station.name, logging.INFO if good else logging.ERROR, text)
-
-    def _collect_garbage(self) -> None:
-        """Keep collections off the hot path: they would stop every thread at any moment."""
-        self._seconds += 1
-        if self._seconds == FREEZE_AFTER:
-            gc.collect()
-            gc.freeze()
-            gc.disable()
-        elif self._seconds > FREEZE_AFTER and self._seconds % COLLECT_EVERY == 0:
-            gc.collect()
 
     def _fail(self, error: BaseException) -> None:
         if self.failure is None:

@@ -28,8 +28,11 @@ from tactile_bus.topics import FEATURES, FORCES, service_key
 from tactiled.cli import main
 from tactiled.outgoing import MessageMaker
 
-SLOW = 30.0
+SLOW = 60.0
 """s that anything may take on a busy machine before a test gives it up."""
+
+
+pytestmark = pytest.mark.timeout(300)
 
 
 class Program:
