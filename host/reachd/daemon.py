@@ -25,7 +25,7 @@ from reachd.arms import Arm, ArmError, BusArm
 from reachd.cycle import Controller, Cycle, Inputs
 from reachd.listen import Listener
 from reachd.lock import ArmLock, LockError
-from reachd.loop import ControlLoop
+from reachd.loop import ControlLoop, ask_real_time
 from reachd.operator_requests import OperatorRequests, RefusedError
 from reachd.outcome import Outcome
 from reachd.publish import Reporter
@@ -124,6 +124,8 @@ class Daemon:
         settings, safety = self.settings, self.settings.parameters.safety
         self._lock.acquire(settings.name)
         sys.setswitchinterval(SWITCH_INTERVAL)
+        if settings.priority > 1:
+            self.loop.real_time = ask_real_time(settings.priority - 1)
         codec()
         self._session = session = open_session(settings.bus)
         self._claim(session)

@@ -33,6 +33,26 @@ LAST_ZEROS = 3
 R = TypeVar("R")
 
 
+def ask_real_time(priority: int) -> bool:
+    """Have the calling thread, and those it starts, run before all ordinary ones; False if refused.
+
+    The interpreter's lock has no priorities: a thread that holds it while other programs have the
+    processor makes the control loop wait. So the daemon asks for all of its threads.
+    """
+    if not hasattr(os, "sched_setscheduler"):  # macOS
+        return False
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
+    except OSError as error:
+        log.info(
+            "no real-time priority (%s): allow it with `ulimit -r` or LimitRTPRIO= if the control "
+            "loop is late under load",
+            error.strerror,
+        )
+        return False
+    return True
+
+
 class Schedule:
     """Absolute deadlines ``period`` s apart; those that were missed are skipped, not made up for.
 
@@ -78,7 +98,8 @@ class ControlLoop:
     """Runs a controller at its period until `stop`. ``failure``: what it died of.
 
     ``sense`` fetches the newest inputs, ``act`` sends a twist with its expiry in s, ``report`` is
-    told of every cycle; none of them may block. ``priority``: of real time, 0 for none.
+    told of every cycle; none of them may block. ``priority``: real-time priority to take where
+    ``real_time`` says that the system grants it.
     """
 
     def __init__(
@@ -139,7 +160,8 @@ class ControlLoop:
 
     def _run(self) -> None:
         try:
-            self._raise_priority()
+            if self.real_time:
+                ask_real_time(self._priority)
             schedule = Schedule(self._period, monotonic_now())
             while not self._stopping:
                 remaining = seconds_between(monotonic_now(), schedule.deadline)
@@ -175,17 +197,3 @@ class ControlLoop:
         for _ in range(LAST_ZEROS):
             with suppress(ArmError):  # it stops by itself, then
                 self._act(ZERO, self._expiry, monotonic_now())
-
-    def _raise_priority(self) -> None:
-        """Ask for real time, so that other programs' load does not make the loop late."""
-        if self._priority == 0 or not hasattr(os, "sched_setscheduler"):
-            return
-        try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(self._priority))
-            self.real_time = True
-        except OSError as error:
-            log.info(
-                "the control loop runs without real-time priority (%s): allow it with `ulimit -r` "
-                "or LimitRTPRIO= if it is late under load",
-                error.strerror,
-            )
