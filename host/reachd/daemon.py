@@ -225,14 +225,16 @@ class Daemon:
         return text
 
     def watch(self) -> None:
-        """Look after log and garbage; called a few times a second by the main thread."""
+        """Look after log, geometry and garbage; called a few times a second by the main thread."""
         if self.recorder is not None:
             stats = self.recorder.stats
             if stats.state != self._log_state:
                 self._log_state = stats.state
                 level = logging.INFO if stats.state == "recording" else logging.ERROR
                 log.log(level, "log %s: %s %s", stats.path, stats.state, stats.last_error)
-        now = monotonic_now()
+        cycle, now = self.loop.last, monotonic_now()
+        if self._listener is not None and cycle is not None and cycle.inputs.touch is not None:
+            self._listener.ask_geometry()
         if not self.moving and seconds_between(self._collected, now) > COLLECT_EVERY:
             self._collected = now
             gc.collect()

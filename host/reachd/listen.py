@@ -13,6 +13,9 @@ MAX_NAMES = 16
 """Names of streams that are logged: a board's, an arm's and a world's, and some to spare; so that
 a publisher that makes up names cannot fill the log with channels."""
 
+ANSWER = 5.0
+"""s for which an answer of the board may come."""
+
 
 class Listener:
     """Logs all streams of ``board``, the state of ``arm`` and the objects of every world.
@@ -24,14 +27,24 @@ class Listener:
         self, session: zenoh.Session, recorder: Recorder, wall: WallClock, board: str, arm: str
     ) -> None:
         self.refused = 0
+        self._session = session
+        self._geometry = service_key(board, "geometry")
+        self._asked = False
         self._recorder = recorder
         self._wall = wall
         self._names: set[str] = set()
         keys = (f"tactile/{board}/*", ARM_STATE.key(arm), WORLD.template.format(name="*"))
         self._taps = [Tap(session, key, self._take) for key in keys]
-        # The board's geometry was published when it was identified, before this began to listen;
-        # asked for, it is published once more. Nobody waits for the answer.
-        session.get(service_key(board, "geometry"), lambda _: None, timeout=5.0)
+
+    def ask_geometry(self) -> None:
+        """Have the board's geometry published once more, for it was before this began to listen.
+
+        To be called when features come, so that the board can be asked. Nobody waits for the
+        answer; a second call does nothing.
+        """
+        if not self._asked:
+            self._asked = True
+            self._session.get(self._geometry, lambda _: None, timeout=ANSWER)
 
     def close(self) -> None:
         """Stop listening."""

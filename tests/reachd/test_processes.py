@@ -14,9 +14,9 @@ from tactile_bus.arm_types import ArmLimits
 from tactile_bus.log_info import info
 from tactile_bus.messages import codec
 from tactile_bus.recovery import recover
-from tactile_bus.services import ServiceError
+from tactile_bus.services import ServiceError, declare_service
 from tactile_bus.streams import declare_publisher
-from tactile_bus.topics import FEATURES
+from tactile_bus.topics import FEATURES, service_key
 
 NEAR = ("--strategy", "straight", "--target", "0.04,0.0", "--seed", "1")
 FAR = ("--strategy", "straight", "--target", "0.36,0.0", "--seed", "1")
@@ -34,10 +34,20 @@ def test_a_reach_from_start_to_outcome_and_one_file_that_holds_it(
     lab: Any, hardware_limits: ArmLimits
 ) -> None:
     arm, _ = lab.arm, lab.board()
+    asked: list[object] = []
+    key = service_key("board0", "geometry")
+
+    def publish_geometry(request: object) -> object:
+        asked.append(request)
+        return {}
+
+    service = declare_service(arm.session, key, publish_geometry)
     program = lab.reachd(*NEAR, "--log", "trial.mcap", "--json", "outcome.json")
     assert program.wait() == 0, program.said
     outcome = json.loads((lab.folder / "outcome.json").read_text())
     assert outcome["success"] is True
+    assert len(asked) == 1
+    service.close()
     assert outcome["distance"] <= 0.0075
     assert (outcome["strategy"], outcome["set"], outcome["seed"]) == ("straight", "hardware", 1)
     assert "REACHED: " in program.said
