@@ -148,8 +148,12 @@ class SerialLine:
         if not self._up:
             return []
         link = self._link or self._board
+        was_served = self._served
         out = [LineEvent(0, event) for event in link.tick(now)]
-        if not self._served and link.state is not State.REFUSED and now >= self._diagnose_from:
+        if was_served:
+            # Should it go out of service, what is wrong is judged from here on.
+            self._diagnosis.begin(now)
+        elif link.state is not State.REFUSED and now >= self._diagnose_from:
             diagnosed = self._diagnosis.judge(now, answered=self._link is not None)
             if diagnosed is not None:
                 self._diagnose_from = after(now, REPEAT_DIAGNOSIS)

@@ -290,3 +290,18 @@ def test_other_versions_are_refused_on_a_line(board: Any, instant: At) -> None:
     events = serve(line, board, instant, 4.0)
     assert "3.0" in of(events, Refused)[0].refusal.problem
     assert not of(events, Diagnosed)
+
+
+def test_a_board_that_goes_quiet_for_a_while_is_not_called_deaf(board: Any, instant: At) -> None:
+    line = SerialLine("p", welcome)
+    line.connect(instant(0.0))
+    serve(line, board, instant, 5.0)
+    board.mute = True
+    events = serve(line, board, instant, 2.0, start=5.0)
+    board.mute = False
+    events += serve(line, board, instant, 1.0, start=7.0)
+    assert not of(events, Diagnosed)
+    assert of(events, Sampled)
+    board.mute = True
+    (diagnosed,) = of(serve(line, board, instant, 8.0, start=8.0), Diagnosed)
+    assert "silent" in diagnosed.problem
