@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -18,7 +19,13 @@ from sim_device.world.base import PHYSICS_STEP, World, WorldError
 from sim_device.world.scene_markers import FRAME, scene_markers
 from sim_device.world.scenes import Scene, SceneError
 from tactile_bus.arm_types import ArmLimits, ArmState
-from tactile_bus.instant import Instant, WallClock, after, monotonic_now, seconds_between
+from tactile_bus.instant import (
+    Instant,
+    WallClock,
+    after,
+    monotonic_now,
+    seconds_between,
+)
 from tactile_bus.messages import MSG, codec, header
 from tactile_bus.services import Service, ServiceError, declare_service
 from tactile_bus.session import BusConfig, BusError, close_session, open_session
@@ -27,8 +34,11 @@ from tactile_bus.topics import ARM_STATE, COMMAND, WORLD, alive_key, service_key
 
 log = logging.getLogger(__name__)
 
-NAME_TIMEOUT = 0.3
-"""s to ask the bus whether an arm of this name is there."""
+NAME_TIMEOUT = 0.5
+"""s to ask the bus whether an arm of this name is there; links take some of it to come about."""
+
+NAME_RETRY = 0.02
+"""s between two such questions."""
 
 MARKER_PERIOD: Final = 1 / WORLD.rate
 
@@ -212,11 +222,14 @@ class ArmServer:
         )
 
     def _refuse_namesake(self, session: zenoh.Session) -> None:
-        replies = session.liveliness().get(alive_key(self.name, "arm"), timeout=NAME_TIMEOUT)
-        if any(reply.ok is not None for reply in replies):
-            raise BusError(
-                f"an arm called {self.name!r} is on this bus: end it, or give --arm NAME"
-            )
+        key = alive_key(self.name, "arm")
+        deadline = after(monotonic_now(), NAME_TIMEOUT)
+        while (left := seconds_between(monotonic_now(), deadline)) > 0:
+            if any(reply.ok is not None for reply in session.liveliness().get(key, timeout=left)):
+                raise BusError(
+                    f"an arm called {self.name!r} is on this bus: end it, or give --arm NAME"
+                )
+            time.sleep(NAME_RETRY)
 
     def _handlers(self) -> Sequence[tuple[str, Callable[[Any], object], Any]]:
         arm, world = self.name, self.world_name

@@ -181,6 +181,8 @@ class Cupboard:
 
     def _apply_faults(self, seconds: float) -> None:
         """Let faults begin and end that are due."""
+        if not self._faults:
+            return
         active = frozenset(f for f in self._faults if f.window.covers(seconds))
         if active == self._active:
             return
