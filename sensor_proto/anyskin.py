@@ -191,7 +191,7 @@ def _all_good(values: NDArray[np.float32]) -> bool:
     """Whether no reading of (k, n, 4) needs a closer look; False for any NaN."""
     temperature_c = values[:, :, 0]
     return bool(
-        TINY_C <= temperature_c.min()
+        temperature_c.min() >= TINY_C
         and temperature_c.max() <= HOTTEST_C
         and np.abs(values).max() <= MAX_FIELD_UT
     )
