@@ -171,7 +171,7 @@ def test_unknown_set_lists_the_sets() -> None:
         parameters("hardwear")
 
 
-@pytest.mark.parametrize("check", ALWAYS_ON)
+@pytest.mark.parametrize("check", sorted(ALWAYS_ON))
 def test_some_checks_cannot_be_switched_off(check: Check) -> None:
     with pytest.raises(SettingError, match="cannot be switched off"):
         parameters("authors_sim", {"safety.disabled": [check.value]})
