@@ -8,6 +8,9 @@ from sensor_proto.packets import Ack, Descriptor, Status
 from tactile_bus.instant import Instant
 from tactiled.blocks import SampleBlock
 
+RESET_CAUSES = {0: "power-on", 1: "command", 2: "watchdog", 3: "brown-out"}
+"""What a status message's ``reset_cause`` means (PROTOCOL.md)."""
+
 
 @dataclass(frozen=True, slots=True)
 class Identity:

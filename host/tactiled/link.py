@@ -32,6 +32,7 @@ from tactile_bus.instant import Instant, after, seconds_between
 from tactiled.clock import ClockMap
 from tactiled.commands import CommandQueue
 from tactiled.events import (
+    RESET_CAUSES,
     Answered,
     BoardLog,
     Event,
@@ -76,8 +77,6 @@ SILENCE = 0.2
 
 RELINK = 1.0
 """s without samples after which the board is asked anew who it is."""
-
-RESET_CAUSES = {0: "power-on", 1: "command", 2: "watchdog", 3: "brown-out"}
 
 Admission = Callable[[Identity], Refusal | None]
 """Judges a board by what it says of itself; None: welcome."""
