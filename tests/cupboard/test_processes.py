@@ -154,8 +154,11 @@ def test_damaged_oversized_and_nameless_commands_move_nothing(
     publisher = cupboard.publisher()
     nameless = cupboard.session.declare_publisher("arm/arm/cmd_vel")
     for _ in range(10):
+        # One at a time: the arm looks at the newest command alone.
         publisher.put(good[:40], 1)
+        time.sleep(0.02)
         nameless.put(good)
+        time.sleep(0.02)
         nameless.put(good + bytes(66_000 - len(good)))
         time.sleep(0.02)
     publisher.put(encode_command(Twist(float("nan"), 0.0, 0.0)), 1)
