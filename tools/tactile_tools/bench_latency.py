@@ -146,7 +146,9 @@ class _Run:
             self._counting = elapsed > SETTLE_S
             due = Instant(due + round(PERIOD_S * 0.5e9))
             self._serve_until(due)
-            if turn % 2:
+            if turn % 2 and elapsed < SETTLE_S / 2:
+                pass  # nobody reads yet: the tty would fill up
+            elif turn % 2:
                 self._floor_sent.append(0)
                 os.write(self._floor_end, b"\x55" * FLOOR_BYTES)
                 self._floor_sent[-1] = time.monotonic_ns()
