@@ -654,6 +654,25 @@ def test_after_arming_motion_grows_from_rest(rig: Callable[..., Rig]) -> None:
     assert r.step(Twist(0.04, 0.0, 0.0)).twist.vx == pytest.approx(0.005)
 
 
+def test_a_limit_may_be_off_by_a_thousandth_at_most(rig: Callable[..., Rig]) -> None:
+    for has, confirmed in ((1001.0, True), (999.0, True), (1001.01, False), (998.99, False)):
+        r = rig(armed=False, arm_f_max=1000.0)
+        assert (r.request(arm=r.fresh_arm(f_max=has)) == set()) == confirmed
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"lateness": 0.075}, "75.0 ms late, 50 at most"),
+        ({"passed": -20_000_000}, "went back by 0.020 s"),
+    ],
+)
+def test_the_loops_faults_are_told_in_figures(
+    how: dict, words: str, rig: Callable[..., Rig]
+) -> None:
+    assert words in rig().step(**how).interventions[0].text
+
+
 def test_interventions_have_words(rig: Callable[..., Rig]) -> None:
     r = rig()
     for decision in (

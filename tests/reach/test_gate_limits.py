@@ -223,6 +223,16 @@ def test_near_the_goal_it_is_slower(
     assert send(wanted, Check.SLOW_DOWN, **pose).twist == wanted
 
 
+def test_the_circle_of_slow_motion_is_open(send: Callable[..., Decision]) -> None:
+    """At exactly its radius nothing is slowed, just inside it is."""
+    goal = Goal(0.3, 0.0, 0.0075, 40.0)
+    radius = 0.3 - (0.05 + L)
+    wanted = Twist(0.6 * SPEED, 0.0, 0.0)
+    for r, slowed in ((radius, False), (math.nextafter(radius, 1.0), True)):
+        decision = send(wanted, goal=goal, values={"slow_radius": r}, **INSIDE)
+        assert (codes(decision) == ["slow_down"]) == slowed
+
+
 # --- workspace --------------------------------------------------------------------------------
 
 

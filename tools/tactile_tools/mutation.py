@@ -213,20 +213,23 @@ def _judge_all(package: Path, tests: Sequence[str], options: argparse.Namespace)
         for job in as_completed(jobs):
             verdicts.append(Verdict(jobs[job], job.result()))
             bar.advance(task)
+            if verdicts[-1].fate == "survived":
+                console.print(_line(jobs[job]), markup=False, soft_wrap=True)
     return _report(verdicts, total, console, options)
+
+
+def _line(mutant: Mutant) -> str:
+    return f"{mutant.file}:{mutant.line}: {mutant.before}  →  {mutant.after}"
 
 
 def _report(
     verdicts: list[Verdict], total: int, console: Console, options: argparse.Namespace
 ) -> int:
-    """Print and write what survived; 1 when that is more than was allowed."""
+    """Sum up, and write what survived; 1 when that is more than was allowed."""
     survivors = sorted(
         (v.mutant for v in verdicts if v.fate == "survived"), key=lambda m: (m.file, m.line)
     )
     slow = sum(v.fate == "timeout" for v in verdicts)
-    for mutant in survivors:
-        text = f"{mutant.file}:{mutant.line}: {mutant.before}  →  {mutant.after}"
-        console.print(text, markup=False, soft_wrap=True)
     console.print(
         f"{len(verdicts)} mutants of {total}: {len(verdicts) - len(survivors)} killed "
         f"({slow} by the time limit), {len(survivors)} survived"
