@@ -110,7 +110,11 @@ def run(options: argparse.Namespace) -> int:
             function: Callable[..., Figures] = getattr(
                 import_module(f"tactile_tools.{group.module}"), group.function
             )
-            figures |= function(quick=options.quick)
+            try:
+                figures |= function(quick=options.quick)
+            except (RuntimeError, OSError) as error:
+                print(f"tactile bench: {group.name}: {error}", file=sys.stderr)
+                return 3
             progress.update(task, total=1, completed=1)
     console.print(table(figures))
     if options.json is not None:
