@@ -274,7 +274,9 @@ def test_ctrl_c_leaves_a_whole_log_that_replays_on_keys_of_its_own(lab: Lab) -> 
     replay = lab.tactiled("--mcap", "run.mcap", "--speed", "inf", "--log", "again.mcap")
     assert replay.wait() == 0, replay.said
     again = {c.topic: c.messages for c in info(lab.folder / "again.mcap").channels}
-    assert again["/tactile/board0/features"] == logged["/tactile/board0/features"]
+    # All of it again, and at most the cycles that were in hand when Ctrl-C came.
+    ahead = again["/tactile/board0/features"] - logged["/tactile/board0/features"]
+    assert 0 <= ahead <= 3
     live, replayed = Ear(session), Ear(session, prefix="replay")
     lab.tactiled("--mcap", "run.mcap", "--speed", "0.5")
     replayed.wait(5)

@@ -213,7 +213,7 @@ def test_served_over_the_bus(lab: Any, wait_until: Until) -> None:
     forger = declare_publisher(arm.session, FEATURES, "board0")
     forger.put(b"forged", 0)
     wait_until(lambda: lab.ask("status")["held"] == "duplicate_publisher")
-    assert stopped(lab) or not arm.moving
+    wait_until(lambda: stopped(lab) or not arm.moving)
     wait_until(lambda: _armed(lab))
 
     program.signal(signal.SIGTERM)
