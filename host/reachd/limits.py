@@ -24,7 +24,10 @@ PARALLEL = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Constraint:
-    """``nx·vx + ny·vy + nw·ω ≤ bound``, with ``bound`` ≥ 0 so that standing still always obeys."""
+    """``nx·vx + ny·vy + nw·ω ≤ bound``, with ``bound`` ≥ 0 so that standing still always obeys.
+
+    (nx, ny) is a unit vector, or zero where only the turning counts.
+    """
 
     nx: float
     ny: float
@@ -48,7 +51,7 @@ def scaled(twist: Twist, factor: float) -> Twist:
 def within_speed(twist: Twist, speed: float, turn: float) -> Twist:
     """``twist`` scaled as a whole to at most ``speed`` (m/s) and ``turn`` (rad/s): same path."""
     v, w = math.hypot(twist.vx, twist.vy), abs(twist.omega)
-    factor = min(1.0, speed / v if v > speed else 1.0, turn / w if w > turn else 1.0)
+    factor = min(speed / v if v > speed else 1.0, turn / w if w > turn else 1.0)
     return twist if factor == 1.0 else scaled(twist, factor)
 
 
@@ -140,7 +143,7 @@ def constrained(twist: Twist, constraints: list[Constraint]) -> Twist:
     border; then the turning; and where less turning would need a velocity that turns back, the
     whole twist is scaled.
     """
-    if not constraints or not any(rule.broken_by(twist) for rule in constraints):
+    if not any(rule.broken_by(twist) for rule in constraints):
         return twist
     omega = twist.omega
     room = [(rule, max(0.0, rule.bound - rule.nw * omega)) for rule in constraints]
@@ -167,8 +170,7 @@ def _nearest(vx: float, vy: float, rules: list[tuple[float, float, float]]) -> t
     if not broken:
         return vx, vy
     for nx, ny, most in broken:
-        size = nx * nx + ny * ny
-        away = (nx * vx + ny * vy - most) / size
+        away = nx * vx + ny * vy - most
         x, y = vx - nx * away, vy - ny * away
         if not any(_beyond(x, y, rule) for rule in rules):
             return x, y

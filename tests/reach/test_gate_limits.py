@@ -450,6 +450,12 @@ def test_only_what_offends_is_taken_away() -> None:
     assert (got.vx, got.omega) == pytest.approx((-0.02, 0.06)), "so does moving away"
 
 
+def test_moving_away_along_a_slant_makes_room_for_turning() -> None:
+    lever = Constraint(0.6, 0.8, 0.5, 0.01)
+    got = constrained(Twist(-0.012, -0.016, 0.1), [lever])
+    assert (got.vx, got.vy, got.omega) == pytest.approx((-0.012, -0.016, 0.06))
+
+
 def test_rounding_does_not_end_motion() -> None:
     """What is left of a component that was taken away is not a reason to stop."""
     for k in range(100):
