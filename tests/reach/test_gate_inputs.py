@@ -271,6 +271,7 @@ def test_a_frozen_arm_state_latches(rig: Callable[..., Rig]) -> None:
     ("values", "frozen"),
     [
         ({"fx": -math.nextafter(1.0, 0)}, True),
+        ({"y": 0.1, "heading": 0.2}, True),
         ({"fx": -1.0}, False),
         ({"fx": -9.0}, False),
         ({"fx": -9.0, "twist": Twist(0.03, 0.0, 0.0)}, True),
