@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup test lint demo demo-reach bench fuzz crash fidelity mutation clean
+.PHONY: setup test lint demo demo-skin bench fuzz crash fidelity mutation clean
 
 setup: $(STAMP)
 
@@ -25,8 +25,8 @@ test: lint
 demo: setup
 	$(BIN)/tactile demo --out demo.mcap --png demo.png
 
-demo-reach: setup
-	$(BIN)/tactile demo-reach --out demo-reach.mcap --png demo-reach.png
+demo-skin: setup
+	$(BIN)/tactile demo-skin --out demo-skin.mcap --png demo-skin.png
 
 # The longer runs. Each leaves its result where docs/results keeps it.
 bench: setup

@@ -67,6 +67,6 @@ def test_every_command_starts_from_a_clean_environment(wheel: Path, tmp_path: Pa
             done = run(home / "bin" / command, flag, cwd=tmp_path)
             assert done.stdout.strip(), f"{command} {flag} says nothing"
     tools = run(home / "bin" / "tactile", "--help").stdout
-    for tool in ("log", "plot", "reach", "bench", "demo", "fuzz"):
+    for tool in ("log", "plot", "reach", "bench", "demo", "demo-skin", "fuzz"):
         assert tool in tools
         assert run(home / "bin" / "tactile", tool, "--help").stdout.strip()

@@ -13,7 +13,7 @@ TOOLS = (
     "plot",
     "reach",
     "demo",
-    "demo_reach",
+    "demo_skin",
     "bench",
     "fidelity",
     "fuzz",

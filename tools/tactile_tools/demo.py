@@ -1,180 +1,96 @@
-"""``tactile demo``: simulated boards, tactiled and a picture, with one command and no hardware."""
+"""``tactile demo``: cupboard, tactiled and reachd as three processes, in real time."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from sim_device.indenter import load_script
-from tactile_bus.geometry import finger
-from tactile_bus.instant import monotonic_now
 from tactile_tools.processes import command, free_port, running, wait_for
-from tactile_tools.series import BoardSeries, LogUnreadableError, read_boards
+from tactile_tools.series import LogUnreadableError
 
-SEED = 1
-ROTATE = "90deg/10s"
-
-PRESSES = """\
-# What the indenter does to the simulated finger. Times in s, forces in N, lengths in mm.
-
-[[press]]            # a slow, firm press on the left side, with shear toward the tip
-array = "left"
-u_mm = 8.0
-v_mm = 8.0
-normal_n = 4.0
-shear_n = [-1.5, 0.0]
-radius_mm = 8.0
-start_s = 6.0
-ramp_s = 0.8
-hold_s = 2.0
-
-[[press]]            # light, extended contact at the tip, as when an object is pushed along
-array = "tip"
-u_mm = 6.0
-v_mm = 8.0
-normal_n = 2.0
-shear_n = [0.0, 0.5]
-radius_mm = 5.0
-start_s = 11.0
-ramp_s = 0.5
-hold_s = 2.5
-
-[[press]]            # a hard, jamming press on the right side while the tip is still touched
-array = "right"
-u_mm = 20.0
-v_mm = -8.0
-normal_n = 9.0
-shear_n = [3.0, 0.0]
-radius_mm = 9.0
-start_s = 13.0
-ramp_s = 1.0
-hold_s = 3.0
-"""
+BOARD = "finger"
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``demo`` to the umbrella command."""
     parser = subparsers.add_parser(
         "demo",
-        help="press and rotate simulated boards under tactiled, leave a log and a picture",
-        description="Starts a simulated finger (serial) and a simulated AnySkin board, runs "
-        "tactiled on both, presses and turns the finger, and leaves a log and a picture.",
+        help="reach into a simulated cupboard with three processes, leave a log and a picture",
+        description="Starts a simulated cupboard with arm and finger, tactiled on the finger's "
+        "board, and reachd; prints the outcome, leaves a log and a picture of the reach. "
+        "Exit: 0 reached, 1 not reached, 2 bad argument, 3 refused by the system.",
     )
     parser.add_argument("--out", type=Path, default=Path("demo.mcap"), help="log to leave")
     parser.add_argument("--png", type=Path, default=Path("demo.png"), help="picture to leave")
-    parser.add_argument(
-        "--duration", type=float, default=24.0, metavar="S", help="how long, s (default 24)"
-    )
+    parser.add_argument("--strategy", default="hybrid_event", help="default %(default)s")
+    parser.add_argument("--scene", default="authors_sim", help="default %(default)s")
+    parser.add_argument("--seed", type=int, default=1, help="of scene and trial (default 1)")
     parser.set_defaults(func=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the demo; 0 only when a log with contacts and a picture were left."""
-    if not options.duration > 0 or options.duration > 600:
-        print(
-            f"tactile demo: --duration {options.duration:g}; allowed: above 0, at most 600 s",
-            file=sys.stderr,
-        )
-        return 2
-    with tempfile.TemporaryDirectory(prefix="tactile-demo-") as folder:
+    """Run the demo; the exit code says whether the target was reached."""
+    with tempfile.TemporaryDirectory(prefix="tactile-demo-") as name:
         try:
-            return _run(options, Path(folder))
-        except (RuntimeError, LogUnreadableError, OSError) as error:
+            code = _run(options, Path(name))
+        except (RuntimeError, OSError, subprocess.SubprocessError) as error:
             print(f"tactile demo: {error}", file=sys.stderr)
             return 3
+    if code not in (0, 1):
+        return code
+    from tactile_tools.plot_reach import draw_reach
+
+    try:
+        draw_reach(options.out, options.png)
+    except LogUnreadableError as error:
+        print(f"tactile demo: {error}", file=sys.stderr)
+        return 3
+    print(f"wrote {options.out} and {options.png}")
+    return code
 
 
 def _run(options: argparse.Namespace, folder: Path) -> int:
-    press, calibration = folder / "press.toml", folder / "finger.cal.toml"
-    press.write_text(PRESSES, encoding="utf-8")
-    finger_port, skin_port = folder / "finger", folder / "skin"
-    simdevice, tactiled = command("simdevice"), command("tactiled")
+    simdevice, tactiled, reachd = command("simdevice"), command("tactiled"), command("reachd")
+    board = folder / BOARD
+    calibration = folder / "finger.cal.toml"
+    scene = ["--scene", options.scene, "--seed", str(options.seed)]
+    goal = subprocess.run(
+        [simdevice, "cupboard", *scene, "--print-goal"], check=True, capture_output=True, text=True
+    ).stdout.strip()
     subprocess.run(
-        [simdevice, "calibration", "--seed", str(SEED), "--out", str(calibration)],
+        [simdevice, "calibration", "--seed", str(options.seed), "--out", str(calibration)],
         check=True,
         stdout=subprocess.DEVNULL,
     )
-    boards = [simdevice, "boards", "--seed", str(SEED), "--rotate", ROTATE]
     options.out.unlink(missing_ok=True)
+    arm, skin, reach = (f"tcp/127.0.0.1:{free_port()}" for _ in range(3))
+    cupboard = [simdevice, "cupboard", *scene, "--pty", str(board), "--listen", arm]
+    sensing = [
+        *(tactiled, "--port", str(board), "--name", BOARD, "--calibration", str(calibration)),
+        *("--listen", skin, "--connect", arm, "--no-log"),
+    ]
     print(
-        f"A simulated finger turning {ROTATE} in a 50 µT field while it is pressed, "
-        "and a simulated AnySkin board."
+        f"A cupboard ({options.scene} {options.seed}), the target at {goal} m, and three processes."
     )
-    with (
-        running([*boards, "--pty", str(finger_port), "--press", str(press)], folder / "a") as first,
-        running([*boards, "--pty", str(skin_port), "--board", "anyskin"], folder / "b") as second,
-    ):
-        wait_for(finger_port, first, folder / "a")
-        power_on = monotonic_now()
-        wait_for(skin_port, second, folder / "b")
+    with contextlib.ExitStack() as stack:
+        said = folder / "cupboard.txt"
+        first = stack.enter_context(running([*cupboard, "--connect", skin], said))
+        wait_for(board, first, said)
+        stack.enter_context(running(sensing, folder / "tactiled.txt"))
         done = subprocess.run(
             [
-                tactiled,
-                *(
-                    "--port",
-                    str(finger_port),
-                    "--name",
-                    "finger",
-                    "--calibration",
-                    str(calibration),
-                ),
-                *("--port", str(skin_port), "--name", "skin"),
-                *("--log", str(options.out), "--duration", str(options.duration)),
-                *("--listen", f"tcp/127.0.0.1:{free_port()}"),
+                *(reachd, "--strategy", options.strategy, "--target", goal),
+                *("--set", options.scene if options.scene == "hardware" else "authors_sim"),
+                *("--board", BOARD, "--seed", str(options.seed), "--log", str(options.out)),
+                *("--listen", reach, "--connect", arm, "--connect", skin),
             ],
             check=False,
         )
-    if done.returncode != 0:
-        raise RuntimeError(f"tactiled ended with exit code {done.returncode}; see above")
-    series = read_boards(options.out)
-    board = series["finger"]
-    time = np.asarray(board.feature_time)
-    applied = _applied(press, time + (board.start_ns - power_on) * 1e-9)
-    _summarise(board, applied)
-    from tactile_tools.plot import draw
-
-    draw(board, options.png, applied=(time, applied.sum(axis=1)))
-    print(f"wrote {options.out} and {options.png}")
-    return 0
-
-
-def _applied(press: Path, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(times, arrays) N: normal force really applied to each array, ``seconds`` after power-on."""
-    geometry = finger()
-    indenter = load_script(press, geometry)
-    force = np.zeros((len(seconds), len(geometry.arrays)))
-    for row, moment in enumerate(seconds):
-        for contact in indenter.contacts(float(moment)):
-            away = [
-                np.linalg.norm(a.position - contact.position, axis=1).min() for a in geometry.arrays
-            ]
-            array = int(np.argmin(away))
-            nearest = geometry.arrays[array].position - contact.position
-            normal = geometry.arrays[array].rotation[np.linalg.norm(nearest, axis=1).argmin()][:, 2]
-            force[row, array] -= contact.force @ normal
-    return force
-
-
-def _summarise(board: BoardSeries, applied: NDArray[np.float64]) -> None:
-    """Print what was felt beside what was done."""
-    felt = board.contact_force()
-    plane = np.stack([np.asarray(m.plane).reshape(-1, 3, 3)[..., 0] for m in board.ambient])
-    swing = float(np.ptp(plane, axis=0).max())
-    print(
-        f"\n{len(board.features)} cycles; the ambient field turned by {swing:.0f} µT "
-        "and was removed."
-    )
-    for index, (name, _) in enumerate(board.array_slices()):
-        top = int(applied[:, index].argmax())
-        idle = felt[applied[:, index] == 0, index]
-        print(
-            f"  {name:6} pressed with {applied[top, index]:5.2f} N, "
-            f"felt {felt[top, index]:5.2f} N; "
-            f"{np.sqrt(np.mean(idle**2)):.3f} N rms while untouched"
-        )
+        if done.returncode not in (0, 1):
+            for name in ("cupboard.txt", "tactiled.txt"):
+                print(f"--- {name}\n{(folder / name).read_text(errors='replace')[-1500:]}")
+    return done.returncode

@@ -1,0 +1,180 @@
+"""``tactile demo-skin``: simulated boards under tactiled and a picture, without hardware."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_device.indenter import load_script
+from tactile_bus.geometry import finger
+from tactile_bus.instant import monotonic_now
+from tactile_tools.processes import command, free_port, running, wait_for
+from tactile_tools.series import BoardSeries, LogUnreadableError, read_boards
+
+SEED = 1
+ROTATE = "90deg/10s"
+
+PRESSES = """\
+# What the indenter does to the simulated finger. Times in s, forces in N, lengths in mm.
+
+[[press]]            # a slow, firm press on the left side, with shear toward the tip
+array = "left"
+u_mm = 8.0
+v_mm = 8.0
+normal_n = 4.0
+shear_n = [-1.5, 0.0]
+radius_mm = 8.0
+start_s = 6.0
+ramp_s = 0.8
+hold_s = 2.0
+
+[[press]]            # light, extended contact at the tip, as when an object is pushed along
+array = "tip"
+u_mm = 6.0
+v_mm = 8.0
+normal_n = 2.0
+shear_n = [0.0, 0.5]
+radius_mm = 5.0
+start_s = 11.0
+ramp_s = 0.5
+hold_s = 2.5
+
+[[press]]            # a hard, jamming press on the right side while the tip is still touched
+array = "right"
+u_mm = 20.0
+v_mm = -8.0
+normal_n = 9.0
+shear_n = [3.0, 0.0]
+radius_mm = 9.0
+start_s = 13.0
+ramp_s = 1.0
+hold_s = 3.0
+"""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``demo-skin`` to the umbrella command."""
+    parser = subparsers.add_parser(
+        "demo-skin",
+        help="press and rotate simulated boards under tactiled, leave a log and a picture",
+        description="Starts a simulated finger (serial) and a simulated AnySkin board, runs "
+        "tactiled on both, presses and turns the finger, and leaves a log and a picture.",
+    )
+    parser.add_argument("--out", type=Path, default=Path("demo-skin.mcap"), help="log to leave")
+    parser.add_argument("--png", type=Path, default=Path("demo-skin.png"), help="picture to leave")
+    parser.add_argument(
+        "--duration", type=float, default=24.0, metavar="S", help="how long, s (default 24)"
+    )
+    parser.set_defaults(func=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the demo; 0 only when a log with contacts and a picture were left."""
+    if not options.duration > 0 or options.duration > 600:
+        print(
+            f"tactile demo-skin: --duration {options.duration:g}; allowed: above 0, at most 600 s",
+            file=sys.stderr,
+        )
+        return 2
+    with tempfile.TemporaryDirectory(prefix="tactile-demo-") as folder:
+        try:
+            return _run(options, Path(folder))
+        except (RuntimeError, LogUnreadableError, OSError) as error:
+            print(f"tactile demo-skin: {error}", file=sys.stderr)
+            return 3
+
+
+def _run(options: argparse.Namespace, folder: Path) -> int:
+    press, calibration = folder / "press.toml", folder / "finger.cal.toml"
+    press.write_text(PRESSES, encoding="utf-8")
+    finger_port, skin_port = folder / "finger", folder / "skin"
+    simdevice, tactiled = command("simdevice"), command("tactiled")
+    subprocess.run(
+        [simdevice, "calibration", "--seed", str(SEED), "--out", str(calibration)],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
+    boards = [simdevice, "boards", "--seed", str(SEED), "--rotate", ROTATE]
+    options.out.unlink(missing_ok=True)
+    print(
+        f"A simulated finger turning {ROTATE} in a 50 µT field while it is pressed, "
+        "and a simulated AnySkin board."
+    )
+    with (
+        running([*boards, "--pty", str(finger_port), "--press", str(press)], folder / "a") as first,
+        running([*boards, "--pty", str(skin_port), "--board", "anyskin"], folder / "b") as second,
+    ):
+        wait_for(finger_port, first, folder / "a")
+        power_on = monotonic_now()
+        wait_for(skin_port, second, folder / "b")
+        done = subprocess.run(
+            [
+                tactiled,
+                *(
+                    "--port",
+                    str(finger_port),
+                    "--name",
+                    "finger",
+                    "--calibration",
+                    str(calibration),
+                ),
+                *("--port", str(skin_port), "--name", "skin"),
+                *("--log", str(options.out), "--duration", str(options.duration)),
+                *("--listen", f"tcp/127.0.0.1:{free_port()}"),
+            ],
+            check=False,
+        )
+    if done.returncode != 0:
+        raise RuntimeError(f"tactiled ended with exit code {done.returncode}; see above")
+    series = read_boards(options.out)
+    board = series["finger"]
+    time = np.asarray(board.feature_time)
+    applied = _applied(press, time + (board.start_ns - power_on) * 1e-9)
+    _summarise(board, applied)
+    from tactile_tools.plot import draw
+
+    draw(board, options.png, applied=(time, applied.sum(axis=1)))
+    print(f"wrote {options.out} and {options.png}")
+    return 0
+
+
+def _applied(press: Path, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(times, arrays) N: normal force really applied to each array, ``seconds`` after power-on."""
+    geometry = finger()
+    indenter = load_script(press, geometry)
+    force = np.zeros((len(seconds), len(geometry.arrays)))
+    for row, moment in enumerate(seconds):
+        for contact in indenter.contacts(float(moment)):
+            away = [
+                np.linalg.norm(a.position - contact.position, axis=1).min() for a in geometry.arrays
+            ]
+            array = int(np.argmin(away))
+            nearest = geometry.arrays[array].position - contact.position
+            normal = geometry.arrays[array].rotation[np.linalg.norm(nearest, axis=1).argmin()][:, 2]
+            force[row, array] -= contact.force @ normal
+    return force
+
+
+def _summarise(board: BoardSeries, applied: NDArray[np.float64]) -> None:
+    """Print what was felt beside what was done."""
+    felt = board.contact_force()
+    plane = np.stack([np.asarray(m.plane).reshape(-1, 3, 3)[..., 0] for m in board.ambient])
+    swing = float(np.ptp(plane, axis=0).max())
+    print(
+        f"\n{len(board.features)} cycles; the ambient field turned by {swing:.0f} µT "
+        "and was removed."
+    )
+    for index, (name, _) in enumerate(board.array_slices()):
+        top = int(applied[:, index].argmax())
+        idle = felt[applied[:, index] == 0, index]
+        print(
+            f"  {name:6} pressed with {applied[top, index]:5.2f} N, "
+            f"felt {felt[top, index]:5.2f} N; "
+            f"{np.sqrt(np.mean(idle**2)):.3f} N rms while untouched"
+        )
