@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -45,17 +45,21 @@ _CLEARANCE = 1e-3
 """m between objects of a grid scene, as a hand leaves."""
 
 
-def authors_sim(seed: int) -> Scene:
+Range = tuple[int, int]
+"""Least and greatest number of objects."""
+
+
+def authors_sim(seed: int, objects: Range = (20, 30)) -> Scene:
     """Scatter and squeeze as the authors' simulator does, then shelf them where they lie.
 
-    Twenty to thirty objects over 0.9 × 0.9 m are pushed together by plates, first in x to 1 cm
+    Objects over 0.9 × 0.9 m, there 20 to 30, are pushed together by plates, first in x to 1 cm
     beyond the cupboard's depth at either end, then in y to its width, in the simulator's scale
     (see `push`); heights and masses are drawn afterwards, as there.
     """
     parameters = WORLD_PARAMETERS["authors_sim"]
     rng = np.random.default_rng(np.random.SeedSequence([seed, _STREAM["authors_sim"]]))
     placed: list[SceneObject] = []
-    count = int(rng.integers(20, 31))
+    count = int(rng.integers(objects[0], objects[1] + 1))
     for _ in range(MAX_DRAWS):
         item = _scattered_object(rng)
         if all(gap(item, other) > 0 for other in placed):
@@ -82,11 +86,11 @@ def authors_sim(seed: int) -> Scene:
         speed=0.1,
         gravity=40.0,
     )
-    objects = tuple(
+    shelved = tuple(
         replace(o, height=float(rng.uniform(0.06, 0.08)), mass=float(rng.uniform(0.25, 0.75)))
         for o in squeezed
     )
-    return _scene("authors_sim", seed, rng, objects)
+    return _scene("authors_sim", seed, rng, shelved)
 
 
 def _scattered_object(rng: np.random.Generator) -> SceneObject:
@@ -107,7 +111,7 @@ def _scattered_object(rng: np.random.Generator) -> SceneObject:
     )
 
 
-def hardware(seed: int) -> Scene:
+def hardware(seed: int, objects: Range = (15, 22)) -> Scene:
     """Objects on a grid of 5 × 7 cells over 38 × 53 cm, as on the paper's bench.
 
     Paper: footprints 4.3 to 8.8 cm square, 143 to 570 g, number and cells pseudo-random. Ours,
@@ -119,7 +123,9 @@ def hardware(seed: int) -> Scene:
     rng = np.random.default_rng(np.random.SeedSequence([seed, _STREAM["hardware"]]))
     rows, columns = 5, 7
     cell_x, cell_y = parameters.depth / rows, parameters.width / columns
-    count = int(rng.integers(15, 23))
+    count = int(rng.integers(objects[0], objects[1] + 1))
+    if count > rows * columns:
+        raise RuntimeError(f"seed {seed}: {count} objects on {rows * columns} cells")
     free = [(row, column) for row in range(rows) for column in range(columns)]
     placed: list[SceneObject] = []
     for _ in range(MAX_DRAWS):
@@ -196,14 +202,27 @@ def _scene(
 _STREAM: Final = {"authors_sim": 1, "hardware": 2}
 """Keeps the generators' random streams apart for equal seeds."""
 
-GENERATORS: Final[Mapping[str, Callable[[int], Scene]]] = MappingProxyType(
+
+class Generator(Protocol):
+    """Makes the scene of a seed."""
+
+    def __call__(self, seed: int, objects: Range = ...) -> Scene:
+        """Scene with so many objects."""
+        ...
+
+
+GENERATORS: Final[Mapping[str, Generator]] = MappingProxyType(
     {"authors_sim": authors_sim, "hardware": hardware}
 )
 """By the name a user gives."""
 
 
-def generate(name: str, seed: int) -> Scene:
-    """Scene ``seed`` of the generator ``name``; ValueError that lists what exists."""
+def generate(name: str, seed: int, objects: Range | None = None) -> Scene:
+    """Scene ``seed`` of the generator ``name``; ValueError that lists what exists.
+
+    ``objects``: how many there shall be, None for the generator's own range. RuntimeError where
+    they do not fit.
+    """
     if seed < 0:
         raise ValueError(f"seed is {seed}; seeds are 0 or above")
     try:
@@ -211,4 +230,4 @@ def generate(name: str, seed: int) -> Scene:
     except KeyError:
         known = ", ".join(sorted(GENERATORS))
         raise ValueError(f"no scene generator {name!r}; there are {known}") from None
-    return generator(seed)
+    return generator(seed) if objects is None else generator(seed, objects)

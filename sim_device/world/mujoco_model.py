@@ -19,7 +19,7 @@ import numpy as np
 from sim_device.world.base import PHYSICS_STEP
 from sim_device.world.parameters import WorldParameters
 from sim_device.world.scenes import Scene, SceneObject, Shape
-from tactile_bus.geometry import FINGER_HEIGHT, FINGER_OUTLINE
+from tactile_bus.geometry import FINGER_HEIGHT
 
 PLANE_HEIGHT: Final = 0.06
 """m, of the plane in which all bodies are centred: half the height of a box."""
@@ -230,7 +230,7 @@ def _add_finger(spec: mujoco.MjSpec, scene: Scene, parameters: WorldParameters) 
     It is built unturned, as a body's joints turn with it; set the start's heading as an angle.
     """
     start = scene.start
-    outline = np.asarray(FINGER_OUTLINE)
+    outline = np.asarray(parameters.outline)
     z = FINGER_HEIGHT / 2
     vertices = np.concatenate([np.insert(outline, 2, z, axis=1), np.insert(outline, 2, -z, axis=1)])
     spec.add_mesh(name="finger", uservert=vertices.ravel().tolist())

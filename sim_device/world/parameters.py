@@ -29,6 +29,10 @@ from types import MappingProxyType
 from typing import Final
 
 from tactile_bus.arm_types import ARM_LIMITS, ArmLimits
+from tactile_bus.geometry import FINGER_OUTLINE
+
+FINGER_WIDTH: Final = max(y for _, y in FINGER_OUTLINE) - min(y for _, y in FINGER_OUTLINE)
+"""m, of the finger as built."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +59,8 @@ class WorldParameters:
     ``limits``: what the arm is asked to keep. ``finger_mass`` kg, ``finger_inertia`` kg·m² about
     the pivot: a velocity-controlled arm's apparent inertia, high enough that one physics step of
     full force changes the speed by less than half its limit. ``goal_radius`` m, ``time_limit`` s.
-    ``lip``: m, how far the shelf reaches out in front of the front edge.
+    ``lip``: m, how far the shelf reaches out in front of the front edge. ``finger_width``: m, to
+    which the finger's outline is stretched across.
     """
 
     name: str
@@ -68,6 +73,13 @@ class WorldParameters:
     friction: Friction
     finger_mass: float
     finger_inertia: float
+    finger_width: float = FINGER_WIDTH
+
+    @property
+    def outline(self) -> tuple[tuple[float, float], ...]:
+        """Corners of the finger in ``ee``, m."""
+        stretch = self.finger_width / FINGER_WIDTH
+        return tuple((x, y * stretch) for x, y in FINGER_OUTLINE)
 
 
 _SIMULATOR_FRICTION = Friction(

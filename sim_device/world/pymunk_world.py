@@ -28,7 +28,6 @@ from sim_device.world.parameters import WorldParameters, world_parameters
 from sim_device.world.plates import settled
 from sim_device.world.scenes import Scene, SceneObject, Shape
 from tactile_bus.arm_types import Twist
-from tactile_bus.geometry import FINGER_OUTLINE
 
 ITERATIONS = 30
 """Of the impulse solver; fewer let jams give way."""
@@ -81,7 +80,7 @@ class PymunkWorld:
         self._finger = finger = pymunk.Body(parameters.finger_mass, parameters.finger_inertia)
         finger.position = (scene.start.x, scene.start.y)
         finger.angle = scene.start.heading
-        skin = pymunk.Poly(finger, FINGER_OUTLINE)
+        skin = pymunk.Poly(finger, parameters.outline)
         skin.friction = friction.finger_object / of_object
         space.add(finger, skin)
         self._steps = 0
