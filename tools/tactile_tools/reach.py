@@ -78,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
                     world=world,
                     watch=log,
                 )
-                log.outcome(result, round(1e9 + result.cycles * 1e7))
+                log.outcome(result)
         spent = time.process_time() - began
     except (StrategyError, SettingError, ValueError) as error:
         print(f"tactile reach: {error}", file=sys.stderr)

@@ -55,6 +55,7 @@ class TrialLog:
         self._sequence = 0
         self._next_world = 0
         self._felt = -1
+        self._last = 0
         self._state = ""
 
     def __enter__(self) -> TrialLog:
@@ -98,20 +99,22 @@ class TrialLog:
         self._write(COMMAND, ARM, MSG.TwistStamped(stamp, sent), now)
         self._write(REACH_STATE, REACH, self._reach_state(step, stamp), now)
         for event in step.command.events:
-            self._event(now, "excavation", event.direction, f"{event.kind}: {event.trigger}")
+            self._event(now, "excavation", event.kind, f"{event.direction} {event.trigger}")
         for intervention in step.new:
-            self._event(now, "intervention", intervention.code, intervention.text)
+            text = f"{intervention.effect}: {intervention.text}"
+            self._event(now, "intervention", intervention.code, text)
         if step.status.state != self._state:
             self._state = step.status.state
             self._event(now, "state", self._state, step.status.text)
         self._sequence += 1
+        self._last = now
         while self._recorder.stats.queued > MAX_QUEUED:
             time.sleep(0.002)
 
-    def outcome(self, result: Result, now: int) -> None:
-        """Write how it ended."""
-        text = json.dumps(asdict(result), default=str)
-        self._event(now, "outcome", result.outcome.reason, text)
+    def outcome(self, result: Result) -> None:
+        """Write how it ended, at the last cycle's time."""
+        self._event(self._last, "outcome", result.outcome.reason, result.outcome.text)
+        self._recorder.metadata("outcome", {"json": json.dumps(asdict(result), default=str)})
 
     def _reach_state(self, step: Step, stamp: Any) -> Any:
         status, decision = step.status, step.decision
