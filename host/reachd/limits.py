@@ -6,10 +6,10 @@ Nothing here ever adds motion in a direction that was not asked for.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from reachd.safety_settings import SafetySettings
 from reachd.seam import ArmState, Twist
+from tactile_bus.records import record
 
 ROUNDING = 1e-12
 """m/s, rad/s: what floating point leaves of a component that was taken away."""
@@ -22,7 +22,7 @@ PARALLEL = 1e-6
 """Sine of the angle below which two borders have no corner worth the name."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Constraint:
     """``nx·vx + ny·vy + nw·ω ≤ bound``, with ``bound`` ≥ 0 so that standing still always obeys.
 

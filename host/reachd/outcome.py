@@ -70,6 +70,8 @@ class Onsets:
     def update(self, interventions: Iterable[Intervention]) -> tuple[Intervention, ...]:
         """Interventions of this cycle that were not there in the one before."""
         found = tuple(interventions)
+        if not found and not self._present:
+            return ()
         new = tuple(i for i in found if i.code not in self._present)
         self._present = frozenset(i.code for i in found)
         for one in new:

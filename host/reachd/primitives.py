@@ -9,15 +9,15 @@ y_here = −x_paper, angles and cross products stay as they are, and R_θ of equ
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from reachd.parameter_fields import Parameters
 from reachd.seam import ArmState, Goal, Twist
+from tactile_bus.records import record
 
 TURN = 2.0 * math.pi
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Aim:
     """Tip and goal: position of the tip (m), distance (m), unit vector d̂ and its angle φ (rad).
 

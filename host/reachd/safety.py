@@ -25,6 +25,7 @@ from reachd.safety_settings import MOVING_MODES, PAUSED_MODE, Check, SafetySetti
 from reachd.seam import ZERO, ArmState, Goal, Touch, Twist
 from reachd.stillness import Stillness
 from tactile_bus.instant import Instant, seconds_between
+from tactile_bus.records import record
 
 Effect = Literal["ignored", "limited", "stopped", "latched", "refused"]
 
@@ -42,7 +43,7 @@ class Intervention:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Decision:
     """The twist to send, s for which the arm may follow it, and why it is not the one wanted.
 

@@ -13,11 +13,12 @@ from typing import Protocol
 from tactile_bus.arm_types import ZERO, ArmState, Twist
 from tactile_bus.geometry import Side
 from tactile_bus.instant import Instant
+from tactile_bus.records import record
 
 __all__ = ["ZERO", "ArmState", "Goal", "Strategy", "Touch", "Twist"]
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Touch:
     """The contact features a strategy may use; see ``ContactFeatures.msg``.
 

@@ -17,6 +17,7 @@ from reachd.safety import Decision, Intervention
 from reachd.seam import ZERO, ArmState, Goal, Strategy, Touch, Twist
 from reachd.strategies import StrategyEvent, ask, begin
 from tactile_bus.instant import Instant, seconds_between
+from tactile_bus.records import record
 
 HOMING_LIMIT = 60.0
 """s that homing or resetting may take: half a turn at 0.1 rad/s and the way across the shelf."""
@@ -31,7 +32,7 @@ class State(StrEnum):
     RESETTING = "resetting"
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Command:
     """What is wanted now: for the gate, and ``events`` for the log.
 

@@ -13,9 +13,10 @@ from types import MappingProxyType
 from typing import Final
 
 from tactile_bus.instant import Instant
+from tactile_bus.records import record
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Twist:
     """Planar velocity of the wrist pivot. m/s in ``cupboard``, rad/s counter-clockwise."""
 
@@ -27,7 +28,7 @@ class Twist:
 ZERO = Twist(0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class ArmState:
     """What the arm reports of itself at its own rate.
 

@@ -16,6 +16,7 @@ import numpy as np
 from sim_device.world.base import PHYSICS_STEP, FingerState, World
 from tactile_bus.arm_types import ZERO, ArmLimits, ArmState, Twist
 from tactile_bus.instant import NS_PER_S, Instant, after
+from tactile_bus.records import record
 
 STEP_NS: Final = round(PHYSICS_STEP * NS_PER_S)
 
@@ -99,7 +100,7 @@ class ArmSettings:
             raise ValueError(f"bias {self.bias} is not finite")
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class _Command:
     """A twist, the instant it takes effect and the instant it dies."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from sim_device.world.scenes import Scene
 from tactile_bus.arm_types import Twist
+from tactile_bus.records import record
 
 Float = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ Touch = tuple[int, float, float, float, float, float, float]
 """One of an engine's points: body; place x, y m, outward normal x, y, force x, y N, in ``ee``."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class FingerContact:
     """One place where a body presses on the finger.
 
@@ -62,7 +62,7 @@ class FingerContact:
         return self.force_y * self.normal_x - self.force_x * self.normal_y
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class FingerState:
     """Pivot's pose (m, m, rad) and twist in ``cupboard``, wrench (N, N, N·m) on the finger.
 
@@ -148,6 +148,8 @@ def merge_touches(touches: Sequence[Touch], count: int) -> tuple[FingerContact, 
     Touches of one body within `MERGE_RADIUS` of each other become one: forces summed and divided
     by ``count``, place and normal weighted by normal force. Touches that do not press are left out.
     """
+    if not touches:
+        return ()
     groups: list[list[float]] = []  # weight; then weighted x, y, normal x, y; then force x, y
     owners: list[int] = []
     for body, x, y, nx, ny, fx, fy in touches:
@@ -157,27 +159,24 @@ def merge_touches(touches: Sequence[Touch], count: int) -> tuple[FingerContact, 
         for group, owner in zip(groups, owners, strict=True):
             dx, dy = x - group[1] / group[0], y - group[2] / group[0]
             if owner == body and dx * dx + dy * dy < MERGE_RADIUS**2:
+                group[0] += weight
+                group[1] += weight * x
+                group[2] += weight * y
+                group[3] += weight * nx
+                group[4] += weight * ny
+                group[5] += fx
+                group[6] += fy
                 break
         else:
-            group = [0.0] * 7
-            groups.append(group)
+            groups.append([weight, weight * x, weight * y, weight * nx, weight * ny, fx, fy])
             owners.append(body)
-        group[0] += weight
-        group[1] += weight * x
-        group[2] += weight * y
-        group[3] += weight * nx
-        group[4] += weight * ny
-        group[5] += fx
-        group[6] += fy
-    return tuple(
-        FingerContact(
-            x=x / weight,
-            y=y / weight,
-            normal_x=nx / math.hypot(nx, ny),
-            normal_y=ny / math.hypot(nx, ny),
-            force_x=fx / count,
-            force_y=fy / count,
-            body=body,
-        )
-        for (weight, x, y, nx, ny, fx, fy), body in zip(groups, owners, strict=True)
+    return tuple([_contact(g, count, body) for g, body in zip(groups, owners, strict=True)])
+
+
+def _contact(group: list[float], count: int, body: int) -> FingerContact:
+    """Contact from the weighted sums of its touches in ``count`` physics steps."""
+    weight, x, y, nx, ny, fx, fy = group
+    length = math.hypot(nx, ny)
+    return FingerContact(
+        x / weight, y / weight, nx / length, ny / length, fx / count, fy / count, body
     )

@@ -34,8 +34,6 @@ _FALLEN = -0.02
 # Otherwise MuJoCo prints, and writes MUJOCO_LOG.TXT wherever the process happens to stand.
 mujoco.set_mju_user_warning(logging.getLogger(__name__).debug)
 
-_Touches = tuple[NDArray[np.int32], Float, Float, Float, NDArray[np.int32], Float, list[float]]
-
 
 class MujocoWorld:
     """`World` on a planar MuJoCo model of ``scene``.
@@ -73,7 +71,7 @@ class MujocoWorld:
         self._work = 0.0
         self._count = 1
         self._wrench = (0.0, 0.0, 0.0)
-        self._touches: list[_Touches] = []
+        self._touches: list[Touch] = []
         self._contacts: tuple[FingerContact, ...] | None = ()
         self._state: FingerState | None = None
 
@@ -109,7 +107,7 @@ class MujocoWorld:
         mass, _, inertia = self._finger_mass
         total_x = total_y = total_m = work = 0.0
         u0, v0, w0 = self._finger_qvel.tolist()
-        for left in range(count - 1, -1, -1):
+        for _ in range(count):
             pose = self._finger_qpos.tolist()
             mujoco.mj_step(model, data)
             u1, v1, w1 = self._finger_qvel.tolist()
@@ -123,35 +121,61 @@ class MujocoWorld:
             u0, v0, w0 = u1, v1, w1
             if fx or fy or mz:
                 total_x, total_y, total_m = total_x + fx, total_y + fy, total_m + mz
-                self._touches.append(self._touched(pose, copied=left > 0))
+                self._gather(pose)
         self._work += work / 2
         self._steps += count
         self._count = count
         self._wrench = (total_x / count, total_y / count, total_m / count)
-        if self._warnings.any():
+        if any(self._warnings.tolist()):
             raise WorldError(
                 f"physics gave up at {self.time:.3f} s of scene {self._scene.seed} "
                 f"({self._scene.source})"
             )
 
-    def _touched(self, pose: list[float], *, copied: bool) -> _Touches:
-        """What `contacts` will need of the physics step just made; it may never be asked.
+    def _gather(self, pose: list[float]) -> None:
+        """Keep what touched the finger in the physics step just made; ``pose`` is from before it.
 
-        Of the last one no copy is needed: the engine leaves it alone until the next.
+        Loops, because a finger touches few things: arrays cost more to make than they save.
         """
-        contact = self._data.contact
-        arrays = (
-            contact.geom,
-            contact.pos,
-            contact.frame,
-            contact.dist,
-            contact.efc_address,
-            self._data.efc_force,
-        )
-        geom, pos, frame, dist, address, force = (
-            (array.copy() for array in arrays) if copied else arrays
-        )
-        return geom, pos, frame, dist, address, force, pose
+        contact, me = self._data.contact, self._finger_geom
+        found = [
+            (index, first, second)
+            for index, (first, second) in enumerate(contact.geom.tolist())
+            if first == me or second == me
+        ]
+        if not found:
+            return
+        position, frames, distance = contact.pos, contact.frame, contact.dist
+        address, forces = contact.efc_address, self._data.efc_force
+        px, py, heading = pose
+        c, s = math.cos(heading), math.sin(heading)
+        px, py = px + self._start.x, py + self._start.y
+        for index, first, second in found:
+            row = int(address[index])
+            if row < 0:
+                continue
+            # Normals point from the first geom to the second, forces act on the second.
+            sign = 1.0 if first == me else -1.0
+            nx, ny, _, ax, ay, _, bx, by, _ = frames[index].tolist()
+            fn, fa, fb = forces[row : row + 3].tolist()
+            fx = -sign * (fn * nx + fa * ax + fb * bx)
+            fy = -sign * (fn * ny + fa * ay + fb * by)
+            x, y, _ = position[index].tolist()
+            # Half of the depth from the middle of the overlap to the finger's own surface.
+            depth = sign * float(distance[index]) / 2
+            x, y = x - nx * depth - px, y - ny * depth - py
+            nx, ny = sign * nx, sign * ny
+            self._touches.append(
+                (
+                    self._body_of_geom[second if first == me else first],
+                    c * x + s * y,
+                    c * y - s * x,
+                    c * nx + s * ny,
+                    c * ny - s * nx,
+                    c * fx + s * fy,
+                    c * fy - s * fx,
+                )
+            )
 
     def limit_wrench(self, f_max: float, m_max: float) -> None:
         """Bound the motors, see `World.limit_wrench`."""
@@ -163,48 +187,8 @@ class MujocoWorld:
     def contacts(self) -> tuple[FingerContact, ...]:
         """Contacts on the finger, forces averaged over the last step."""
         if self._contacts is None:
-            self._contacts = self._merged()
+            self._contacts = merge_touches(self._touches, self._count)
         return self._contacts
-
-    def _merged(self) -> tuple[FingerContact, ...]:
-        """Contacts from the touches kept of each physics step.
-
-        Loops, because a finger touches few things: arrays cost more to make than they save.
-        """
-        me, bodies = self._finger_geom, self._body_of_geom
-        touches: list[Touch] = []
-        for geoms, position, frames, distance, address, forces, (px, py, heading) in self._touches:
-            c, s = math.cos(heading), math.sin(heading)
-            px, py = px + self._start.x, py + self._start.y
-            for index, (first, second) in enumerate(geoms.tolist()):
-                if first != me and second != me:
-                    continue
-                row = int(address[index])
-                if row < 0:
-                    continue
-                # Normals point from the first geom to the second, forces act on the second.
-                sign = 1.0 if first == me else -1.0
-                nx, ny, _, ax, ay, _, bx, by, _ = frames[index].tolist()
-                fn, fa, fb = forces[row : row + 3].tolist()
-                fx = -sign * (fn * nx + fa * ax + fb * bx)
-                fy = -sign * (fn * ny + fa * ay + fb * by)
-                x, y, _ = position[index].tolist()
-                # Half of the depth from the middle of the overlap to the finger's own surface.
-                depth = sign * float(distance[index]) / 2
-                x, y = x - nx * depth - px, y - ny * depth - py
-                nx, ny = sign * nx, sign * ny
-                touches.append(
-                    (
-                        bodies[second if first == me else first],
-                        c * x + s * y,
-                        c * y - s * x,
-                        c * nx + s * ny,
-                        c * ny - s * nx,
-                        c * fx + s * fy,
-                        c * fy - s * fx,
-                    )
-                )
-        return merge_touches(touches, self._count)
 
     def finger(self) -> FingerState:
         """Where the finger is, how it moves and what pushes it."""

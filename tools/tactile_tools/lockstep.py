@@ -25,6 +25,7 @@ from sim_device.world.base import World
 from sim_device.world.mujoco_world import MujocoWorld
 from sim_device.world.scenes import Scene
 from tactile_bus.instant import Instant, after
+from tactile_bus.records import record
 from tactile_tools.touch_senses import ContactSense, Sense, TaxelSense
 from tactiled.blocks import Cycle
 
@@ -37,7 +38,7 @@ BEGIN = Instant(1_000_000_000)
 """Virtual time at which every trial begins; not 0, so that what was never set shows."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Step:
     """One control cycle of a trial, for whoever logs or draws it."""
 
@@ -116,7 +117,7 @@ def run_trial(
             watch(Step(now, world, touch, sense.cycle, state, command, decision, status, new))
         now, state = _next(arm, now)
         touch = sense.feel(world, now)
-        loads.append(sum(c.normal_force for c in world.contacts()))
+        loads.append(sum([c.normal_force for c in world.contacts()]))
         cycles += 1
     outcome = supervisor.outcome
     if outcome is None:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from functools import cache, lru_cache
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from reachd.seam import Touch
 from sim_device.catalogue import build_skin, factory_calibration, identity
 from sim_device.environment import rotation_about
 from sim_device.firmware import SerialBoard
-from sim_device.world.base import FingerContact, World
+from sim_device.world.base import World
 from sim_device.world.touch import on_skin
 from tactile_bus.geometry import Side, finger
 from tactile_bus.instant import Instant, after
@@ -20,7 +22,13 @@ from tactiled.events import Event, Identity, Refusal, Refused, Sampled
 from tactiled.line import SerialLine
 from tactiled.pipeline import BoardPipeline, PipelineSettings
 
+Float = NDArray[np.float64]
+
 UP = np.array([0.0, 0.0, 1.0])
+
+CELL_M = 1e-4
+"""m; fifty times finer than taxels lie apart. A search of the nearest costs more than a trial's
+whole control cycle, and a finger is touched in few of these cells."""
 
 SETTLE_S = 1.0
 """s that a board is given to be identified, its clock to be mapped and its first fits made."""
@@ -48,11 +56,6 @@ class ContactSense:
 
     cycle: Cycle | None = None
 
-    def __init__(self) -> None:
-        skin = finger()
-        self._places = np.concatenate([a.position[:, :2] for a in skin.arrays])
-        self._sides = [a.side for a in skin.arrays for _ in range(a.taxels)]
-
     def settle(self, world: World, now: Instant) -> Instant:
         """There is nothing to start."""
         del world
@@ -60,29 +63,42 @@ class ContactSense:
 
     def feel(self, world: World, now: Instant) -> Touch:
         """Touch from the contacts of the last physics step."""
-        contacts = world.contacts()
-        if not contacts:
+        peak, tip, total = None, 0.0, 0.0
+        greatest, peak_side = -1.0, Side.NONE
+        for contact in world.contacts():
+            force, side = contact.normal_force, side_of(contact.x, contact.y)
+            total += force
+            if side is Side.TIP:
+                tip += force
+            if force > greatest:
+                peak, greatest, peak_side = contact, force, side
+        if peak is None:
             return Touch(now, now, True, 0.0, Side.NONE, 0.0, 0.0, 0.0, 0.0)
-        peak = max(contacts, key=lambda c: c.normal_force)
-        sides = [self.side(c) for c in contacts]
-        return Touch(
-            captured=now,
-            received=now,
-            valid=True,
-            peak_force=peak.normal_force,
-            peak_side=sides[contacts.index(peak)],
-            peak_x=peak.x,
-            peak_y=peak.y,
-            total_force=sum(c.normal_force for c in contacts),
-            tip_force=sum(
-                c.normal_force for c, side in zip(contacts, sides, strict=True) if side is Side.TIP
-            ),
-        )
+        return Touch(now, now, True, greatest, peak_side, peak.x, peak.y, total, tip)
 
-    def side(self, contact: FingerContact) -> Side:
-        """Part of the skin that a contact would be felt by: that of the nearest taxel."""
-        away = (self._places[:, 0] - contact.x) ** 2 + (self._places[:, 1] - contact.y) ** 2
-        return self._sides[int(away.argmin())]
+
+def side_of(x: float, y: float) -> Side:
+    """Part of the skin that a contact at (x, y) m in ``ee`` is felt by: that of the nearest taxel.
+
+    Places are told apart to `CELL_M`.
+    """
+    return _side_of_cell(math.floor(x / CELL_M), math.floor(y / CELL_M))
+
+
+@lru_cache(maxsize=1 << 16)
+def _side_of_cell(column: int, row: int) -> Side:
+    """Part of the skin that the middle of a cell belongs to."""
+    places, sides = _taxels()
+    middle = ((column + 0.5) * CELL_M, (row + 0.5) * CELL_M)
+    return sides[int(((places - middle) ** 2).sum(axis=1).argmin())]
+
+
+@cache
+def _taxels() -> tuple[Float, list[Side]]:
+    """Places (n, 2) m in ``ee`` and sides of the finger's taxels."""
+    skin = finger()
+    places = np.concatenate([a.position[:, :2] for a in skin.arrays])
+    return places, [a.side for a in skin.arrays for _ in range(a.taxels)]
 
 
 class TaxelSense:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from reachd.parameter_fields import Parameters
 from reachd.primitives import Aim, aim, excavate, slowing
 from reachd.seam import ArmState, Goal, Touch, Twist
 from tactile_bus.instant import Instant, seconds_between
+from tactile_bus.records import record
 
 MAX_EVENTS = 64
 """Events kept until they are taken: a reach has at most a few excavations, so more means that
@@ -31,7 +32,7 @@ class StrategyEvent:
     trigger: str
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Moment:
     """What a strategy chooses by: newest touch and arm state, the aim, s since the reach began."""
 
@@ -42,7 +43,6 @@ class Moment:
     now: Instant
 
 
-@runtime_checkable
 class ReportsEvents(Protocol):
     """A strategy that tells what it decided."""
 

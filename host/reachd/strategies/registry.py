@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import cast
@@ -12,10 +11,11 @@ import numpy as np
 
 from reachd.parameter_fields import Parameters
 from reachd.seam import ArmState, Goal, Strategy, Touch, Twist
-from reachd.strategies.base import ReportsEvents, StrategyEvent
+from reachd.strategies.base import StrategyEvent
 from reachd.strategies.hybrid import HybridClock, HybridEvent
 from reachd.strategies.isolated import Burrow, Excavate, Straight
 from tactile_bus.instant import Instant
+from tactile_bus.records import record
 
 GROUP = "tactile_reach.strategies"
 """Entry-point group in which an installed package offers strategies."""
@@ -55,7 +55,7 @@ def load_strategy(spec: str, parameters: Parameters, rng: np.random.Generator) -
     return strategy
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Answer:
     """What a strategy said: twist and activity, what it decided, or how it failed (``failure``)."""
 
@@ -82,7 +82,8 @@ def ask(strategy: Strategy, touch: Touch, arm: ArmState, goal: Goal, now: Instan
             raise TypeError(f"step() returned {type(said).__name__}, not a Twist")
         twist = Twist(float(said.vx), float(said.vy), float(said.omega))
         activity = str(strategy.activity)
-        events = strategy.take_events() if isinstance(strategy, ReportsEvents) else ()
+        # Not isinstance of a Protocol: in every cycle it costs as much as the strategy itself.
+        events = tuple(strategy.take_events()) if hasattr(strategy, "take_events") else ()
     except Exception as error:  # noqa: BLE001 - a plug-in may raise anything
         return Answer(None, "failed", failure=f"{type(error).__name__}: {error}")
     return Answer(twist, activity, events)
