@@ -14,6 +14,10 @@ from tactile_tools.series import LogUnreadableError
 
 BOARD = "finger"
 
+SEED = 29
+"""A scene that is crowded from the front edge on, and that hybrid_event gets through nearly always:
+in five of five runs in real time and five of five in lockstep, with and without an excavation."""
+
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``demo`` to the umbrella command."""
@@ -28,29 +32,55 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--png", type=Path, default=Path("demo.png"), help="picture to leave")
     parser.add_argument("--strategy", default="hybrid_event", help="default %(default)s")
     parser.add_argument("--scene", default="authors_sim", help="default %(default)s")
-    parser.add_argument("--seed", type=int, default=1, help="of scene and trial (default 1)")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=SEED,
+        help="of scene and trial (default %(default)s: thirty objects in the way)",
+    )
     parser.set_defaults(func=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the demo; the exit code says whether the target was reached."""
-    with tempfile.TemporaryDirectory(prefix="tactile-demo-") as name:
-        try:
-            code = _run(options, Path(name))
-        except (RuntimeError, OSError, subprocess.SubprocessError) as error:
-            print(f"tactile demo: {error}", file=sys.stderr)
-            return 3
-    if code not in (0, 1):
-        return code
+    for flag, path in (("--out", options.out), ("--png", options.png)):
+        if not path.resolve().parent.is_dir():
+            print(
+                f"tactile demo: {flag} {path}: there is no folder {path.parent}; create it or "
+                "name another",
+                file=sys.stderr,
+            )
+            return 2
     from tactile_tools.plot_reach import draw_reach
 
     try:
+        with tempfile.TemporaryDirectory(prefix="tactile-demo-") as name:
+            code = _run(options, Path(name))
+        if code not in (0, 1):
+            return code
         draw_reach(options.out, options.png)
-    except LogUnreadableError as error:
+    except BadArgumentError as error:
+        print(f"tactile demo: {error}", file=sys.stderr)
+        return 2
+    except (RuntimeError, OSError, LogUnreadableError) as error:
         print(f"tactile demo: {error}", file=sys.stderr)
         return 3
     print(f"wrote {options.out} and {options.png}")
     return code
+
+
+class BadArgumentError(Exception):
+    """One of our commands refused what it was given; the text is its own."""
+
+
+def _ask(words: list[str]) -> str:
+    """What a command printed; `BadArgumentError` when it refused."""
+    done = subprocess.run(words, check=False, capture_output=True, text=True)
+    if done.returncode == 2:
+        raise BadArgumentError(done.stderr.strip().splitlines()[-1])
+    if done.returncode != 0:
+        raise RuntimeError(done.stderr.strip() or f"{words[0]} ended with {done.returncode}")
+    return done.stdout.strip()
 
 
 def _run(options: argparse.Namespace, folder: Path) -> int:
@@ -58,14 +88,8 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
     board = folder / BOARD
     calibration = folder / "finger.cal.toml"
     scene = ["--scene", options.scene, "--seed", str(options.seed)]
-    goal = subprocess.run(
-        [simdevice, "cupboard", *scene, "--print-goal"], check=True, capture_output=True, text=True
-    ).stdout.strip()
-    subprocess.run(
-        [simdevice, "calibration", "--seed", str(options.seed), "--out", str(calibration)],
-        check=True,
-        stdout=subprocess.DEVNULL,
-    )
+    goal = _ask([simdevice, "cupboard", *scene, "--print-goal"])
+    _ask([simdevice, "calibration", "--seed", str(options.seed), "--out", str(calibration)])
     options.out.unlink(missing_ok=True)
     arm, skin, reach = (f"tcp/127.0.0.1:{free_port()}" for _ in range(3))
     cupboard = [simdevice, "cupboard", *scene, "--pty", str(board), "--listen", arm]
@@ -90,7 +114,7 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
             ],
             check=False,
         )
-        if done.returncode not in (0, 1):
+        if done.returncode == 3:
             for name in ("cupboard.txt", "tactiled.txt"):
                 print(f"--- {name}\n{(folder / name).read_text(errors='replace')[-1500:]}")
     return done.returncode
