@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -43,6 +44,7 @@ def identity(model: str, seed: int) -> Identity:
     return Identity(digest[:8], model)
 
 
+@lru_cache(maxsize=8)
 def factory_calibration(model: str, seed: int) -> BoardCalibration:
     """Calibration that belongs to that very board, as its maker would supply it."""
     return nominal_calibration(build_skin(model, seed), identity(model, seed).unique_id.hex())

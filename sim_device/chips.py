@@ -102,6 +102,12 @@ class Magnetometers:
         # The chip converts X, Y, Z one after another: when Z ends, X is two conversions old.
         self._lag[chips] = self._oscillator[chips, None] * setting.axis_time * [2.0, 1.0, 0.0]
 
+    def response(self, temperature_c: float) -> Float:
+        """Matrices (N, 3, 3): field in ``ee`` to what each chip makes of it, offsets apart."""
+        warmer = temperature_c - self.parameters.reference_c
+        matrices: Float = self._view * (1.0 + self._sensitivity_drift * warmer)[:, :, None]
+        return matrices
+
     def sense(self, field_ut: Float, temperature_c: float) -> Float:
         """Noiseless, unrounded field (N, 3) µT in chip axes of ``field_ut`` (N, 3) in ``ee``."""
         warmer = temperature_c - self.parameters.reference_c

@@ -115,10 +115,10 @@ class Elastomer:
         return self._displace(effective)
 
     def settled(self, force: Float) -> Float:
-        """Displacement (N, 3) m of recovered rubber `CALIBRATION_DWELL` after ``force`` came on.
+        """Displacement (..., N, 3) m of recovered rubber some time after ``force`` came on.
 
-        What a calibration rig sees, which loads and never unloads before it reads; changes no
-        state.
+        ``force``: (..., N, 3) N, on for `CALIBRATION_DWELL`. What a calibration rig sees, which
+        loads and never unloads before it reads; changes no state.
         """
         p = self._parameters
         crept = -p.creep * math.expm1(-CALIBRATION_DWELL / p.creep_time)
@@ -126,5 +126,5 @@ class Elastomer:
 
     def _displace(self, effective: Float) -> Float:
         displacement: Float = effective * self._compliance
-        np.maximum(displacement[:, 2], -self._travel, out=displacement[:, 2])
+        np.maximum(displacement[..., 2], -self._travel, out=displacement[..., 2])
         return displacement

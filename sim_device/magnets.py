@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
+Index = NDArray[np.intp]
 
 MU0_OVER_4PI = 1e-7
 """T·m/A."""
@@ -37,12 +38,25 @@ class MagnetArray:
         seen = distance <= radius
         np.fill_diagonal(seen, True)
         pairs = np.argwhere(seen)
-        chip, self._magnet = pairs[:, 0], pairs[:, 1]
+        self._chip, self._magnet = chip, _ = pairs[:, 0], pairs[:, 1]
         # Every chip has at least its own magnet, so each has a run of pairs, in order.
         self._starts = np.searchsorted(chip, np.arange(len(chips)))
         # Components apart: numpy is several times faster on long rows than on triples.
         self._offset = np.ascontiguousarray((chips[chip] - rest[self._magnet]).T)
         self._moment = np.ascontiguousarray(moment[self._magnet].T)
+
+    @property
+    def pairs(self) -> tuple[Index, Index]:
+        """Chip and magnet (P,) of every pair in which the chip sees the magnet."""
+        return self._chip, self._magnet
+
+    def shares_ut(self, displacement: Float) -> Float:
+        """Field (..., P, 3) µT in ee at the chip of each pair from its magnet alone.
+
+        ``displacement``: (..., N, 3) m in ee.
+        """
+        offset = self._offset.T - displacement.take(self._magnet, axis=-2)
+        return dipole_field_ut(offset, self._moment.T)
 
     def field_ut(self, displacement: Float, strength: float = 1.0) -> Float:
         """Field (N, 3) µT in ee at the chips, the magnets moved by ``displacement`` (N, 3) m in ee.

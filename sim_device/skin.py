@@ -13,7 +13,7 @@ from sim_device.environment import Surroundings
 from sim_device.magnets import MagnetArray
 from sim_device.parameters import SkinParameters
 from tactile_bus.calibration import ArrayCalibration, BoardCalibration
-from tactile_bus.geometry import ArrayGeometry, SkinGeometry
+from tactile_bus.geometry import SkinGeometry
 from tactile_bus.instant import Instant, seconds_between
 
 __all__ = ["Contact", "SkinModel", "nominal_calibration"]
@@ -41,7 +41,7 @@ class SkinModel:
         yaw = np.concatenate([a.chip_yaw for a in arrays])
         n = geometry.taxels
         self._position = position
-        self._rotation = rotation
+        self.rotation = rotation
         self._to_taxel = np.ascontiguousarray(np.transpose(rotation, (0, 2, 1)))
         tolerance, magnet = parameters.tolerance, parameters.magnet
 
@@ -62,8 +62,8 @@ class SkinModel:
             _turn(rotation, moment),
             magnet.neighbour_radius,
         )
-        self._yaw = _yaw_matrices(yaw)
-        self.chips = Magnetometers(rotation @ self._yaw, parameters.chip, tolerance, rng)
+        self.yaw = _yaw_matrices(yaw)
+        self.chips = Magnetometers(rotation @ self.yaw, parameters.chip, tolerance, rng)
         self._last: tuple[Instant, Float] | None = None
         self._true_force = np.zeros((n, 3))
 
@@ -98,7 +98,7 @@ class SkinModel:
         """Noiseless field (N, 3) µT in chip axes, magnets moved by ``displacement`` (N, 3) m."""
         warmer = surroundings.temperature_c - self.parameters.chip.reference_c
         strength = 1.0 + self.parameters.magnet.drift_per_k * warmer
-        field = self.magnets.field_ut(_turn(self._rotation, displacement), strength)
+        field = self.magnets.field_ut(_turn(self.rotation, displacement), strength)
         field += surroundings.field_ut(self._position)
         return self.chips.sense(field, surroundings.temperature_c)
 
@@ -110,7 +110,7 @@ class SkinModel:
         """
         displacement = self.elastomer.settled(force)
         in_chip = self.field_ut(displacement, Surroundings(temperature_c=temperature_c))
-        return _turn(self._yaw, in_chip)
+        return _turn(self.yaw, in_chip)
 
     def reset(self) -> None:
         """Recovered rubber and no memory of earlier samples; the tolerances stay."""
@@ -144,6 +144,7 @@ def nominal_calibration(
     warm = model.settled_field_ut(np.zeros((n, 3)), reference + _DRIFT_STEP_K)
     cold = model.settled_field_ut(np.zeros((n, 3)), reference - _DRIFT_STEP_K)
     drift = (warm - cold) / (2 * _DRIFT_STEP_K)
+    loads, field = _presses(model, reference)
     arrays = []
     for array, taxels in zip(model.geometry.arrays, model.geometry.slices, strict=True):
         arrays.append(
@@ -152,7 +153,7 @@ def nominal_calibration(
                 rest_ut=rest[taxels],
                 drift_ut_per_k=drift[taxels],
                 reference_c=reference,
-                newton_per_ut=_fit(model, array, taxels, rest, reference),
+                newton_per_ut=_fit(model, taxels, loads, field),
             )
         )
     return BoardCalibration(
@@ -166,27 +167,40 @@ def nominal_calibration(
     )
 
 
-def _fit(
-    model: SkinModel, array: ArrayGeometry, taxels: slice, rest: Float, temperature_c: float
-) -> Float:
-    """Matrix (3n, 3n) N/µT of one array."""
-    loads = [
-        np.array([x * normal, y * normal, -normal])
-        for normal in CALIBRATION_NORMAL_N
-        for x, y in [(s, 0.0) for s in CALIBRATION_SHEAR]
-        + [(0.0, s) for s in CALIBRATION_SHEAR[1:]]
-    ]
-    forces, fields = [], []
-    force = np.zeros_like(rest)
-    for taxel in range(array.taxels):
-        for load in loads:
-            weight = 1.0 / float(np.linalg.norm(load))
-            force[taxels.start + taxel] = load
-            field = model.settled_field_ut(force, temperature_c) - rest
-            forces.append(force[taxels].ravel() * weight)
-            fields.append(field[taxels].ravel() * weight)
-        force[taxels.start + taxel] = 0.0
-    matrix, *_ = np.linalg.lstsq(np.array(fields), np.array(forces), rcond=None)
+def _presses(model: SkinModel, temperature_c: float) -> tuple[Float, Float]:
+    """Loads (L, 3) N of the calibration and what each pair of chip and magnet makes of them.
+
+    The field (L, P, 3) µT is the change in taxel axes when the magnet's own taxel bears the load
+    alone: whatever else a chip sees stays as it is at rest.
+    """
+    sheared = [(s, 0.0) for s in CALIBRATION_SHEAR] + [(0.0, s) for s in CALIBRATION_SHEAR[1:]]
+    loads = np.array(
+        [[x * n, y * n, -n] for n in CALIBRATION_NORMAL_N for x, y in sheared], dtype=float
+    )
+    n = model.geometry.taxels
+    displacement = model.elastomer.settled(np.repeat(loads[:, None], n, axis=1))
+    moved = np.einsum("nij,lnj->lni", model.rotation, displacement)
+    change = model.magnets.shares_ut(moved) - model.magnets.shares_ut(np.zeros((n, 3)))
+    seen = model.yaw @ model.chips.response(temperature_c)
+    chip, _ = model.magnets.pairs
+    field: Float = np.einsum("pij,lpj->lpi", seen[chip], change)
+    return loads, field
+
+
+def _fit(model: SkinModel, taxels: slice, loads: Float, field: Float) -> Float:
+    """Matrix (3n, 3n) N/µT of one array, from what `_presses` found."""
+    weight = 1.0 / np.linalg.norm(loads, axis=1)
+    n = taxels.stop - taxels.start
+    forces = np.zeros((n, len(loads), n, 3))
+    forces[np.arange(n), :, np.arange(n)] = loads * weight[:, None]
+    fields = np.zeros((n, len(loads), n, 3))
+    chip, magnet = (index - taxels.start for index in model.magnets.pairs)
+    own = (chip >= 0) & (chip < n) & (magnet >= 0) & (magnet < n)
+    fields[magnet[own], :, chip[own]] = np.moveaxis(field[:, own], 1, 0) * weight[:, None]
+    rows = n * len(loads)
+    # Half as many operations as by singular values, and the presses leave no doubt of the rank.
+    q, r = np.linalg.qr(fields.reshape(rows, 3 * n))
+    matrix = np.linalg.solve(r, q.T @ forces.reshape(rows, 3 * n))
     return np.ascontiguousarray(matrix.T)
 
 

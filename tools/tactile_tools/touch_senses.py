@@ -130,8 +130,9 @@ class TaxelSense:
     def feel(self, world: World, now: Instant) -> Touch | None:
         """Pass the bytes there are both ways; the newest touch, if a cycle was completed."""
         board = self._board
-        board.contacts = on_skin(world.contacts(), world.scene)
-        board.attitude = rotation_about(UP, world.finger().heading)
+        # As functions: a board samples four times more rarely than it is asked for bytes.
+        board.contacts = lambda _: on_skin(world.contacts(), world.scene)
+        board.attitude = lambda _: rotation_about(UP, world.finger().heading)
         events: list[Event] = [e.event for e in self._line.tick(now)]
         for payload in self._line.outgoing():
             if isinstance(payload, bytes):
