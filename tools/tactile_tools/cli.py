@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -41,6 +42,9 @@ def build_parser(tools: Sequence[str] = TOOLS) -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one tool; its exit code is 0 only when the job was done, 2 for a bad argument."""
     words = list(sys.argv[1:] if argv is None else argv)
+    # Our matrices are small: threads of the linear algebra gain nothing on them, and on a machine
+    # busy with trials they wait for one another far longer than they work. Read at numpy's import.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Only the tool that was named is imported, so that `tactile log` does not wait for matplotlib.
     named = tuple(tool for tool in TOOLS if words and words[0] == tool.replace("_", "-"))
     options = build_parser(named or TOOLS).parse_args(words)
