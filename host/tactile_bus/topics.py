@@ -44,6 +44,8 @@ FIELD = Topic("tactile/{name}/field", f"{_OWN}/TaxelField", 100)
 AMBIENT = Topic("tactile/{name}/ambient", f"{_OWN}/AmbientField", 100)
 GEOMETRY = Topic("tactile/{name}/geometry", f"{_OWN}/SkinGeometry", 0, latched=True)
 RAW = Topic("tactile/{name}/raw", f"{_OWN}/RawChunk", 100, published=False)
+PORT = Topic("tactile/{name}/port", f"{_OWN}/PortEvent", 8, published=False)
+CONTACTS = Topic("tactile/{name}/contacts", "visualization_msgs/msg/MarkerArray", 10)
 DIAGNOSTICS = Topic("tactile/{name}/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 1)
 LOG = Topic("tactile/{name}/log", "rcl_interfaces/msg/Log", 0)
 
@@ -51,6 +53,7 @@ ARM_STATE = Topic("arm/{name}/state", f"{_OWN}/ArmState", 100, stale_after=0.05)
 COMMAND = Topic("arm/{name}/cmd_vel", "geometry_msgs/msg/TwistStamped", 100, stale_after=0.1)
 REACH_STATE = Topic("reach/{name}/state", f"{_OWN}/ReachState", 100)
 REACH_EVENT = Topic("reach/{name}/event", f"{_OWN}/ReachEvent", 0)
+TF = Topic("tf", "tf2_msgs/msg/TFMessage", 25)
 WORLD = Topic("world/{name}/objects", "visualization_msgs/msg/MarkerArray", 10)
 
 TOPICS = (
@@ -60,12 +63,15 @@ TOPICS = (
     AMBIENT,
     GEOMETRY,
     RAW,
+    PORT,
+    CONTACTS,
     DIAGNOSTICS,
     LOG,
     ARM_STATE,
     COMMAND,
     REACH_STATE,
     REACH_EVENT,
+    TF,
     WORLD,
 )
 
@@ -73,7 +79,8 @@ TOPICS = (
 def find_topic(key: str) -> tuple[Topic, str] | None:
     """Topic and name that ``key`` (a key expression, or a channel of a log) was built from.
 
-    A leading slash (channels of a log have one) and a replay prefix are passed over.
+    A leading slash (channels of a log have one) and a replay prefix are passed over. The name of
+    a topic that all share is the topic's own.
     """
     parts = key.strip("/").split("/")
     for topic in TOPICS:
@@ -82,7 +89,7 @@ def find_topic(key: str) -> tuple[Topic, str] | None:
         if len(tail) == len(template) and all(
             a == b or b == "{name}" for a, b in zip(tail, template, strict=True)
         ):
-            return topic, tail[template.index("{name}")]
+            return topic, tail[template.index("{name}") if "{name}" in template else 0]
     return None
 
 

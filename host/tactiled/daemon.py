@@ -26,19 +26,21 @@ from tactile_bus.session import BusError, close_session, open_session
 from tactile_bus.streams import declare_alive
 from tactile_bus.topics import DIAGNOSTICS, alive_key
 from tactiled import diagnostics
-from tactiled.can_line import CanLine
 from tactiled.events import Identity, Refusal
 from tactiled.inbox import MAX_AGE, Inbox, Wake
-from tactiled.line import Line, SerialLine
+from tactiled.journal import Journal
+from tactiled.line import SerialLine
+from tactiled.lines import bus_names, make_line
 from tactiled.memory import Collector, return_large_buffers
 from tactiled.outlet import Outlet
 from tactiled.port import Port, Trouble
 from tactiled.reader import PortReader
+from tactiled.recorded import describe
 from tactiled.services import BoardServices
 from tactiled.settings import REPLAY_PREFIX, PortSettings, Settings
 from tactiled.shelf import Shelf
 from tactiled.station import Station
-from tactiled.transports import Medium, Transport, TransportError
+from tactiled.transports import Transport, TransportError
 from tactiled.transports.can_bus import CanTransport
 from tactiled.transports.mcap_file import McapTransport
 from tactiled.transports.serial_port import SerialTransport
@@ -83,6 +85,7 @@ class Daemon:
         self._calls: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._session: zenoh.Session | None = None
         self._outlet: Outlet | None = None
+        self._readers: list[PortReader] = []
         self._services: list[BoardServices] = []
         self._tokens: list[zenoh.LivelinessToken] = []
         self._stopping = threading.Event()
@@ -120,14 +123,15 @@ class Daemon:
         if settings.log is not None:
             self.recorder = outlet.recorder = self._open_log(settings.log)
         self._thread.start()
-        for port in self.ports:
-            port.reader.start()
+        for reader in self._readers:
+            reader.start()
 
     def _make_port(self, wanted: PortSettings, transport: Transport, outlet: Outlet) -> Port:
         settings = self.settings
         replay = wanted.medium == "log"
         inbox = Inbox(self._wake, max_age=None if replay else MAX_AGE)
         reader = PortReader(transport, inbox, outlet, wanted.name, self._fail, paced=replay)
+        self._readers.append(reader)
         reader.open(settings.wait and not replay)
         name = wanted.name
         if isinstance(transport, McapTransport):
@@ -137,20 +141,23 @@ class Daemon:
         def admit(node: int, identity: Identity) -> Refusal | None:
             return port.admit(node, identity)
 
-        line: Line
-        if transport.medium is Medium.CAN:
-            fd = isinstance(transport, CanTransport) and transport.spec.fd
-            nodes = frozenset(wanted.nodes) or None
-            line = CanLine(transport.name, admit, fd, settings.rate, nodes, listen_only=replay)
-        else:
-            line = SerialLine(
-                transport.name, admit, wanted.kind, settings.rate, wanted.baud, listen_only=replay
-            )
+        line = make_line(
+            transport.name,
+            admit,
+            transport.medium,
+            kind=wanted.kind,
+            rate=settings.rate,
+            baud=wanted.baud,
+            fd=isinstance(transport, CanTransport) and transport.spec.fd,
+            nodes=frozenset(wanted.nodes) or None,
+            listen_only=replay,
+        )
 
         def names(nodes: tuple[int, ...], late: bool) -> dict[int, str]:
             return bus_names(name, wanted.nodes, nodes, late)
 
-        port = Port(name, line, reader, inbox, names, self._open_station, live=not replay)
+        journal = None if replay else Journal(outlet, name, transport.name)
+        port = Port(name, line, reader, inbox, names, self._open_station, not replay, journal)
         if isinstance(line, SerialLine):
             port.add_station(0, name)
             if port.trouble is not None:
@@ -184,12 +191,12 @@ class Daemon:
             "tactiled",
             {
                 "ports": ", ".join(port.spec for port in settings.ports),
-                "pipeline": repr(settings.pipeline),
-                "rate": repr(settings.rate),
                 "python": platform.python_version(),
                 "host": platform.platform(),
             },
         )
+        for key, values in describe(settings).items():
+            recorder.metadata(key, values)
         if settings.config_path is not None:
             text = settings.config_path.read_bytes()
             recorder.attach(settings.config_path.name, "application/toml", text)
@@ -206,8 +213,8 @@ class Daemon:
         if self._thread.is_alive():
             self._thread.join(JOIN_TIMEOUT)
         clean = not self._thread.is_alive()
-        for port in self.ports:
-            clean &= port.reader.stop()
+        for reader in self._readers:
+            clean &= reader.stop()
         if self.recorder is not None and not self.recorder.close():
             log.error("the log was not closed in time; see `tactile log recover`")
         for service in self._services:
@@ -251,7 +258,7 @@ class Daemon:
                 if all(port.ended for port in self.ports):
                     self.done.set()
             for port in self.ports:
-                port.farewell()
+                port.farewell(monotonic_now())
             self._abandon_requests()
         except BaseException as error:  # noqa: BLE001 - thread boundary: the daemon must end loudly
             self._fail(error)
@@ -314,17 +321,6 @@ class Daemon:
             self.failure = (name, error)
             log.critical("thread %s failed", name, exc_info=error)
         self.done.set()
-
-
-def bus_names(
-    stem: str, given: dict[int, str], nodes: tuple[int, ...], late: bool
-) -> dict[int, str]:
-    """Names of boards on a CAN bus: as given by node; the stem for a lone board, else stem-node."""
-    if given:
-        return {node: given[node] for node in nodes if node in given}
-    if len(nodes) == 1 and not late:
-        return {nodes[0]: stem}
-    return {node: f"{stem}-{node}" for node in nodes}
 
 
 def _make_transport(port: PortSettings, speed: float) -> Transport:

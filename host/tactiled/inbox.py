@@ -69,6 +69,9 @@ class Inbox:
         self._chunks = 0
         self.dropped = 0
         """Chunks dropped since the start."""
+        self.skipped = 0
+        """Of these, the ones between the chunk taken last and the one before it."""
+        self._told = 0
 
     @property
     def full(self) -> bool:
@@ -98,7 +101,9 @@ class Inbox:
             if not self._items:
                 return None
             item = self._items.popleft()
-            self._chunks -= isinstance(item, Chunk)
+            if isinstance(item, Chunk):
+                self._chunks -= 1
+                self.skipped, self._told = self.dropped - self._told, self.dropped
             return item
 
     def _oldest(self) -> tuple[int, Chunk]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
+from typing import Any, Protocol
 
 import zenoh
 
@@ -22,6 +22,27 @@ NODE = "tactiled"
 """Name of this program in ``rcl_interfaces/Log``."""
 
 
+class Sink(Protocol):
+    """Where a board's messages go: bus and log, or the log of a run over recorded bytes."""
+
+    wall: WallClock
+    recorder: Recorder | None
+
+    def now(self) -> Instant:
+        """Present instant of whatever clock the messages live by."""
+
+    def send(self, topic: Topic, name: str, message: Any, stamp_ns: int) -> None:
+        """Encode and send; ``stamp_ns``: wall-clock time that the message stands for."""
+
+    def announce(self, name: str, level: int, text: str, at: Instant | None = None) -> None:
+        """Say something of a board: to people, on the bus and into the log."""
+
+    def firmware_text(
+        self, name: str, level: int, speaker: str, text: str, at: Instant | None = None
+    ) -> None:
+        """``rcl_interfaces/Log`` on the bus and into the log alone."""
+
+
 class Outlet:
     """Bus and log behind one call. ``recorder`` None: nothing is logged."""
 
@@ -38,6 +59,10 @@ class Outlet:
         self._prefix = prefix
         self._codec = codec()
         self._publishers: dict[tuple[str, str], Publisher] = {}
+
+    def now(self) -> Instant:
+        """Present instant."""
+        return monotonic_now()
 
     def send(self, topic: Topic, name: str, message: Any, stamp_ns: int) -> None:
         """Encode and send; ``stamp_ns``: wall-clock time that the message stands for."""

@@ -5,15 +5,18 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 from tactile_bus.instant import Instant
+from tactiled import journal as kinds
 from tactiled.blocks import Chunk
 from tactiled.events import Diagnosed, Found, Identity, Refusal
-from tactiled.inbox import Inbox, PortLost, PortOpened
+from tactiled.inbox import Inbox, Item, PortLost, PortOpened
+from tactiled.journal import Journal
 from tactiled.line import Line, LineEvent
 from tactiled.link import BoardLink
-from tactiled.reader import PortReader
 from tactiled.station import Station
+from tactiled.transports.base import Transport
 
 log = logging.getLogger(__name__)
 
@@ -33,27 +36,39 @@ class Trouble:
         return f"{self.problem}; {self.remedy}"
 
 
+class Source(Protocol):
+    """What a port has of its reader."""
+
+    reopened: int
+
+    @property
+    def transport(self) -> Transport:
+        """Where payloads are written and losses are counted."""
+
+
 class Port:
     """Owned by the pipeline's thread.
 
     ``names``: of the boards at some nodes, and whether those came later than the others of their
     bus. ``open_station``: makes the station of a board; `Trouble` when its name is taken.
-    ``live`` False: a recording, whose time is that of its chunks.
+    ``live`` False: a recording, whose time is that of its chunks. ``journal``: where it is noted
+    what was acted on beside the bytes.
     """
 
     def __init__(
         self,
         name: str,
         line: Line,
-        reader: PortReader,
+        source: Source,
         inbox: Inbox,
         names: Callable[[tuple[int, ...], bool], dict[int, str]],
         open_station: Callable[[Port, int, str], Station | Trouble],
         live: bool = True,
+        journal: Journal | None = None,
     ) -> None:
         self.name = name
         self.line = line
-        self.reader = reader
+        self.reader = source
         self.inbox = inbox
         self.stations: dict[int, Station] = {}
         self.ended = False
@@ -62,6 +77,7 @@ class Port:
         self._names = names
         self._open_station = open_station
         self._live = live
+        self._journal = journal
         self._clock = Instant(0)
 
     @property
@@ -82,35 +98,55 @@ class Port:
             item = self.inbox.take()
             if item is None:
                 break
-            if isinstance(item, Chunk):
-                self._clock = item.received
-                self._handle(self.line.receive(item))
-            elif isinstance(item, PortOpened):
-                self._clock = now
-                self.line.connect(now, item.usb_serial, item.byte_time)
-            elif isinstance(item, PortLost):
-                self._handle(self.line.disconnect())
-                for station in self.stations.values():
-                    station.port_lost(item.reason)
-                if not self.stations:
-                    log.warning("%s: %s", self.name, item.reason)
-            else:
-                self.ended = True
-                for station in self.stations.values():
-                    station.flush()
+            if isinstance(item, Chunk) and self.inbox.skipped:
+                self.note(kinds.SKIPPED, now, until=item.received)
+            self.work(item, now)
         # A recording's time is that of its chunks, which at high speed run ahead of ours.
-        self._handle(self.line.tick(now if self._live else self._clock))
-        self.write()
+        self.tick(now if self._live else self._clock)
+        if self._journal is not None:
+            self._journal.progress(now)
+
+    def work(self, item: Item, now: Instant) -> None:
+        """Work off one chunk, or one piece of news of the port itself."""
+        if isinstance(item, Chunk):
+            self._clock = item.received
+            self._handle(self.line.receive(item))
+            if self._journal is not None:
+                self._journal.worked(item.received)
+        elif isinstance(item, PortOpened):
+            self._clock = now
+            self.note(kinds.OPENED, now, value=item.byte_time, text=item.usb_serial)
+            self.line.connect(now, item.usb_serial, item.byte_time)
+        elif isinstance(item, PortLost):
+            self.note(kinds.LOST, now, text=item.reason)
+            self._handle(self.line.disconnect())
+            for station in self.stations.values():
+                station.port_lost(item.reason)
+            if not self.stations:
+                log.warning("%s: %s", self.name, item.reason)
+        else:
+            self.ended = True
+            for station in self.stations.values():
+                station.flush()
+
+    def tick(self, now: Instant) -> None:
+        """Let the links do what time demands, and write what they want to say."""
+        events, payloads = self.line.tick(now), self.line.outgoing()
+        if events or payloads:  # else it left no trace, whenever it was
+            self.note(kinds.TICK, now)
+        self._handle(events)
+        for payload in payloads:
+            self.reader.transport.write(payload)
+
+    def note(self, kind: str, now: Instant, **values: Any) -> None:
+        """Have the journal note what is acted on; see `Journal.note`."""
+        if self._journal is not None:
+            self._journal.note(kind, now, **values)
 
     @property
     def behind(self) -> bool:
         """Whether more waits than one turn works off."""
         return self.inbox.waiting
-
-    def write(self) -> None:
-        """Send what the links want to say."""
-        for payload in self.line.outgoing():
-            self.reader.transport.write(payload)
 
     def retry(self, node: int, now: Instant) -> None:
         """Have a refused board judged again."""
@@ -120,14 +156,16 @@ class Port:
         elif link is not None:
             link.retry()
 
-    def farewell(self) -> None:
+    def farewell(self, now: Instant) -> None:
         """Stop the boards, send what is under way."""
+        self.note(kinds.ENDED, now)
         for node, link in self.line.links.items():
             if isinstance(link, BoardLink):
                 link.farewell()
             if node in self.stations:
                 self.stations[node].flush()
-        self.write()
+        for payload in self.line.outgoing():
+            self.reader.transport.write(payload)
 
     def add_station(self, node: int, name: str) -> None:
         """Make room for a board under ``name``."""

@@ -20,6 +20,7 @@ from tactile_bus.calibration import CalibrationError
 from tactile_bus.instant import monotonic_now
 from tactile_bus.services import Service, ServiceError, declare_service
 from tactile_bus.topics import service_key
+from tactiled import journal
 from tactiled.diagnostics import log_summary, summary
 from tactiled.events import Answered, Event
 from tactiled.link import BoardLink
@@ -98,7 +99,12 @@ class BoardServices:
         return result
 
     def _tare(self, _: Nothing) -> dict[str, Any]:
-        future: Future[dict[str, Any]] = self._do(self._station.tare)
+        def begin() -> Future[dict[str, Any]]:
+            ending = self._station.tare()
+            self._port.note(journal.TARE, monotonic_now(), node=self._node)
+            return ending
+
+        future: Future[dict[str, Any]] = self._do(begin)
         stuck = "the tare did not end: no samples are coming"
         report: dict[str, Any] = self._await(future, TARE_TIMEOUT, stuck)
         if not report["accepted"]:
@@ -130,14 +136,19 @@ class BoardServices:
         mhz = round(rate * 1000)
         if mhz < 1:
             raise ServiceError(f"rate_hz is {rate:g}; the finest step is 0.001")
-        request = link.request(lambda n: SetRate(n, mhz), monotonic_now())
+        now = monotonic_now()
+        request = link.request(lambda n: SetRate(n, mhz), now)
+        self._port.note(journal.SET_RATE, now, node=self._node, value=rate)
         return self._station.await_answer(request)
 
     def _recalibrate(self, _: Nothing) -> dict[str, Any]:
         def reload() -> dict[str, Any]:
             self._shelf.reload()
-            self._port.retry(self._node, monotonic_now())
-            return self._station.recalibrate()
+            now = monotonic_now()
+            self._port.retry(self._node, now)
+            told = self._station.recalibrate()
+            self._port.note(journal.RECALIBRATE, now, node=self._node, text=told["hash"])
+            return told
 
         result: dict[str, Any] = self._do(reload)
         return result

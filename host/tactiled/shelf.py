@@ -65,6 +65,12 @@ class Shelf:
                         self._files[log] = calibration
                     return
 
+    def add(self, source: Path, calibration: BoardCalibration) -> None:
+        """Take a calibration that is in no file of its own; it stands in for that board's other."""
+        serial = calibration.serial_number
+        self._files = {p: c for p, c in self._files.items() if c.serial_number != serial}
+        self._files[source] = calibration
+
     def choose(self, identity: Identity) -> Choice | Refusal:
         """Calibration for a board, or why there is none."""
         own = [(p, c) for p, c in self._files.items() if c.serial_number == identity.serial_number]

@@ -11,9 +11,9 @@ from typing import Any
 
 from tactile_bus.calibration import saves
 from tactile_bus.calibration_file import SUFFIX
-from tactile_bus.instant import NS_PER_S, Instant, monotonic_now, seconds_between
+from tactile_bus.instant import NS_PER_S, Instant, seconds_between
 from tactile_bus.recorder import Recorder
-from tactile_bus.topics import AMBIENT, FEATURES, FIELD, FORCES, GEOMETRY
+from tactile_bus.topics import AMBIENT, CONTACTS, FEATURES, FIELD, FORCES, GEOMETRY
 from tactiled.blocks import Cycle, Features, SampleBlock
 from tactiled.events import (
     Answered,
@@ -31,9 +31,10 @@ from tactiled.events import (
     Streaming,
 )
 from tactiled.outgoing import MessageMaker
-from tactiled.outlet import Outlet
+from tactiled.outlet import Sink
 from tactiled.pipeline import BoardPipeline, PipelineSettings
 from tactiled.shelf import Choice, Shelf
+from tactiled.skin_picture import SkinPicture
 
 LATENCIES = 512
 """Latencies kept for the percentiles: a second at the fastest rate of the chip (493 Hz)."""
@@ -52,7 +53,7 @@ class Latency:
 class Station:
     """Owned by the pipeline's thread; others read its plain attributes."""
 
-    def __init__(self, name: str, outlet: Outlet, shelf: Shelf, settings: PipelineSettings) -> None:
+    def __init__(self, name: str, outlet: Sink, shelf: Shelf, settings: PipelineSettings) -> None:
         self.name = name
         self.identity: Identity | None = None
         self.choice: Choice | None = None
@@ -73,9 +74,10 @@ class Station:
         self._shelf = shelf
         self._settings = settings
         self._maker: MessageMaker | None = None
+        self._picture: SkinPicture | None = None
         self._warned = ""
         self._latencies: deque[float] = deque(maxlen=LATENCIES)
-        self._rate_from: tuple[Instant, int] = (monotonic_now(), 0)
+        self._rate_from: tuple[Instant, int] = (outlet.now(), 0)
         self._answers: dict[int, Future[Event]] = {}
         self._tares: list[Future[dict[str, Any]]] = []
 
@@ -128,6 +130,7 @@ class Station:
         if before is not None:
             self.counters.update({k: v for k, v in asdict(before).items() if k not in ("cycles",)})
         self._maker = MessageMaker(calibration, self._outlet.wall)
+        self._picture = SkinPicture(calibration.geometry)
         recorder = self.recorder
         if recorder is not None:
             text = saves(calibration).encode()
@@ -149,7 +152,7 @@ class Station:
     def send_geometry(self) -> None:
         """Publish where the taxels are; nothing before a board has been identified."""
         if self._maker is not None:
-            now_ns = self._outlet.wall.wall_ns(monotonic_now())
+            now_ns = self._outlet.wall.wall_ns(self._outlet.now())
             self._outlet.send(GEOMETRY, self.name, self._maker.geometry(now_ns), now_ns)
 
     # What happens
@@ -300,11 +303,13 @@ class Station:
         stamp_ns = outlet.wall.wall_ns(cycle.captured)
         if cycle.features_due:
             outlet.send(FEATURES, name, maker.features(cycle), stamp_ns)
-        self._latencies.append((monotonic_now() - cycle.received) / NS_PER_S)
+        self._latencies.append((outlet.now() - cycle.received) / NS_PER_S)
         outlet.send(FORCES, name, maker.forces(cycle), stamp_ns)
         outlet.send(FIELD, name, maker.field(cycle), stamp_ns)
         if cycle.ambient.method != "off":
             outlet.send(AMBIENT, name, maker.ambient(cycle), stamp_ns)
+        if self._picture is not None and self._picture.due(cycle.captured):
+            outlet.send(CONTACTS, name, self._picture.draw(cycle, stamp_ns), stamp_ns)
         self.features, self.last = cycle.features, cycle
         self.sent += 1
 

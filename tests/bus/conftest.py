@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from tactile_bus import topics
-from tactile_bus.markers import CYLINDER, marker
+from tactile_bus.markers import CYLINDER, SPHERE_LIST, frame_transform, marker, wipe
 from tactile_bus.mcap_file import DiskStorage
 from tactile_bus.messages import MSG, codec, diagnostic_status, header, log_message
 from tactile_bus.recorder import Recorder, RecorderSettings
@@ -55,6 +55,20 @@ def example_messages() -> dict[topics.Topic, Any]:
         topics.RAW: MSG.RawChunk(
             head, 12, 1, np.array([0x1234], np.uint32), np.array([3], u8), np.array([1, 2, 3], u8)
         ),
+        topics.PORT: MSG.PortEvent(
+            header(WALL_NS, "/dev/ttyACM0"), 12, 11, "set_rate", 3, 0, 100.5, "grüße"
+        ),
+        topics.CONTACTS: MSG.MarkerArray(
+            [
+                wipe(WALL_NS, "ee"),
+                marker(
+                    WALL_NS, "ee", "taxels", 1, SPHERE_LIST, (0.0, 0.0, 0.0, 0.0),
+                    (0.5, 0.5, 0.5), (0.25, 0.5, 0.75, 1.0), points=[(0.5, 0.25, 0.125)],
+                    colours=[(0.25, 0.5, 0.75, 1.0)], text="1 N",
+                ),
+            ]
+        ),
+        topics.TF: frame_transform(WALL_NS, "cupboard", "ee", (0.5, 0.25, 0.0, 1.0)),
         topics.DIAGNOSTICS: MSG.DiagnosticArray(
             header(WALL_NS, ""), [diagnostic_status("b0", 1, "ok", "0011", {"drops.crc": 5})]
         ),

@@ -1,0 +1,90 @@
+"""What a skin feels as shapes for a 3D view, at a rate for eyes: taxels, patches, their forces."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tactile_bus.geometry import SkinGeometry
+from tactile_bus.instant import NS_PER_S, Instant
+from tactile_bus.markers import ARROW, SPHERE, SPHERE_LIST, TEXT, Colour, Triple, marker, wipe
+from tactile_bus.messages import MSG
+from tactile_bus.topics import CONTACTS
+from tactiled.blocks import Cycle
+
+TAXELS, CONTACT, FORCE, LABEL = "taxels", "contacts", "forces", "labels"
+"""Namespaces of the markers; the number of a contact is that of its patch."""
+
+FULL_N = 3.0
+"""N on a taxel at which its colour is full: a firm press spread over some taxels."""
+
+METRES_PER_N = 0.01
+"""How long an arrow is drawn: the paper's threshold of 10 N is as long as the finger's side."""
+
+TAXEL_M, SHAFT_M, LETTERS_M = 0.003, 0.002, 0.01
+
+IDLE: Colour = (0.55, 0.58, 0.62, 1.0)
+SICK: Colour = (0.85, 0.0, 0.6, 1.0)
+PRESSED = np.array([0.90, 0.25, 0.05, 1.0])
+AT_ORIGIN = (0.0, 0.0, 0.0, 0.0)
+
+
+class SkinPicture:
+    """Pictures of one board; `due` tells when the next one is."""
+
+    def __init__(self, geometry: SkinGeometry) -> None:
+        self._frame = geometry.frame
+        places = np.concatenate([a.position for a in geometry.arrays])
+        self._places: list[Triple] = [(x, y, z) for x, y, z in places.tolist()]
+        self._due: Instant | None = None
+
+    def due(self, captured: Instant) -> bool:
+        """Whether a cycle captured then is to be drawn; by capture times alone."""
+        period = round(NS_PER_S / CONTACTS.rate)
+        if self._due is not None and self._due - 2 * period <= captured < self._due:
+            return False
+        self._due = Instant(captured + period)
+        return True
+
+    def draw(self, cycle: Cycle, wall_ns: int) -> Any:
+        """``MarkerArray`` of the taxels by their normal force, and of the contact patches."""
+        frame = self._frame
+        size = (TAXEL_M,) * 3
+        made = [
+            wipe(wall_ns, frame),
+            marker(
+                wall_ns, frame, TAXELS, 0, SPHERE_LIST, AT_ORIGIN, (size[0], size[1], size[2]),
+                IDLE, points=self._places, colours=self._colours(cycle),
+            ),
+        ]  # fmt: skip
+        for number, patch in enumerate(cycle.features.patches):
+            x, y, z = patch.centroid.tolist()
+            fx, fy, fz = (patch.force * METRES_PER_N).tolist()
+            wide = TAXEL_M * (1.0 + 2.0 * min(1.0, patch.normal_force / 10.0))
+            made += [
+                marker(
+                    wall_ns, frame, CONTACT, number, SPHERE, (x, y, z, 0.0),
+                    (wide, wide, wide), (0.9, 0.6, 0.0, 0.9),
+                ),
+                marker(
+                    wall_ns, frame, FORCE, number, ARROW, AT_ORIGIN,
+                    (SHAFT_M, 2 * SHAFT_M, 3 * SHAFT_M), (0.8, 0.1, 0.1, 1.0),
+                    # the tip touches the skin: an arrow shows what pushes on it
+                    points=((x - fx, y - fy, z - fz), (x, y, z)),
+                ),
+                marker(
+                    wall_ns, frame, LABEL, number, TEXT,
+                    (x - 1.2 * fx, y - 1.2 * fy, z - 1.2 * fz + LETTERS_M, 0.0),
+                    (LETTERS_M,) * 3, (0.1, 0.1, 0.1, 1.0), text=f"{patch.normal_force:.1f} N",
+                ),
+            ]  # fmt: skip
+        return MSG.MarkerArray(made)
+
+    def _colours(self, cycle: Cycle) -> list[Colour]:
+        share = np.clip(-np.nan_to_num(cycle.force[:, 2]) / FULL_N, 0.0, 1.0)[:, None]
+        colours = ((1.0 - share) * np.array(IDLE) + share * PRESSED).tolist()
+        sick = cycle.health != 0
+        return [
+            SICK if bad else (r, g, b, a) for bad, (r, g, b, a) in zip(sick, colours, strict=True)
+        ]
