@@ -17,6 +17,7 @@ TOOLS = (
     "demo_skin",
     "bench",
     "fidelity",
+    "experiment",
     "fuzz",
     "crash",
     "mutation",

@@ -1,0 +1,214 @@
+"""Who runs the trials: processes of this machine, or a Dask cluster."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections import deque
+from collections.abc import Iterator, Sequence
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from types import TracebackType
+from typing import Protocol, Self
+
+from tactile_tools.experiments.rows import Row
+from tactile_tools.experiments.spec import TrialSpec
+
+Batch = Sequence[TrialSpec]
+"""Trials that one worker runs one after another, of the same scene where possible."""
+
+BATCH = 10
+"""Trials in a batch: enough for a scene, which costs as much as a trial, to be made only once."""
+
+ATTEMPTS = 2
+"""Workers that may die of one trial before it is given up: the first may have been bad luck."""
+
+FRUITLESS = 20
+"""Workers that may die one after another with no row in between before the run is given up."""
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class BackendError(Exception):
+    """Trials cannot be run: why, what to do."""
+
+
+class Backend(Protocol):
+    """Runs trials. A context manager; leaving it ends what still runs."""
+
+    def __enter__(self) -> Self:
+        """Start; BackendError."""
+        ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End."""
+        ...
+
+    @property
+    def workers(self) -> int:
+        """How many trials run at a time."""
+        ...
+
+    def run(self, specs: Sequence[TrialSpec]) -> Iterator[Row]:
+        """Rows of ``specs`` as they are finished, in any order; BackendError."""
+        ...
+
+
+def batches(specs: Sequence[TrialSpec], size: int) -> list[list[TrialSpec]]:
+    """``specs``, which come scene by scene, in batches of one scene."""
+    made: list[list[TrialSpec]] = []
+    scene = None
+    for spec in specs:
+        here = (spec.source, spec.scene_seed)
+        if not made or here != scene or len(made[-1]) == size:
+            made.append([])
+            scene = here
+        made[-1].append(spec)
+    return made
+
+
+class _Worker:
+    """A process and what it was asked."""
+
+    def __init__(self) -> None:
+        context = get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self.process: BaseProcess = context.Process(target=_serve, args=(theirs,), daemon=True)
+        self.process.start()
+        theirs.close()
+        self.asked: deque[TrialSpec] = deque()
+
+    def ask(self, batch: Batch) -> None:
+        """Give it ``batch``; its death is seen when its answer is waited for."""
+        self.asked.extend(batch)
+        try:
+            self.pipe.send(list(batch))
+        except OSError:
+            return
+
+    def end(self) -> None:
+        """Kill it: there is nothing in it that is to be kept."""
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+
+class Processes:
+    """``jobs`` processes of this machine. One that dies costs its trial alone."""
+
+    def __init__(self, jobs: int) -> None:
+        self.workers = jobs
+        self._crew: list[_Worker] = []
+
+    def __enter__(self) -> Self:
+        """Processes are started as they are needed."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End them."""
+        for worker in self._crew:
+            worker.end()
+        self._crew.clear()
+
+    def run(self, specs: Sequence[TrialSpec]) -> Iterator[Row]:
+        """Rows as they are finished."""
+        # Small batches when there is little to do: no worker shall wait long for the last one.
+        size = max(1, min(BATCH, len(specs) // (4 * self.workers)))
+        waiting = deque(batches(specs, size))
+        deaths: dict[TrialSpec, int] = {}
+        while len(self._crew) < min(self.workers, len(waiting)):
+            self._crew.append(_hire())
+        idle = list(self._crew)
+        fruitless = 0
+        while True:
+            while idle and waiting:
+                idle.pop().ask(waiting.popleft())
+            busy = {worker.pipe: worker for worker in self._crew if worker.asked}
+            if not busy:
+                return
+            for pipe in wait(list(busy)):
+                assert isinstance(pipe, Connection)
+                worker = busy[pipe]
+                try:
+                    row: Row = pipe.recv()
+                except (EOFError, OSError):
+                    fruitless += 1
+                    yield from self._bury(worker, waiting, deaths)
+                    if fruitless == FRUITLESS:
+                        raise BackendError(
+                            f"{FRUITLESS} worker processes in a row died "
+                            f"({_how(worker.process)}); is there enough memory? "
+                            "Finished trials are kept, and the same command runs the rest"
+                        ) from None
+                    self._crew.remove(worker)
+                    self._crew.append(_hire())
+                    idle.append(self._crew[-1])
+                    continue
+                fruitless = 0
+                worker.asked.popleft()
+                if not worker.asked:
+                    idle.append(worker)
+                yield row
+
+    def _bury(
+        self, worker: _Worker, waiting: deque[list[TrialSpec]], deaths: dict[TrialSpec, int]
+    ) -> Iterator[Row]:
+        """Put back what a dead worker did not do; the trial that killed it twice is lost."""
+        worker.end()
+        killer = worker.asked[0]
+        rest = list(worker.asked)[1:]
+        deaths[killer] = deaths.get(killer, 0) + 1
+        if rest:
+            waiting.appendleft(rest)
+        if deaths[killer] < ATTEMPTS:
+            waiting.appendleft([killer])
+            return
+        from tactile_tools.experiments.trial import lost
+
+        how = _how(worker.process)
+        yield lost(killer, f"the process that ran it died ({how}), {ATTEMPTS} times")
+
+
+def _how(process: BaseProcess) -> str:
+    """How a process died."""
+    code = process.exitcode or 0
+    return signal.Signals(-code).name if code < 0 else f"exit code {code}"
+
+
+def _hire() -> _Worker:
+    """A worker whose linear algebra keeps to one thread: its neighbours use the other cores."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        return _Worker()
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _serve(pipe: Connection) -> None:
+    """A worker's life: batches in, rows out one by one, until the other end is gone."""
+    # Ctrl-C reaches the whole group; the parent decides what becomes of its workers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    from tactile_tools.experiments.trial import run_one
+
+    try:
+        while True:
+            for spec in pipe.recv():
+                pipe.send(run_one(spec))
+    except (EOFError, OSError):
+        return

@@ -1,0 +1,115 @@
+"""Scene, world, parameters and touch of a trial, with what its conditions change."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+from reachd.fields import SettingError
+from reachd.parameter_fields import Parameters
+from sim_device.world.base import World
+from sim_device.world.generate import GENERATORS, generate
+from sim_device.world.mujoco_world import MujocoWorld
+from sim_device.world.parameters import Friction, WorldParameters, world_parameters
+from sim_device.world.scenes import Scene
+from tactile_tools.experiments.senses import DegradedContacts, DegradedTaxels
+from tactile_tools.experiments.spec import Conditions, TrialSpec
+from tactile_tools.touch_senses import Sense
+from tactile_tools.worlds import load_scene, make_world
+
+CACHED_SCENES = 8
+"""Scenes kept by a worker: trials come scene by scene, and a few scenes may be under way at once
+where a worker has several threads."""
+
+MISSED_FEATURES = 3
+"""Periods of the feature stream that the safety gate lets pass before it stops the arm. Without
+this, features at 5 Hz would be judged by a limit on their age that was set for 15 Hz."""
+
+
+@lru_cache(maxsize=CACHED_SCENES)
+def build_scene(source: str, seed: int, objects: tuple[int, int] | None) -> Scene:
+    """The scene; ValueError, RuntimeError or OSError where there is none."""
+    if objects is None:
+        return load_scene(source, seed)
+    if source not in GENERATORS:
+        raise SettingError(
+            f"the number of objects cannot be set in {source}; it can in "
+            f"{', '.join(sorted(GENERATORS))}"
+        )
+    return generate(source, seed, objects)
+
+
+def scene_of(spec: TrialSpec) -> Scene:
+    """The scene of ``spec``, as `build_scene`."""
+    return build_scene(spec.source, spec.scene_seed, spec.changed.objects)
+
+
+def world_of(spec: TrialSpec, scene: Scene) -> World:
+    """The world of ``spec``; SettingError, or ValueError where the engine is not installed."""
+    engine = spec.typed_engine
+    figures = world_parameters(scene.parameters)
+    changed = _figures(figures, spec.changed)
+    if changed == figures:
+        return make_world(engine, scene)
+    if engine == "mujoco":
+        return MujocoWorld(scene, changed)
+    from sim_device.world.pymunk_world import PymunkWorld
+
+    return PymunkWorld(scene, changed)
+
+
+def _figures(figures: WorldParameters, conditions: Conditions) -> WorldParameters:
+    """``figures`` with the friction and the finger of ``conditions``."""
+    friction = figures.friction
+    if (each := conditions.friction_all) is not None:
+        friction = Friction(each, each, each, each, each)
+    if (mu := conditions.friction_objects) is not None:
+        # The engines take the greater of two surfaces' coefficients, so no pair can have less.
+        friction = replace(
+            friction,
+            objects=mu,
+            object_wall=max(mu, friction.object_wall),
+            finger_object=max(mu, friction.finger_object),
+        )
+    width = conditions.finger_width
+    return replace(
+        figures,
+        friction=friction,
+        finger_width=figures.finger_width if width is None else width,
+    )
+
+
+def parameters_of(spec: TrialSpec) -> Parameters:
+    """The parameters of ``spec``; SettingError."""
+    resolved = spec.resolved()
+    rate = spec.changed.feature_rate
+    if rate is None:
+        return resolved
+    safety = resolved.safety
+    age = max(safety.features_age, MISSED_FEATURES / rate)
+    return replace(
+        resolved,
+        safety=replace(safety, features_age=age, features_latch=max(safety.features_latch, age)),
+    )
+
+
+def sense_of(spec: TrialSpec, scene: Scene) -> Sense | None:
+    """The sense of touch of ``spec``; None where it is the plain one of its depth."""
+    conditions = spec.changed
+    plain = Conditions(
+        objects=conditions.objects,
+        friction_objects=conditions.friction_objects,
+        friction_all=conditions.friction_all,
+    )
+    if conditions == plain:
+        return None
+    figures = world_parameters(scene.parameters)
+    stretch = _figures(figures, conditions).finger_width / figures.finger_width
+    kind = DegradedContacts if spec.typed_depth == "contacts" else DegradedTaxels
+    return kind(
+        spec.trial_seed,
+        noise=conditions.noise,
+        rate=conditions.feature_rate,
+        dead=conditions.dead_taxels,
+        stretch=stretch,
+    )

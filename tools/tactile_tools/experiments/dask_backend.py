@@ -1,0 +1,140 @@
+"""Trials on a Dask cluster, of one machine or many."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from importlib.metadata import version
+from types import TracebackType
+from typing import Any, Self
+
+from tactile_tools.experiments.backends import BackendError, batches
+from tactile_tools.experiments.rows import Row
+from tactile_tools.experiments.spec import TrialSpec
+
+BATCH = 5
+"""Trials in a task: a scene's five strategies. What a lost worker had of it runs again."""
+
+AHEAD = 2
+"""Tasks handed out for each thread of the cluster: none waits, and few are under way at an end."""
+
+CONNECT_S = 10.0
+
+
+class DaskCluster:
+    """The workers that the scheduler at ``address`` has, however many come and go."""
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._client: Any = None
+
+    def __enter__(self) -> Self:
+        """Connect; BackendError."""
+        try:
+            from distributed import Client
+        except ImportError as error:
+            raise BackendError(
+                "--dask needs Dask: pip install 'tactile-reach[dask]', here and on the workers"
+            ) from error
+        try:
+            self._client = Client(self._address, timeout=CONNECT_S, set_as_default=False)
+        except (OSError, ValueError, TimeoutError) as error:
+            raise BackendError(
+                f"no Dask scheduler at {self._address} ({error}): start `dask scheduler` there, or "
+                "leave --dask out"
+            ) from error
+        try:
+            self._check()
+        except BackendError:
+            self._client.close()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Disconnect; the scheduler forgets what nobody waits for."""
+        if self._client is not None:
+            self._client.close()
+
+    @property
+    def workers(self) -> int:
+        """Threads of the cluster now."""
+        return max(1, sum(int(n) for n in self._client.nthreads().values()))
+
+    def run(self, specs: Sequence[TrialSpec]) -> Iterator[Row]:
+        """Rows as they are finished."""
+        from distributed import as_completed
+
+        waiting = deque(batches(specs, BATCH))
+        asked: dict[Any, list[TrialSpec]] = {}
+        done = as_completed([])
+        try:
+            while waiting or asked:
+                while waiting and len(asked) < AHEAD * self.workers:
+                    batch = waiting.popleft()
+                    future = self._submit(batch)
+                    asked[future] = batch
+                    done.add(future)
+                future = next(done)
+                yield from self._take(future, asked.pop(future), waiting)
+        except OSError as error:
+            raise self._gone(error) from error
+
+    def _submit(self, batch: Sequence[TrialSpec]) -> Any:
+        from tactile_tools.experiments.trial import run_batch
+
+        # Not pure: a trial that is asked for again, asked by another run, is to be run again.
+        return self._client.submit(run_batch, list(batch), pure=False)
+
+    def _take(
+        self, future: Any, batch: list[TrialSpec], waiting: deque[list[TrialSpec]]
+    ) -> Iterator[Row]:
+        """Rows of a task that ended; a batch that killed its workers is tried one by one."""
+        from distributed.scheduler import KilledWorker
+
+        if future.status == "finished":
+            yield from future.result()
+            return
+        if future.status in ("lost", "cancelled"):
+            raise self._gone(future.status)
+        error = future.exception()
+        if not isinstance(error, KilledWorker):
+            raise BackendError(
+                f"a worker of {self._address} cannot run trials: {type(error).__name__}: {error}"
+            )
+        if len(batch) > 1:
+            waiting.extend([spec] for spec in batch)
+            return
+        from tactile_tools.experiments.trial import lost
+
+        yield lost(batch[0], f"the workers that ran it died: {error}")
+
+    def _check(self) -> None:
+        """Every worker has this software in this version; BackendError."""
+        try:
+            found: dict[str, str] = self._client.run(version, "tactile-reach", on_error="return")
+        except OSError as error:
+            raise self._gone(error) from error
+        if not found:
+            raise BackendError(
+                f"the scheduler at {self._address} has no workers: start `dask worker "
+                f"{self._address}`"
+            )
+        here = version("tactile-reach")
+        for worker, there in found.items():
+            if there != here:
+                what = f"has version {there}" if isinstance(there, str) else f"has none ({there!r})"
+                raise BackendError(
+                    f"the worker {worker} {what} of tactile-reach, this machine {here}: install "
+                    "the same everywhere"
+                )
+
+    def _gone(self, why: object) -> BackendError:
+        return BackendError(
+            f"the Dask scheduler at {self._address} is gone ({why}); finished trials are kept, "
+            "and the same command runs the rest"
+        )

@@ -1,0 +1,224 @@
+"""An experiment's folder: what it is an experiment of, and finished trials as they finish.
+
+``experiment.json`` says what it is of. ``trials.jsonl`` holds a line a finished trial, written in
+one piece; of a process killed in between at most its last line is torn, and that trial runs again.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from tactile_tools.experiments.rows import Row, replace_file, whole
+from tactile_tools.experiments.spec import TrialSpec, spec_of
+
+FORMAT = 1
+"""Version of the folder's files; another one is refused."""
+
+FLUSH_S = 1.0
+"""s at most between a trial's end and its being safe from a loss of power; a kill loses nothing."""
+
+
+class FolderError(Exception):
+    """A folder that cannot be used: which, why, what to do."""
+
+
+class DiskError(Exception):
+    """Something could not be written: what, why, what became of the rest, what to do."""
+
+
+class Journal:
+    """The folder of one run, held so that no other process writes to it. A context manager.
+
+    ``definition``: what the experiment is of, plain JSON values. Raises FolderError for a folder
+    of another experiment, or of none, or in use, and DiskError.
+    """
+
+    def __init__(self, directory: Path, definition: Mapping[str, Any]) -> None:
+        self.directory = directory
+        self._lines = directory / "trials.jsonl"
+        self._lock: int | None = None
+        self._stream: int | None = None
+        self._flushed = 0.0
+        self.damaged = 0
+        wanted = {"format": FORMAT, **definition}
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            self._hold()
+            path = directory / "experiment.json"
+            if path.exists():
+                _compare(directory, read_definition(directory), wanted)
+            else:
+                _refuse_strangers(directory)
+                replace_file(path, (json.dumps(wanted, indent=1) + "\n").encode())
+        except OSError as error:
+            self.close()
+            raise disk_error(directory, error) from error
+        except FolderError:
+            self.close()
+            raise
+
+    def __enter__(self) -> Journal:
+        """Ready to be written to."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Let go of the folder."""
+        self.close()
+
+    def load(self) -> dict[TrialSpec, Row]:
+        """Finished trials, and make the file ready for more; DiskError.
+
+        ``damaged`` then counts the lines that were no trials; theirs run again.
+        """
+        try:
+            data = self._lines.read_bytes() if self._lines.exists() else b""
+            finished, self.damaged = parse_lines(data)
+            if self.damaged:
+                kept = b"".join(_line(row) for row in finished.values())
+                replace_file(self._lines, kept)
+            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
+            self._stream = os.open(self._lines, flags, 0o644)
+        except OSError as error:
+            raise disk_error(self.directory, error) from error
+        return finished
+
+    def append(self, row: Row) -> None:
+        """Keep ``row``; DiskError, after which the file is as it was before."""
+        if self._stream is None:
+            raise RuntimeError("load the journal before adding to it")
+        try:
+            _write_whole(self._stream, _line(row))
+            now = time.monotonic()
+            if now - self._flushed > FLUSH_S:
+                os.fdatasync(self._stream)
+                self._flushed = now
+        except OSError as error:
+            raise disk_error(self.directory, error) from error
+
+    def close(self) -> None:
+        """Let go of the folder; what was added stays."""
+        for descriptor in (self._stream, self._lock):
+            if descriptor is not None:
+                os.close(descriptor)
+        self._stream = self._lock = None
+
+    def _hold(self) -> None:
+        """Take the lock, which the system lets go of when the process is gone, however it goes."""
+        self._lock = os.open(
+            self.directory / ".lock", os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644
+        )
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise FolderError(
+                f"another run is writing to {self.directory}: wait for it, or choose another --out"
+            ) from None
+
+
+def read_definition(directory: Path) -> dict[str, Any]:
+    """What ``directory`` is an experiment of; FolderError."""
+    path = directory / "experiment.json"
+    try:
+        raw = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise FolderError(
+            f"{directory} is no folder of an experiment: cannot read {path.name} ({error})"
+        ) from None
+    if not isinstance(raw, dict) or raw.get("format") != FORMAT:
+        found = raw.get("format") if isinstance(raw, dict) else type(raw).__name__
+        raise FolderError(
+            f"{directory} is an experiment in format {found!r}; this version reads {FORMAT}: "
+            "choose another folder"
+        )
+    return raw
+
+
+def read_lines(directory: Path) -> dict[TrialSpec, Row]:
+    """Finished trials of a run that need not be over; FolderError."""
+    path = directory / "trials.jsonl"
+    try:
+        return parse_lines(path.read_bytes())[0]
+    except OSError as error:
+        raise FolderError(f"cannot read {path}: {error.strerror}") from None
+
+
+def parse_lines(data: bytes) -> tuple[dict[TrialSpec, Row], int]:
+    """Finished trials in ``data``, and how many lines held none."""
+    finished: dict[TrialSpec, Row] = {}
+    damaged = 0
+    for line in data.splitlines(keepends=True):
+        try:
+            row = json.loads(line) if line.endswith(b"\n") else None
+        except ValueError:
+            row = None
+        if isinstance(row, dict) and whole(row):
+            finished[spec_of(row)] = row
+        else:
+            damaged += 1
+    return finished, damaged
+
+
+def disk_error(directory: Path, error: OSError) -> DiskError:
+    """What to tell the user about ``error``."""
+    kept = "finished trials are kept, and the same command runs the rest"
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return DiskError(f"the disk of {directory} is full: make room; {kept}")
+    return DiskError(f"cannot write to {directory}: {error.strerror}; {kept}")
+
+
+def _line(row: Row) -> bytes:
+    return json.dumps(row, separators=(",", ":")).encode() + b"\n"
+
+
+def _write_whole(stream: int, line: bytes) -> None:
+    """Write ``line`` or, on a full disk, nothing of it."""
+    written = os.write(stream, line)
+    if written == len(line):
+        return
+    size = os.fstat(stream).st_size
+    os.ftruncate(stream, size - written)
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _compare(directory: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """FolderError that names what differs."""
+    # Through JSON, as a tuple comes back as a list.
+    wanted = json.loads(json.dumps(wanted))
+    names = [n for n in dict.fromkeys([*found, *wanted]) if found.get(n) != wanted.get(n)]
+    if names:
+        differences = "; ".join(
+            f"{n} is {_short(found.get(n))} there and {_short(wanted.get(n))} here" for n in names
+        )
+        raise FolderError(
+            f"{directory} holds another experiment ({differences}): choose another --out, "
+            "or give the same options to resume it"
+        )
+
+
+def _refuse_strangers(directory: Path) -> None:
+    """FolderError for a folder with files of somebody else's."""
+    others = sorted(p.name for p in directory.iterdir() if p.name != ".lock")
+    if others:
+        shown: Sequence[str] = others[:3]
+        raise FolderError(
+            f"{directory} is no folder of an experiment and not empty (it has {', '.join(shown)}"
+            f"{', …' if len(others) > 3 else ''}): choose another --out"
+        )
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 60 else text[:57] + "…"

@@ -1,0 +1,171 @@
+"""Runs the trials of a study that are not finished yet, and writes the tables when all are."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tactile_tools.experiments.backends import Backend
+from tactile_tools.experiments.conditions import build_scene, parameters_of, world_of
+from tactile_tools.experiments.journal import Journal, disk_error
+from tactile_tools.experiments.rows import Row, replace_file, sort_rows, write_tables
+from tactile_tools.experiments.spec import TrialSpec
+from tactile_tools.experiments.studies import Study
+from tactile_tools.experiments.trial import software_version
+
+REFERENCE_CPU = 0.30
+"""CPU-s that the authors' simulator needs for a simulated second, without making the scene."""
+
+Progress = Callable[[int, int, Row | None], None]
+"""Called with trials finished, trials in all, and the row that was finished just now."""
+
+
+class StudyError(ValueError):
+    """A study that cannot be run as it was asked for."""
+
+
+def check(study: Study) -> None:
+    """Refuse what every trial would fail of, before the first: StudyError, or ValueError."""
+    if not study.specs:
+        raise StudyError("the experiment has no trials: at least one scene and one strategy")
+    import numpy as np
+
+    from reachd.strategies import load_strategy
+
+    seen: set[object] = set()
+    for spec in study.specs:
+        parts: tuple[tuple[object, Callable[[TrialSpec], object]], ...] = (
+            (("parameters", spec.set, spec.parameters, spec.conditions), parameters_of),
+            (
+                ("strategy", spec.strategy, spec.set),
+                lambda s: load_strategy(s.strategy, s.resolved(), np.random.default_rng(0)),
+            ),
+            (("depth", spec.depth), lambda s: s.typed_depth),
+            (("source", spec.source), _check_source),
+            (("engine", spec.engine), _check_engine),
+        )
+        for key, examine in parts:
+            if key not in seen:
+                seen.add(key)
+                examine(spec)
+
+
+def _check_source(spec: TrialSpec) -> None:
+    """A scene that cannot be made is a row; a source that does not exist is a wrong argument."""
+    try:
+        build_scene(spec.source, spec.scene_seed, None)
+    except RuntimeError:
+        return
+
+
+def _check_engine(spec: TrialSpec) -> None:
+    from dataclasses import replace
+
+    spec.typed_engine  # noqa: B018 - raises where there is no such engine
+    try:
+        scene = build_scene(spec.source, spec.scene_seed, None)
+    except RuntimeError:
+        return
+    world_of(replace(spec, conditions="{}"), replace(scene, objects=()))
+
+
+def run_study(
+    study: Study,
+    directory: Path,
+    backend: Backend,
+    progress: Progress,
+    *,
+    retry: bool = False,
+) -> dict[str, Any]:
+    """Run what is not finished in ``directory``, write tables and summary, return the summary.
+
+    ``retry``: run trials again that ended in an error. FolderError, DiskError, BackendError; what
+    was finished by then is kept.
+    """
+    began = time.perf_counter()
+    with Journal(directory, study.definition) as journal:
+        finished = journal.load()
+        if retry:
+            finished = {spec: row for spec, row in finished.items() if row["error"] is None}
+        rest = [spec for spec in study.specs if spec not in finished]
+        before = len(study.specs) - len(rest)
+        rows = {spec: finished[spec] for spec in study.specs if spec in finished}
+        progress(before, len(study.specs), None)
+        workers = 0
+        if rest:
+            with backend:
+                workers = backend.workers
+                for row in backend.run(rest):
+                    journal.append(row)
+                    rows[_key(row)] = row
+                    progress(len(rows), len(study.specs), row)
+        table = sort_rows(list(rows.values()))
+        summary = summarize(table)
+        summary["this_session"] = {
+            "trials": len(rest),
+            "workers": workers,
+            "wall_s": round(time.perf_counter() - began, 2),
+            "resumed": before,
+            "damaged_lines": journal.damaged,
+        }
+        try:
+            write_tables(table, directory)
+            replace_file(
+                directory / "summary.json", (json.dumps(summary, indent=1) + "\n").encode()
+            )
+        except OSError as error:
+            raise disk_error(directory, error) from error
+    return summary
+
+
+def _key(row: Row) -> TrialSpec:
+    from tactile_tools.experiments.spec import spec_of
+
+    return spec_of(row)
+
+
+def summarize(rows: Sequence[Row]) -> dict[str, Any]:
+    """What the rows took: CPU, speed beside the authors' simulator, memory of the workers."""
+    good = [row for row in rows if row["error"] is None]
+    cpu = sum(row["cpu_s"] for row in good)
+    scenes = sum(row["scene_cpu_s"] for row in good)
+    simulated = sum(row["simulated_s"] for row in good)
+    return {
+        "version": software_version(),
+        "versions_of_rows": sorted({row["version"] for row in rows if row["version"]}),
+        "trials": len(rows),
+        "errors": len(rows) - len(good),
+        "cpu_s": round(cpu, 2),
+        "scene_cpu_s": round(scenes, 2),
+        "simulated_s": round(simulated, 2),
+        "trials_per_core_minute": round(60 * len(good) / (cpu + scenes), 2) if good else None,
+        "cpu_s_per_simulated_s": round(cpu / simulated, 5) if simulated else None,
+        "speedup_vs_reference": round(REFERENCE_CPU * simulated / cpu, 2) if cpu else None,
+        "memory": memory_of(good),
+    }
+
+
+def memory_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Resident memory of the workers: peak, and growth by a line through each one's course.
+
+    ``growth_mb_per_1000``: the greatest of workers with at least 20 trials, the first five left
+    out as caches fill; None where there is no such worker.
+    """
+    import numpy as np
+
+    courses: dict[str, list[tuple[int, float]]] = {}
+    for row in rows:
+        courses.setdefault(row["worker"], []).append((row["worker_trials"], row["memory_mb"]))
+    slopes = []
+    for course in courses.values():
+        ordered = np.array(sorted(course))[5:]
+        if len(ordered) >= 15:
+            slopes.append(1000 * float(np.polyfit(ordered[:, 0], ordered[:, 1], 1)[0]))
+    return {
+        "workers": len(courses),
+        "peak_mb": max((row["memory_mb"] for row in rows), default=None),
+        "growth_mb_per_1000": round(max(slopes), 2) if slopes else None,
+    }
