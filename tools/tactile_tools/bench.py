@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -22,21 +23,76 @@ Figures = dict[str, float]
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Figures measured together by ``function`` of ``module``, which takes ``quick``."""
+    """Figures measured together by ``function`` of ``module``, which takes ``quick``.
+
+    ``promised``: those of its figures that have an aim.
+    """
 
     name: str
     module: str
     function: str
     what: str
+    promised: tuple[str, ...] = ()
 
 
 GROUPS = (
-    Group("decode", "bench_wire", "bench_decode", "serial frames of 250 bytes"),
-    Group("anyskin", "bench_wire", "bench_anyskin", "the AnySkin stream, beside its own host loop"),
-    Group("pipeline", "bench_sensing", "bench_pipeline", "bytes to features, 4 arrays × 16 taxels"),
-    Group("consensus", "bench_sensing", "bench_consensus", "consensus beside RANSAC"),
-    Group("rotation", "bench_sensing", "bench_rotation", "a turn through 360° in a 50 µT field"),
-    Group("latency", "bench_latency", "bench_latency", "pty to features in another process"),
+    Group("decode", "bench_wire", "bench_decode", "serial frames of 250 bytes", ("decode_fps",)),
+    Group(
+        "anyskin",
+        "bench_wire",
+        "bench_anyskin",
+        "the AnySkin stream, beside its own host loop",
+        ("anyskin_speedup",),
+    ),
+    Group(
+        "pipeline",
+        "bench_sensing",
+        "bench_pipeline",
+        "bytes to features, 4 arrays × 16 taxels",
+        ("pipeline_ms_p50", "pipeline_ms_p99"),
+    ),
+    Group(
+        "consensus",
+        "bench_sensing",
+        "bench_consensus",
+        "consensus beside RANSAC",
+        ("consensus_speedup", "consensus_residual_ratio"),
+    ),
+    Group(
+        "rotation",
+        "bench_sensing",
+        "bench_rotation",
+        "a turn through 360° in a 50 µT field",
+        ("rotation_consensus_rms_n_25", "rotation_contact_bias_pct_25"),
+    ),
+    Group(
+        "latency",
+        "bench_latency",
+        "bench_latency",
+        "pty to features in another process",
+        ("wire_to_feature_floor_ratio", "wire_to_feature_ms_p99"),
+    ),
+    Group(
+        "reach",
+        "bench_reach",
+        "bench_reach_speed",
+        "reaches in lockstep among 25 objects",
+        ("reach_rtf_contacts", "reach_rtf_taxels"),
+    ),
+    Group(
+        "live",
+        "bench_reach",
+        "bench_reach_live",
+        "punctuality of a reach in three processes",
+        ("loop_late_ms_p99", "loop_late_ms_p99.9", "wire_to_twist_ms_p99"),
+    ),
+    Group(
+        "stop",
+        "bench_stop",
+        "bench_stop",
+        "standing still after SIGSTOP and SIGKILL of each process",
+        ("stop_ms_max_features", "stop_ms_max_arm_state", "stop_ms_max_commands"),
+    ),
     Group("soak", "bench_soak", "bench_soak", "memory over an hour of simulated frames"),
 )
 
@@ -64,6 +120,14 @@ AIMS: Mapping[str, Aim] = {
     "rotation_contact_bias_pct_25": Aim("≤", 5.0),
     "wire_to_feature_floor_ratio": Aim("≤", 2.0),
     "wire_to_feature_ms_p99": Aim("≤", 5.0),
+    "reach_rtf_contacts": Aim("≥", 80),
+    "reach_rtf_taxels": Aim("≥", 30),
+    "loop_late_ms_p99": Aim("≤", 5.0),
+    "loop_late_ms_p99.9": Aim("≤", 10.0),
+    "wire_to_twist_ms_p99": Aim("≤", 20.0),  # 10 ms and the loop's period
+    "stop_ms_max_features": Aim("≤", 200.0),
+    "stop_ms_max_arm_state": Aim("≤", 50.0),
+    "stop_ms_max_commands": Aim("≤", 100.0),
 }
 
 
@@ -77,18 +141,36 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         + "; ".join(f"{g.name} ({g.what})" for g in GROUPS)
         + ".",
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
+    parser.add_argument(
+        "--json",
+        type=Path,
+        metavar="FILE",
+        help="write the figures to FILE; with --only, those of other groups in it are kept",
+    )
     parser.add_argument(
         "--only",
         nargs="+",
-        choices=[g.name for g in GROUPS],
-        metavar="GROUP",
-        help="measure these groups only",
+        type=_group_of,
+        metavar="NAME",
+        help="measure these groups only, or the groups of these figures",
     )
     parser.add_argument(
-        "--quick", action="store_true", help="shorter runs (about a minute in all); rougher figures"
+        "--quick",
+        action="store_true",
+        help="shorter runs (some minutes in all); rougher figures",
     )
     parser.set_defaults(func=run)
+
+
+def _group_of(name: str) -> str:
+    """Name of the group that is called ``name`` or has a figure called so."""
+    for group in GROUPS:
+        if name in (group.name, *group.promised):
+            return group.name
+    groups = ", ".join(g.name for g in GROUPS)
+    raise argparse.ArgumentTypeError(
+        f"{name!r} is no group and no figure; groups: {groups}; figures: {', '.join(AIMS)}"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -102,7 +184,13 @@ def run(options: argparse.Namespace) -> int:
             file=sys.stderr,
         )
         return 2
+    try:
+        kept = {} if options.only is None else _earlier(options.json)
+    except ValueError as error:
+        print(f"tactile bench: --json {options.json}: {error}", file=sys.stderr)
+        return 2
     figures: Figures = {}
+    loads: dict[str, object] = {}
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=console) as progress:
         for number, group in enumerate(chosen, 1):
@@ -110,28 +198,55 @@ def run(options: argparse.Namespace) -> int:
             function: Callable[..., Figures] = getattr(
                 import_module(f"tactile_tools.{group.module}"), group.function
             )
+            before = os.getloadavg()[0]
             try:
                 figures |= function(quick=options.quick)
             except (RuntimeError, OSError) as error:
                 print(f"tactile bench: {group.name}: {error}", file=sys.stderr)
                 return 3
+            loads[group.name] = {
+                "load_before": round(before, 2),
+                "load_after": round(os.getloadavg()[0], 2),
+                "quick": options.quick,
+            }
             progress.update(task, total=1, completed=1)
     console.print(table(figures))
+    console.print(f"load average (1 min) while measuring: {_range_of_loads(loads)}")
     if options.json is not None:
+        all_figures = kept.get("figures", {}) | figures
         report = {
             "version": version("tactile-reach"),
             "machine": machine(),
             "quick": options.quick,
-            "figures": figures,
+            "figures": all_figures,
             "aims": {
-                key: {"relation": a.relation, "bound": a.bound, "met": a.met(figures[key])}
+                key: {"relation": a.relation, "bound": a.bound, "met": a.met(all_figures[key])}
                 for key, a in AIMS.items()
-                if key in figures
+                if key in all_figures
             },
+            "groups": kept.get("groups", {}) | loads,
         }
         options.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
         console.print(f"wrote {options.json}")
     return 0
+
+
+def _earlier(path: Path | None) -> dict[str, Any]:
+    """Return the report that is in ``path``, empty where there is none; ValueError."""
+    if path is None or not path.exists():
+        return {}
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"cannot be read, so cannot be added to: {error}") from error
+    if not isinstance(report, dict) or not isinstance(report.get("figures"), dict):
+        raise ValueError("is no report of this command: name another file")
+    return report
+
+
+def _range_of_loads(loads: Mapping[str, Any]) -> str:
+    values = [v for group in loads.values() for v in (group["load_before"], group["load_after"])]
+    return f"{min(values):.2f} to {max(values):.2f}" if values else "none"
 
 
 def machine() -> dict[str, object]:
