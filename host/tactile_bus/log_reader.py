@@ -53,6 +53,8 @@ FOOTER_SIZE = 9 + 20
 class LogReader:
     """One pass over a log, as a context manager. `LogError` when the file is none.
 
+    ``window``: log times, ns, first and last included; chunks wholly outside may be passed over.
+
     After the pass: ``schemas`` and ``channels`` by number, ``closed`` (the file was finished in
     order), ``damages`` (the first MAX_DAMAGES) and their ``damage_count``, ``bytes_damaged``,
     ``messages_lost`` as far as indexes tell, ``lost_unknown`` places where they do not.
@@ -60,6 +62,7 @@ class LogReader:
 
     path: Path
     progress: Progress | None = None
+    window: tuple[int, int] | None = None
     size: int = 0
     closed: bool = False
     profile: str = ""
@@ -160,6 +163,11 @@ class LogReader:
             first = self._bytes.find_chunk(0)
             if op.MAGIC.startswith(magic):
                 raise LogError(f"{self.path} is cut off after {self.size} bytes: nothing to read")
+            if magic[:5] == op.MAGIC[:5] and magic[6:] == op.MAGIC[6:]:
+                raise LogError(
+                    f"{self.path} is in version {chr(magic[5])!r} of the MCAP format, this program "
+                    "reads version '0': update it"
+                )
             if first is None:
                 raise LogError(f"{self.path} is no MCAP file")
             self._damaged(Damage(0, first, "the start of the file is overwritten"))
@@ -287,6 +295,10 @@ class LogReader:
         if head.size > MAX_CHUNK or length > MAX_CHUNK:
             self._lose_chunk(position, after, head, f"a chunk of {head.size} bytes")
             return after, None
+        if self.window is not None and self._summary_checked:  # else it may define channels
+            first, last = self.window
+            if head.end_ns < first or head.start_ns > last:
+                return after, None
         try:
             data = unpack(self.read_at(place, head.data_length), head)
         except BadRecordError as error:

@@ -101,7 +101,7 @@ def test_a_cut_log_is_recovered_to_a_new_file(tactile: Any, path: Path) -> None:
     assert json.loads(tactile("info", target, "--json").stdout)["whole"] is True
     again = tactile("recover", path)
     assert again.returncode == 2
-    assert "exists and is not overwritten: name another with --out" in again.stderr
+    assert "exists and is not overwritten: name another" in again.stderr
     same = tactile("recover", path, "--out", path)
     assert same.returncode == 2
     assert path.read_bytes() == before
@@ -141,8 +141,8 @@ def test_what_is_no_log_is_refused_with_2(
 def test_missing_files_directories_and_devices(tactile: Any, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for place, text in (
-        (tmp_path / "none.mcap", "name a file that exists"),
-        (tmp_path, "name one .mcap file in it"),
+        (tmp_path / "none.mcap", "none.mcap does not exist; name a file, a folder of logs"),
+        (tmp_path, "is a folder without a readable .mcap file"),
         (Path("/dev/zero"), "no file but a device or a pipe"),
         (tmp_path / "pipe", "no file but a device or a pipe"),
     ):

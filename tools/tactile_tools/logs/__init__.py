@@ -1,0 +1,1 @@
+"""``tactile log``: one module a subcommand, over what all of them share."""
