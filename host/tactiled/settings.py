@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
@@ -277,22 +277,33 @@ def _calibrations(
     return unique
 
 
-def _pipeline(options: argparse.Namespace, file: ConfigFile, path: Path | None) -> PipelineSettings:
+def pipeline_settings(file: ConfigFile) -> PipelineSettings:
+    """Settings of the sensing core in a file; ValueError names the first that cannot be used."""
     s, c = file.sensing, file.compensation
+    return PipelineSettings(
+        method=c.method,
+        compensation_rate_hz=c.rate,
+        feature_rate_hz=s.feature_rate,
+        contact_minimum_n=s.contact_minimum_n,
+        contact_sigmas=s.contact_sigmas,
+        tip_light_n=s.tip_light_n,
+        frozen_after_s=s.frozen_after_s,
+        range_limit_ut=s.range_limit_ut,
+        tare_s=s.tare_s,
+        auto_tare=s.auto_tare,
+        rest_tracking_s=s.rest_tracking_s,
+        hold_s=s.hold_s,
+    )
+
+
+def _pipeline(options: argparse.Namespace, file: ConfigFile, path: Path | None) -> PipelineSettings:
     try:
-        return PipelineSettings(
-            method=options.compensation or c.method,
-            compensation_rate_hz=options.compensation_rate or c.rate,
-            feature_rate_hz=options.feature_rate or s.feature_rate,
-            contact_minimum_n=s.contact_minimum_n,
-            contact_sigmas=s.contact_sigmas,
-            tip_light_n=s.tip_light_n,
-            frozen_after_s=s.frozen_after_s,
-            range_limit_ut=s.range_limit_ut,
-            tare_s=s.tare_s,
-            auto_tare=s.auto_tare,
-            rest_tracking_s=s.rest_tracking_s,
-            hold_s=s.hold_s,
+        settings = pipeline_settings(file)
+        return replace(
+            settings,
+            method=options.compensation or settings.method,
+            compensation_rate_hz=options.compensation_rate or settings.compensation_rate_hz,
+            feature_rate_hz=options.feature_rate or settings.feature_rate_hz,
         )
     except ValueError as error:
         raise SettingsError(f"{path}: {error}" if path is not None else str(error)) from error
