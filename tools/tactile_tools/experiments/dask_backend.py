@@ -71,7 +71,7 @@ class DaskCluster:
 
         waiting = deque(batches(specs, BATCH))
         asked: dict[Any, list[TrialSpec]] = {}
-        done = as_completed([])
+        done = as_completed([], loop=self._client.loop)
         try:
             while waiting or asked:
                 while waiting and len(asked) < AHEAD * self.workers:

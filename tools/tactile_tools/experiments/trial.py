@@ -39,7 +39,7 @@ def run_one(
     row["scene_cpu_s"] = 0.0
     try:
         scene = scene_of(spec)
-        row["scene_cpu_s"] = time.thread_time() - began
+        row["scene_cpu_s"] = round(time.thread_time() - began, 4)
         began = time.thread_time()
         result = run_trial(
             scene,

@@ -1,0 +1,171 @@
+"""What the rows of a strategies study say, in plain words: every sentence follows from the data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from statistics import fmean
+
+from tactile_tools.experiments.document import listed, shown_p, spoken
+from tactile_tools.experiments.reference import PAPER_EJECTED, Reference
+from tactile_tools.experiments.rows import Row
+from tactile_tools.experiments.statistics import (
+    SIGNIFICANT,
+    PairedValues,
+    Rate,
+    contrast,
+)
+
+ByStrategy = Mapping[str, Sequence[Row]]
+
+
+def rate_of(rows: Sequence[Row], column: str = "success") -> Rate:
+    """How often ``column`` is true."""
+    return Rate(sum(bool(row[column]) for row in rows), len(rows))
+
+
+def means_of(rows: ByStrategy, column: str) -> dict[str, float]:
+    """Mean of ``column`` by strategy."""
+    return {name: fmean(row[column] for row in of) for name, of in rows.items() if of}
+
+
+def worst_is_straight(
+    means: Mapping[str, float], pairs: Sequence[PairedValues], what: str, unit: str
+) -> str:
+    """Whether straight is significantly worst in a measure where less is better."""
+    others = [name for name in means if name != "straight"]
+    if "straight" not in means or not others:
+        return ""
+    against = {pair.b if pair.a == "straight" else pair.a: pair for pair in pairs
+               if "straight" in (pair.a, pair.b)}  # fmt: skip
+    worse = {n: _signed(against[n], "straight") for n in others}
+    clear = [n for n in others if worse[n] > 0 and against[n].adjusted < SIGNIFICANT]
+    rest = [n for n in others if n not in clear]
+    spread = _range([means[n] for n in others])
+    start = f"In {what}, straight has a mean of {means['straight']:.3f}{unit}, the others {spread}"
+    if not rest:
+        p = max(against[n].adjusted for n in others)
+        return f"{start}: it is significantly worse than each of them (p ≤ {_p(p)})."
+    told = []
+    for n in rest:
+        pair = against[n]
+        how = "significantly better than" if pair.adjusted < SIGNIFICANT else "no clear loser to"
+        if pair.adjusted < SIGNIFICANT or worse[n] > 0:
+            told.append(f"{how} {spoken(n)} (p = {_p(pair.adjusted)})")
+        else:
+            told.append(f"not worse than {spoken(n)} (p = {_p(pair.adjusted)})")
+    if clear:
+        beaten = f"it is significantly worse than {listed([spoken(n) for n in clear])}, but "
+    else:
+        beaten = "it is "
+    return f"{start}: {beaten}{listed(told)}."
+
+
+def faster_by_touch(means: Mapping[str, float], pairs: Sequence[PairedValues]) -> str:
+    """Whether hybrid event is significantly faster than hybrid clock."""
+    pair = _pair(pairs, "hybrid_clock", "hybrid_event")
+    if pair is None:
+        return ""
+    gain = _signed(pair, "hybrid_clock")
+    figures = (
+        f"mean normalised time {means['hybrid_event']:.3f} against {means['hybrid_clock']:.3f}, "
+        f"p = {_p(pair.adjusted)}"
+    )
+    if pair.adjusted >= SIGNIFICANT:
+        return f"Hybrid event is not significantly faster than hybrid clock ({figures})."
+    how = "faster" if gain > 0 else "slower"
+    return f"Hybrid event, guided by touch, is significantly {how} than hybrid clock ({figures})."
+
+
+def order_of_success(rates: Mapping[str, Rate], reference: Reference | None) -> str:
+    """From least to most successful, and the paper's order beside it."""
+    ranked = sorted(rates, key=lambda name: rates[name].value)
+    text = "By success, from least to most: " + ", ".join(
+        f"{spoken(n)} {100 * rates[n].value:.0f} %" for n in ranked
+    )
+    if reference is None or not set(reference.success) >= set(rates):
+        return text + "."
+    theirs = sorted(rates, key=lambda name: reference.success[name].value)
+    if theirs == ranked:
+        return f"{text}. The order is the paper's."
+    order = ", ".join(spoken(n) for n in theirs)
+    return f"{text}. The paper's order is {order}."
+
+
+def beside(rates: Mapping[str, Rate], reference: Reference, column: str = "success") -> str:
+    """Which rates differ from those of ``reference`` beyond chance."""
+    theirs = reference.success if column == "success" else reference.entered
+    differ, agree = [], []
+    for name, rate in rates.items():
+        if name not in theirs:
+            continue
+        p = contrast(rate, theirs[name]).p
+        if p < SIGNIFICANT:
+            word = "above" if rate.value > theirs[name].value else "below"
+            differ.append(
+                f"{spoken(name)} ({100 * rate.value:.0f} %, {word} its "
+                f"{100 * theirs[name].value:.0f} %, p = {_p(p)})"
+            )
+        else:
+            agree.append(spoken(name))
+    what = f"the success in {reference.what}"
+    if not differ and not agree:
+        return ""
+    if not differ:
+        return f"No rate differs significantly from {what}."
+    told = f"Significantly different from {what}: {listed(differ)}"
+    return told + (f"; not different: {listed(agree)}." if agree else ".")
+
+
+def solved_by_touch(rows: ByStrategy) -> str:
+    """The paper's count: scenes that event alone fails, and that others fail and event does not."""
+    if "hybrid_event" not in rows or len(rows) < 2:
+        return ""
+    solved = {name: {r["scene_seed"] for r in of if r["success"]} for name, of in rows.items()}
+    seen = set.intersection(*({r["scene_seed"] for r in of} for of in rows.values()))
+    event = solved.pop("hybrid_event")
+    lost = len((set.union(*solved.values()) - event) & seen)
+    gained = {name: len((event - of) & seen) for name, of in solved.items()}
+    least = min(gained, key=lambda name: gained[name])
+    every = len((event | set.union(*solved.values())) & seen)
+    return (
+        f"Of {len(seen)} scenes, {every} were solved by at least one strategy. Hybrid event failed "
+        f"in {lost} that another strategy solved; every other strategy failed in at least "
+        f"{gained[least]} that hybrid event solved (the least is {spoken(least)})."
+    )
+
+
+def pushed_out(rows: ByStrategy) -> str:
+    """Objects pushed out of the front by the two hybrids, beside the paper's."""
+    if not {"hybrid_clock", "hybrid_event"} <= set(rows):
+        return ""
+    told, counts = [], {}
+    for name in ("hybrid_clock", "hybrid_event"):
+        counts[name] = 25 * fmean(row["ejected"] for row in rows[name])
+        objects, trials = PAPER_EJECTED[name]
+        told.append(f"{spoken(name)} {counts[name]:.1f} (paper, hardware: {objects} in {trials})")
+    same = (counts["hybrid_clock"] > counts["hybrid_event"]) == (
+        PAPER_EJECTED["hybrid_clock"][0] > PAPER_EJECTED["hybrid_event"][0]
+    )
+    verdict = "as in the paper, touch disturbs less" if same else "unlike in the paper"
+    return f"Objects pushed out of the front, per 25 trials: {listed(told)}; {verdict}."
+
+
+def _pair(pairs: Sequence[PairedValues], a: str, b: str) -> PairedValues | None:
+    for pair in pairs:
+        if {pair.a, pair.b} == {a, b}:
+            return pair
+    return None
+
+
+def _signed(pair: PairedValues, name: str) -> float:
+    """Rank effect of ``name`` over the other: positive where its values are greater."""
+    return pair.effect if pair.a == name else -pair.effect
+
+
+def _range(values: Sequence[float]) -> str:
+    low, high = min(values), max(values)
+    return f"{low:.3f}" if len(values) == 1 else f"{low:.3f} to {high:.3f}"
+
+
+def _p(p: float) -> str:
+    return shown_p(p)
