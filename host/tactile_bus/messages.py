@@ -105,11 +105,14 @@ class Codec:
     def __init__(self) -> None:
         self._store = get_typestore(Stores.ROS2_HUMBLE)
         own = {}
+        self._notes: dict[str, dict[str, str]] = {}
         for entry in sorted(resources.files("tactile_bus").joinpath("msg").iterdir(), key=str):
             stem, _, extension = entry.name.rpartition(".")
             if extension == "msg":
                 name = f"{OWN_PACKAGE}/msg/{stem}"
-                own.update(get_types_from_msg(entry.read_text(encoding="utf-8"), name))
+                text = entry.read_text(encoding="utf-8")
+                own.update(get_types_from_msg(text, name))
+                self._notes[f"{OWN_PACKAGE}/{stem}"] = _notes(text)
         self._store.register(own)
         self._arrays: dict[str, tuple[tuple[str, np.dtype[Any]], ...]] = {}
         self._schemas: dict[str, Schema] = {}
@@ -174,9 +177,20 @@ class Codec:
                 type_hash = self._store.hash_rihs01(msgtype)
             except TypesysError:
                 raise ValueError(f"no message type {msgtype!r}") from None
-            schema = Schema(msgtype, "ros2msg", text.encode(), type_hash)
+            schema = Schema(msgtype, "ros2msg", self._annotate(msgtype, text).encode(), type_hash)
             self._schemas[msgtype] = schema
         return schema
+
+    def _annotate(self, msgtype: str, text: str) -> str:
+        """Put the remarks of our own definitions, with their units, beside the fields again."""
+        notes = self._notes.get(msgtype.replace("/msg/", "/"), {})
+        lines = []
+        for line in text.splitlines():
+            if line.startswith("MSG: "):
+                notes = self._notes.get(line.removeprefix("MSG: ").strip(), {})
+            note = notes.get(line.rpartition(" ")[2].partition("=")[0])
+            lines.append(f"{line}  # {note}" if note else line)
+        return "\n".join(lines) + "\n"
 
     def _find_arrays(self, msgtype: str) -> tuple[tuple[str, np.dtype[Any]], ...]:
         """Fields of a type that must be numpy arrays: a same-sized wrong type encodes silently."""
@@ -190,6 +204,16 @@ class Codec:
                 if element[0] == 1 and element[1][0] in NUMBER_TYPES:  # of base type
                     found.append((name, np.dtype(NUMBER_TYPES[element[1][0]])))
         return tuple(found)
+
+
+def _notes(definition: str) -> dict[str, str]:
+    """Remarks behind the fields of a ``.msg`` file, by field."""
+    found = {}
+    for line in definition.splitlines():
+        field, _, remark = line.partition("#")
+        if field.strip() and remark.strip():
+            found[field.split()[1].partition("=")[0]] = remark.strip()
+    return found
 
 
 _building = threading.Lock()

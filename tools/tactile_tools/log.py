@@ -15,6 +15,7 @@ COMMANDS = (
     "doctor",
     "recover",
     "cat",
+    "export",
     "reprocess",
 )
 """Modules of `tactile_tools.logs` that add a subcommand; each defines ``add(commands)``."""

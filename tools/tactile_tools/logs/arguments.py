@@ -43,15 +43,15 @@ def add_files(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_selection(parser: argparse.ArgumentParser) -> None:
-    """Add --topic, --from and --to."""
+def add_selection(parser: argparse.ArgumentParser, until: str = "--to") -> None:
+    """Add --topic, --from and --to (``until`` where that means something else)."""
     parser.add_argument(
         "--topic",
         action="append",
         metavar="PATTERN",
         help="only these, with * and ? (quote them); may be repeated",
     )
-    for name, which in (("--from", "first"), ("--to", "last")):
+    for name, which in (("--from", "first"), (until, "last")):
         parser.add_argument(
             name,
             dest=f"{which}_time",
@@ -68,9 +68,11 @@ def select(options: argparse.Namespace) -> Selection:
     window = None
     if options.first_time is not None or options.last_time is not None:
         first = 0 if options.first_time is None else moment("--from", options.first_time, start)
-        last = END_NS if options.last_time is None else moment("--to", options.last_time, start)
+        last = END_NS if options.last_time is None else moment("end", options.last_time, start)
         if first > last:
-            raise ToolError(f"--from {options.first_time} is after --to {options.last_time}")
+            raise ToolError(
+                f"the time {options.first_time} is after {options.last_time}: nothing is between"
+            )
         window = (first, last)
     return Selection(logs, matcher(options.topic), window, start)
 

@@ -1,0 +1,150 @@
+"""Messages as columns: nested fields flattened, times as nanoseconds, notes from the definitions.
+
+A column holds numbers, texts, a list of numbers or of texts a row, or the rows of a nested table.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from operator import attrgetter
+from typing import Any, Literal
+
+import numpy as np
+
+from tactile_bus.messages import NUMBER_TYPES
+from tactile_tools.logs.decode import ARRAY, BASE, NAME, SEQUENCE, TIMES, Reader, plain
+from tactile_tools.logs.stream import Stream
+
+Kind = Literal["number", "text", "numbers", "texts", "rows"]
+
+FIELD_LINE = re.compile(
+    r"^\s*([A-Za-z][\w/]*(?:<=\d+)?(?:\[[^\]]*\])?)\s+([a-z]\w*)\b[^#=]*(?:#\s*(.*))?$"
+)
+
+TIME_NOTE = "ns since the Unix epoch"
+
+
+@dataclass(slots=True)
+class Column:
+    """One column. ``get``: its value in a message; ``fields``: of each row, for ``rows``.
+
+    ``length``: of a list that always has as many elements, else None.
+    """
+
+    name: str
+    kind: Kind
+    get: Callable[[Any], Any]
+    dtype: np.dtype[Any] | None = None
+    note: str = ""
+    length: int | None = None
+    fields: list[Column] = field(default_factory=list)
+    to_plain: Callable[[Any], Any] = lambda value: value
+
+
+def plan(stream: Stream, reader: Reader) -> list[Column]:
+    """Columns of a stream's messages, in the order of their definition."""
+    if not reader.fields:
+        import json
+
+        return [Column("json", "text", lambda message: json.dumps(message, ensure_ascii=False))]
+    notes = comments(stream)
+    return _columns(reader.fields, reader.msgtype, "", "", notes)
+
+
+def _columns(
+    fields: dict[str, Any], msgtype: str, path: str, prefix: str, notes: dict[tuple[str, str], str]
+) -> list[Column]:
+    """``path``: attributes from the message to this part; ``prefix``: of the columns' names."""
+    out: list[Column] = []
+    for name, (kind, arguments) in fields[msgtype][1]:
+        here = f"{path}.{name}" if path else name
+        column = prefix + name
+        note = notes.get((msgtype, name), "")
+        get = attrgetter(here)
+        if kind == NAME:
+            if arguments in TIMES:
+                out.append(
+                    Column(f"{column}_ns", "number", _time(get), np.dtype(np.int64), TIME_NOTE)
+                )
+                continue
+            inner = _columns(fields, arguments, here, f"{column}.", notes)
+            for each in inner:
+                each.note = each.note or note
+            out += inner
+        elif kind == BASE:
+            out.append(_single(column, get, arguments[0], note))
+        elif kind in (ARRAY, SEQUENCE):
+            (inner_kind, inner_arguments), size = arguments
+            length = size if kind == ARRAY else None
+            if inner_kind == NAME:
+                out.append(_table(fields, column, get, inner_arguments, note, notes))
+            elif inner_arguments[0] in NUMBER_TYPES:
+                dtype = np.dtype(NUMBER_TYPES[inner_arguments[0]])
+                out.append(Column(column, "numbers", get, dtype, note, length))
+            else:
+                out.append(Column(column, "texts", get, None, note, length))
+    return out
+
+
+def _single(name: str, get: Callable[[Any], Any], base: str, note: str) -> Column:
+    if base in NUMBER_TYPES:
+        return Column(name, "number", get, np.dtype(NUMBER_TYPES[base]), note)
+    return Column(name, "text", get, None, note)
+
+
+def _time(get: Callable[[Any], Any]) -> Callable[[Any], int]:
+    def nanoseconds(message: Any) -> int:
+        time = get(message)
+        return int(time.sec) * 1_000_000_000 + int(time.nanosec)
+
+    return nanoseconds
+
+
+def _table(
+    fields: dict[str, Any],
+    name: str,
+    get: Callable[[Any], Any],
+    msgtype: str,
+    note: str,
+    notes: dict[tuple[str, str], str],
+) -> Column:
+    if msgtype in TIMES:
+
+        def times(message: Any) -> Any:
+            return np.array(
+                [int(t.sec) * 1_000_000_000 + int(t.nanosec) for t in get(message)], np.int64
+            )
+
+        return Column(f"{name}_ns", "numbers", times, np.dtype(np.int64), TIME_NOTE)
+    inner = _columns(fields, msgtype, "", "", notes)
+    return Column(
+        name, "rows", get, None, note, None, inner, lambda each: plain(each, fields, msgtype)
+    )
+
+
+def comments(stream: Stream) -> dict[tuple[str, str], str]:
+    """What the definition says of its fields, by type and field: units stand there."""
+    found: dict[tuple[str, str], str] = {}
+    msgtype = stream.msgtype
+    for line in stream.definition.decode("utf-8", "replace").splitlines():
+        if line.startswith("MSG: "):
+            package, _, name = line[5:].strip().rpartition("/")
+            msgtype = f"{package.removesuffix('/msg')}/msg/{name}"
+        elif (match := FIELD_LINE.match(line)) is not None and match[3]:
+            found[msgtype, match[2]] = match[3].strip()
+    return found
+
+
+def file_names(streams: Iterable[Stream], suffix: str) -> dict[Stream, str]:
+    """A file name for each stream, told apart where two have the same topic."""
+    names: dict[Stream, str] = {}
+    for stream in streams:
+        stem = re.sub(r"[^A-Za-z0-9-]+", "_", stream.topic).strip("_") or "topic"
+        name, number = f"{stem}{suffix}", 1
+        while name in names.values():
+            number += 1
+            name = f"{stem}_{number}{suffix}"
+        names[stream] = name
+    return names
