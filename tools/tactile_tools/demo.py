@@ -10,6 +10,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+import numpy as np
+
 from tactile_tools.processes import command, free_port, running, wait_for
 from tactile_tools.series import LogUnreadableError
 
@@ -52,15 +54,19 @@ def run(options: argparse.Namespace) -> int:
                 file=sys.stderr,
             )
             return 2
+    from reachd.parameters import parameters
+    from reachd.strategies import StrategyError, load_strategy
     from tactile_tools.plot_reach import draw_reach
 
     try:
+        # Before three processes are started in vain.
+        load_strategy(options.strategy, parameters(_set(options)), np.random.default_rng(0))
         with tempfile.TemporaryDirectory(prefix="tactile-demo-") as name:
             code = _run(options, Path(name))
         if code not in (0, 1):
             return code
         draw_reach(options.out, options.png)
-    except BadArgumentError as error:
+    except (BadArgumentError, StrategyError) as error:
         print(f"tactile demo: {error}", file=sys.stderr)
         return 2
     except (RuntimeError, OSError, LogUnreadableError) as error:
@@ -82,6 +88,11 @@ def _ask(words: list[str]) -> str:
     if done.returncode != 0:
         raise RuntimeError(done.stderr.strip() or f"{words[0]} ended with {done.returncode}")
     return done.stdout.strip()
+
+
+def _set(options: argparse.Namespace) -> str:
+    """Parameter set that belongs to the scene."""
+    return "hardware" if options.scene == "hardware" else "authors_sim"
 
 
 def _run(options: argparse.Namespace, folder: Path) -> int:
@@ -109,7 +120,7 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
         done = subprocess.run(
             [
                 *(reachd, "--strategy", options.strategy, "--target", goal),
-                *("--set", options.scene if options.scene == "hardware" else "authors_sim"),
+                *("--set", _set(options)),
                 *("--board", BOARD, "--seed", str(options.seed), "--log", str(options.out)),
                 *("--listen", reach, "--connect", arm, "--connect", skin),
             ],
