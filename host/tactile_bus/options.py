@@ -49,17 +49,18 @@ def add_log_and_bus(parser: argparse.ArgumentParser, port: int) -> None:
     _add_bus(add, port)
 
 
-def add_bus(parser: argparse.ArgumentParser, port: int) -> None:
-    """Add --listen, --connect and --insecure; ``port``: the role's own."""
+def add_bus(parser: argparse.ArgumentParser, port: int | None) -> None:
+    """Add --listen, --connect and --insecure; ``port``: the role's own, None for tools."""
     _add_bus(parser.add_argument_group("bus").add_argument, port)
 
 
-def _add_bus(add: Callable[..., object], port: int) -> None:
+def _add_bus(add: Callable[..., object], port: int | None) -> None:
+    default = "nowhere" if port is None else f"tcp/127.0.0.1:{port}"
     add(
         "--listen",
         action="append",
         metavar="ENDPOINT",
-        help=f"zenoh endpoint (default tcp/127.0.0.1:{port}); may be repeated",
+        help=f"zenoh endpoint to listen at (default {default}); may be repeated",
     )
     add(
         "--connect",

@@ -18,13 +18,11 @@ SHOWN = 6
 """Elements of an array shown to people; --json has them all."""
 
 
-def add(commands: Any) -> None:
-    """Add ``cat`` to ``tactile log``."""
-    parser: argparse.ArgumentParser = commands.add_parser(
-        "cat",
-        help="print messages, one a line",
-        description="Print the messages of a log, one a line: time since its start, topic, fields. "
-        "Several logs are printed in the order of time.",
+def fill(parser: argparse.ArgumentParser) -> None:
+    """Give ``tactile log cat`` its arguments."""
+    parser.description = (
+        "Print the messages of a log, one a line: time since its start, topic, fields. "
+        "Several logs are printed in the order of time."
     )
     add_files(parser)
     add_selection(parser)

@@ -51,14 +51,12 @@ class Finding:
     remedy: str = ""
 
 
-def add(commands: Any) -> None:
-    """Add ``doctor`` to ``tactile log``."""
-    parser: argparse.ArgumentParser = commands.add_parser(
-        "doctor",
-        help="what is wrong with a log, what can be had of it, what repairs it",
-        description="Read a log from end to end and say what is wrong with it, what of it can be "
+def fill(parser: argparse.ArgumentParser) -> None:
+    """Give ``tactile log doctor`` its arguments."""
+    parser.description = (
+        "Read a log from end to end and say what is wrong with it, what of it can be "
         "had all the same, and which command repairs it. Exit: 0 healthy, 1 it has faults, "
-        "2 bad argument or no log, 3 refused by the system.",
+        "2 bad argument or no log, 3 refused by the system."
     )
     add_files(parser)
     parser.add_argument("--json", action="store_true", help="machine-readable, on standard output")

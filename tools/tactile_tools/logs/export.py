@@ -35,15 +35,13 @@ CONTENTS = "columns.json"
 has it was made by this tool, and may be overwritten with --force."""
 
 
-def add(commands: Any) -> None:
-    """Add ``export`` to ``tactile log``."""
-    parser: argparse.ArgumentParser = commands.add_parser(
-        "export",
-        help="write messages as CSV, Parquet or NumPy files, one a topic",
-        description="Write a folder with one table a topic. Nested fields are flattened "
+def fill(parser: argparse.ArgumentParser) -> None:
+    """Give ``tactile log export`` its arguments."""
+    parser.description = (
+        "Write a folder with one table a topic. Nested fields are flattened "
         f"(header.stamp_ns, wrench.force.x); {CONTENTS} says what each column is. Lists of numbers "
         "are columns name.0, name.1 … in CSV, lists in Parquet, matrices in npz; lists of messages "
-        "are JSON in CSV, lists of structures in Parquet, flat arrays with offsets in npz.",
+        "are JSON in CSV, lists of structures in Parquet, flat arrays with offsets in npz."
     )
     add_files(parser)
     parser.add_argument("--to", dest="format", choices=FORMATS, required=True, help="format")

@@ -28,14 +28,12 @@ SHOWN = 10
 OUTCOME = "outcome"
 
 
-def add(commands: Any) -> None:
-    """Add ``info`` to ``tactile log``."""
-    parser: argparse.ArgumentParser = commands.add_parser(
-        "info",
-        help="channels, rates, losses, gaps, outcome, and whether the file is whole",
-        description="Read a log from end to end and say what it holds: channels and rates, what "
+def fill(parser: argparse.ArgumentParser) -> None:
+    """Give ``tactile log info`` its arguments."""
+    parser.description = (
+        "Read a log from end to end and say what it holds: channels and rates, what "
         "was dropped and where, calibration, outcome and software, and whether every byte is "
-        "readable. Files of one log are taken together.",
+        "readable. Files of one log are taken together."
     )
     add_files(parser)
     parser.add_argument("--json", action="store_true", help="machine-readable, on standard output")

@@ -6,7 +6,6 @@ import argparse
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
 
 from tactile_bus.recovery import RecoveryError, RecoveryReport, recover
 from tactile_tools.logs.arguments import check_output
@@ -23,13 +22,10 @@ from tactile_tools.logs.terminal import (
 )
 
 
-def add(commands: Any) -> None:
-    """Add ``recover`` to ``tactile log``."""
-    parser: argparse.ArgumentParser = commands.add_parser(
-        "recover",
-        help="write a whole log out of one that was cut off or damaged",
-        description="Write everything readable of each FILE to a new, finished log. The files are "
-        "only read.",
+def fill(parser: argparse.ArgumentParser) -> None:
+    """Give ``tactile log recover`` its arguments."""
+    parser.description = (
+        "Write everything readable of each FILE to a new, finished log. The files are only read."
     )
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="MCAP log, or several")
     parser.add_argument(

@@ -6,7 +6,7 @@ import argparse
 import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tactile_tools.logs.arguments import add_files, add_output, check_output
 from tactile_tools.logs.sources import Series, find_series
@@ -22,14 +22,12 @@ if TYPE_CHECKING:  # the daemon's rooms take a while to import: only where they 
 METHODS = ("off", "ransac", "consensus")
 
 
-def add(commands: Any) -> None:
-    """Add ``reprocess`` to ``tactile log``."""
-    parser: argparse.ArgumentParser = commands.add_parser(
-        "reprocess",
-        help="run the pipeline again over the raw bytes of a log",
-        description="Run field, compensation, force and features again over the raw bytes of a "
+def fill(parser: argparse.ArgumentParser) -> None:
+    """Give ``tactile log reprocess`` its arguments."""
+    parser.description = (
+        "Run field, compensation, force and features again over the raw bytes of a "
         "log. With the settings and calibration of the log they come out the same to the bit; "
-        "with others, as they would have been. Everything else is carried over.",
+        "with others, as they would have been. Everything else is carried over."
     )
     add_files(parser)
     add_output(parser, "new log (default: FILE's name with _reprocessed)")
