@@ -96,7 +96,12 @@ def percent(rate: Rate) -> str:
     if not rate.trials:
         return "–"
     low, high = rate.interval
-    return f"{100 * rate.value:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
+    return f"{whole(rate.value)} % [{whole(low)}, {whole(high)}]"
+
+
+def whole(value: float) -> str:
+    """A fraction in whole percent, halves rounded up as in print; "–" for NaN."""
+    return "–" if math.isnan(value) else f"{math.floor(100 * value + 0.5)}"
 
 
 def points(difference: float, interval: tuple[float, float]) -> str:
@@ -113,6 +118,12 @@ def shown_p(p: float) -> str:
     if p < 1e-4:
         return "< 0.0001"
     return f"{p:.4f}" if p < 0.01 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
+
+
+def told_p(p: float) -> str:
+    """A p-value in a sentence."""
+    shown = shown_p(p)
+    return f"p {shown}" if shown.startswith("<") else f"p = {shown}"
 
 
 def slug(text: str) -> str:

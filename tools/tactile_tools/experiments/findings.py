@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from statistics import fmean
 
-from tactile_tools.experiments.document import listed, shown_p, spoken
+from tactile_tools.experiments.document import listed, spoken, told_p, whole
 from tactile_tools.experiments.reference import PAPER_EJECTED, Reference
 from tactile_tools.experiments.rows import Row
 from tactile_tools.experiments.statistics import (
@@ -13,6 +13,7 @@ from tactile_tools.experiments.statistics import (
     PairedValues,
     Rate,
     contrast,
+    signed_rank,
 )
 
 ByStrategy = Mapping[str, Sequence[Row]]
@@ -44,15 +45,15 @@ def worst_is_straight(
     start = f"In {what}, straight has a mean of {means['straight']:.3f}{unit}, the others {spread}"
     if not rest:
         p = max(against[n].adjusted for n in others)
-        return f"{start}: it is significantly worse than each of them (p ≤ {_p(p)})."
+        return f"{start}: it is significantly worse than each of them (the greatest {told_p(p)})."
     told = []
     for n in rest:
         pair = against[n]
         how = "significantly better than" if pair.adjusted < SIGNIFICANT else "no clear loser to"
         if pair.adjusted < SIGNIFICANT or worse[n] > 0:
-            told.append(f"{how} {spoken(n)} (p = {_p(pair.adjusted)})")
+            told.append(f"{how} {spoken(n)} ({told_p(pair.adjusted)})")
         else:
-            told.append(f"not worse than {spoken(n)} (p = {_p(pair.adjusted)})")
+            told.append(f"not worse than {spoken(n)} ({told_p(pair.adjusted)})")
     if clear:
         beaten = f"it is significantly worse than {listed([spoken(n) for n in clear])}, but "
     else:
@@ -68,7 +69,7 @@ def faster_by_touch(means: Mapping[str, float], pairs: Sequence[PairedValues]) -
     gain = _signed(pair, "hybrid_clock")
     figures = (
         f"mean normalised time {means['hybrid_event']:.3f} against {means['hybrid_clock']:.3f}, "
-        f"p = {_p(pair.adjusted)}"
+        f"{told_p(pair.adjusted)}"
     )
     if pair.adjusted >= SIGNIFICANT:
         return f"Hybrid event is not significantly faster than hybrid clock ({figures})."
@@ -80,7 +81,7 @@ def order_of_success(rates: Mapping[str, Rate], reference: Reference | None) -> 
     """From least to most successful, and the paper's order beside it."""
     ranked = sorted(rates, key=lambda name: rates[name].value)
     text = "By success, from least to most: " + ", ".join(
-        f"{spoken(n)} {100 * rates[n].value:.0f} %" for n in ranked
+        f"{spoken(n)} {whole(rates[n].value)} %" for n in ranked
     )
     if reference is None or not set(reference.success) >= set(rates):
         return text + "."
@@ -102,8 +103,8 @@ def beside(rates: Mapping[str, Rate], reference: Reference, column: str = "succe
         if p < SIGNIFICANT:
             word = "above" if rate.value > theirs[name].value else "below"
             differ.append(
-                f"{spoken(name)} ({100 * rate.value:.0f} %, {word} its "
-                f"{100 * theirs[name].value:.0f} %, p = {_p(p)})"
+                f"{spoken(name)} ({whole(rate.value)} %, {word} its "
+                f"{whole(theirs[name].value)} %, {told_p(p)})"
             )
         else:
             agree.append(spoken(name))
@@ -143,11 +144,18 @@ def pushed_out(rows: ByStrategy) -> str:
         counts[name] = 25 * fmean(row["ejected"] for row in rows[name])
         objects, trials = PAPER_EJECTED[name]
         told.append(f"{spoken(name)} {counts[name]:.1f} (paper, hardware: {objects} in {trials})")
-    same = (counts["hybrid_clock"] > counts["hybrid_event"]) == (
-        PAPER_EJECTED["hybrid_clock"][0] > PAPER_EJECTED["hybrid_event"][0]
+    clock, event = ({r["scene_seed"]: r["ejected"] for r in rows[n]} for n in counts)
+    scenes = sorted(clock.keys() & event.keys())
+    p = signed_rank([clock[s] for s in scenes], [event[s] for s in scenes])[0]
+    if p >= SIGNIFICANT:
+        verdict = "the difference is not beyond chance"
+    elif counts["hybrid_event"] < counts["hybrid_clock"]:
+        verdict = "as in the paper, touch disturbs less"
+    else:
+        verdict = "unlike in the paper, touch disturbs more"
+    return (
+        f"Objects pushed out of the front, per 25 trials: {listed(told)}; {verdict} ({told_p(p)})."
     )
-    verdict = "as in the paper, touch disturbs less" if same else "unlike in the paper"
-    return f"Objects pushed out of the front, per 25 trials: {listed(told)}; {verdict}."
 
 
 def _pair(pairs: Sequence[PairedValues], a: str, b: str) -> PairedValues | None:
@@ -165,7 +173,3 @@ def _signed(pair: PairedValues, name: str) -> float:
 def _range(values: Sequence[float]) -> str:
     low, high = min(values), max(values)
     return f"{low:.3f}" if len(values) == 1 else f"{low:.3f} to {high:.3f}"
-
-
-def _p(p: float) -> str:
-    return shown_p(p)

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from tactile_tools.experiments.document import spoken
+from tactile_tools.experiments.document import spoken, whole
 from tactile_tools.experiments.statistics import Rate
 
 Float = NDArray[np.float64]
@@ -105,7 +105,9 @@ def _brackets(
             linewidth=0.9,
         )
         axes.text((left + right) / 2, y, bracket.text, ha="center", va="bottom", fontsize=8)
+    ticks = [tick for tick in axes.get_yticks() if -1e-9 <= tick <= top + 1e-9]
     axes.set_ylim(-0.03 * top, 1.05 * top + (highest + 1.2) * step if brackets else 1.06 * top)
+    axes.set_yticks(ticks)  # above lie the brackets, where there are no values
 
 
 def rates(
@@ -119,9 +121,7 @@ def rates(
         low, high = rate.interval
         axes.bar(index, 100 * rate.value, 0.5, color=colour_of(name), alpha=0.6, edgecolor="black")
         _bar(axes, index, rate.value, low, high)
-        axes.text(
-            index - 0.24, 100 * rate.value + 1.5, f"{100 * rate.value:.0f}", ha="left", fontsize=9
-        )
+        axes.text(index - 0.24, 100 * rate.value + 1.5, whole(rate.value), ha="left", fontsize=9)
     width = 0.16
     for k, (label, theirs) in enumerate(others):
         at = [(i + 0.36 + k * width, theirs[n]) for i, n in enumerate(names) if n in theirs]
@@ -230,7 +230,7 @@ def heat_map(
     for i in range(len(rows)):
         for j in range(len(columns)):
             value = values[i, j]
-            text = "–" if np.isnan(value) else f"{100 * value:.0f}"
+            text = whole(float(value))
             light = not np.isnan(value) and value < 0.55
             axes.text(j, i, text, ha="center", va="center", color="white" if light else "black")
     axes.set_xticks(range(len(columns)), columns)

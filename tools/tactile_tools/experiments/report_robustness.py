@@ -169,7 +169,7 @@ def _places(found: Sequence[tuple[str, Level, str]]) -> str:
     by: dict[str, list[str]] = {}
     for axis, level, _ in found:
         by.setdefault(axis, []).append(level.label)
-    return listed([f"{AXES[axis].title} {', '.join(labels)}" for axis, labels in by.items()])
+    return listed([f"{AXES[axis].title} ({', '.join(labels)})" for axis, labels in by.items()])
 
 
 def _testable(strategies: Sequence[str]) -> list[Claim]:

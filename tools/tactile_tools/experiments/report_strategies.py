@@ -16,6 +16,7 @@ from tactile_tools.experiments.document import (
     shown_p,
     slug,
     spoken,
+    whole,
 )
 from tactile_tools.experiments.findings import ByStrategy, means_of, rate_of
 from tactile_tools.experiments.plots import Bracket, boxes, rates
@@ -140,7 +141,7 @@ def _success_table(by: ByStrategy, references: Sequence[Reference], prefix: str)
                 continue
             found = contrast(rate, reference.success[name])
             cells += [
-                f"{100 * reference.success[name].value:.0f} %",
+                f"{whole(reference.success[name].value)} %",
                 points(found.difference, found.interval),
                 shown_p(found.p),
             ]
@@ -150,7 +151,7 @@ def _success_table(by: ByStrategy, references: Sequence[Reference], prefix: str)
             if theirs is None:
                 cells += ["–"] * 2
             else:
-                cells += [f"{100 * theirs.value:.0f} %", shown_p(contrast(entered, theirs).p)]
+                cells += [f"{whole(theirs.value)} %", shown_p(contrast(entered, theirs).p)]
         body.append(cells)
     sources = "; ".join(f"{r.label}: {r.what}" for r in references)
     return TableData(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from tactile_tools.experiments.document import Picture, Section, TableData, slug
+from tactile_tools.experiments.document import Picture, Section, TableData, slug, whole
 from tactile_tools.experiments.plots import Surface, contours
 from tactile_tools.experiments.reference import PAPER_SWEEP
 from tactile_tools.experiments.rows import Row
@@ -168,8 +168,8 @@ def _worst_table(grids: Sequence[Grid], prefix: str) -> TableData:
                     f"{float(np.nanmax(raw)):.2f}",
                     f"{smooth[best]:.2f} at {_setting(grid, *best)}",
                     f"{float(np.nanmean(raw)):.2f}",
-                    f"{100 * float(np.nanmin(grid.success)):.0f} to "
-                    f"{100 * float(np.nanmax(grid.success)):.0f} %",
+                    f"{whole(float(np.nanmin(grid.success)))} to "
+                    f"{whole(float(np.nanmax(grid.success)))} %",
                 ]
             )
     return TableData(
@@ -192,7 +192,7 @@ def _grid_table(grid: Grid, prefix: str) -> TableData:
     down = SWEEP_AMPLITUDES if burrow else SWEEP_TIMES
     corner = "A_bur \\ f_bur" if burrow else "t_excv \\ t_trig, s"
     body = [
-        [f"{value:g}", *("–" if np.isnan(v) else f"{100 * v:.0f}" for v in row)]
+        [f"{value:g}", *(whole(float(v)) for v in row)]
         for value, row in zip(down, grid.success, strict=True)
     ]
     return TableData(

@@ -1,0 +1,56 @@
+"""The same rows from a Dask cluster of two worker processes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tactile_tools.experiments.backends import BackendError
+from tactile_tools.experiments.dask_backend import DaskCluster
+from tactile_tools.experiments.rows import Row, outcome_of, read_table
+from tactile_tools.experiments.runner import run_study
+from tactile_tools.experiments.studies import Study
+
+distributed = pytest.importorskip("distributed", reason="Dask is an optional extra")
+
+
+def silent(finished: int, total: int, row: Row | None) -> None:
+    """No progress."""
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    with distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address=None,
+        silence_logs=logging.CRITICAL,
+    ) as made:
+        yield made
+
+
+def test_two_dask_workers_give_the_rows_of_one_process(
+    cluster: Any, study: Study, alone: Path, tmp_path: Path
+) -> None:
+    backend = DaskCluster(cluster.scheduler_address)
+    summary = run_study(study, tmp_path / "run", backend, silent)
+    rows = read_table(tmp_path / "run" / "trials.parquet")
+    assert [outcome_of(r) for r in rows] == [
+        outcome_of(r) for r in read_table(alone / "trials.parquet")
+    ]
+    assert summary["this_session"]["workers"] == 2
+    assert len({row["worker"] for row in rows}) == 2
+
+
+def test_no_scheduler_says_where_and_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tactile_tools.experiments.dask_backend.CONNECT_S", 0.3)
+    with (
+        pytest.raises(BackendError, match=r"tcp://127\.0\.0\.1:1 .*start `dask scheduler`"),
+        DaskCluster("tcp://127.0.0.1:1"),
+    ):
+        pass
