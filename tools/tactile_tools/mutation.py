@@ -28,7 +28,12 @@ from rich.progress import Progress
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "host" / "reachd"
 FILES = ("safety.py", "limits.py", "stillness.py")
-TESTS = ("test_gate_limits.py", "test_gate_inputs.py", "test_gate_random.py")
+TESTS = (
+    "test_gate_limits.py",
+    "test_gate_geometry.py",
+    "test_gate_inputs.py",
+    "test_gate_random.py",
+)
 RANDOM_INPUTS = "2000"
 """Inputs of the random test for each mutant: what it finds it finds among the first."""
 
