@@ -11,6 +11,7 @@ share one ellipsoidal limit surface, as a spread-out footprint does.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Final
 
 import mujoco
@@ -20,6 +21,9 @@ from sim_device.world.base import PHYSICS_STEP
 from sim_device.world.parameters import WorldParameters
 from sim_device.world.scenes import Scene, SceneObject, Shape
 from tactile_bus.geometry import FINGER_HEIGHT
+
+GRAVITY: Final = 9.81
+"""m/s²."""
 
 PLANE_HEIGHT: Final = 0.06
 """m, of the plane in which all bodies are centred: half the height of a box."""
@@ -67,7 +71,7 @@ def yaw_inertia(item: SceneObject) -> float:
     return item.mass * (item.size_x**2 + item.size_y**2) / 12
 
 
-def base_spec(gravity: float = 9.81) -> mujoco.MjSpec:
+def base_spec(gravity: float = GRAVITY) -> mujoco.MjSpec:
     """Empty model with the solver's settings. ``gravity`` in m/s², downwards."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
@@ -188,7 +192,9 @@ def add_ground(
 
 def cupboard_model(scene: Scene, parameters: WorldParameters) -> mujoco.MjModel:
     """Model of ``scene``: objects ``object_<i>``, walls, shelf, ground, finger and its motors."""
-    spec = base_spec()
+    # Heavier objects under a weaker pull: the same weight and friction, more inertia.
+    heavier = parameters.inertia_scale
+    spec = base_spec(GRAVITY / heavier)
     friction = parameters.friction
     half = scene.width / 2
     margin = 0.1
@@ -205,7 +211,7 @@ def cupboard_model(scene: Scene, parameters: WorldParameters) -> mujoco.MjModel:
         add_object(
             spec,
             f"object_{index}",
-            item,
+            replace(item, mass=item.mass * heavier),
             friction_objects=friction.objects,
             friction_shelf=friction.object_shelf,
         )

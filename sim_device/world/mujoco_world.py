@@ -22,7 +22,7 @@ from sim_device.world.base import (
     merge_touches,
     substeps,
 )
-from sim_device.world.mujoco_model import FINGER_GEOM, cupboard_model, yaw_inertia
+from sim_device.world.mujoco_model import FINGER_GEOM, MOTOR_TIME, cupboard_model, yaw_inertia
 from sim_device.world.parameters import WorldParameters, world_parameters
 from sim_device.world.plates import settled
 from sim_device.world.scenes import Scene
@@ -52,7 +52,9 @@ class MujocoWorld:
         mujoco.mj_forward(model, data)
         n = len(scene.objects)
         self._initial = np.array([[o.x, o.y, o.yaw] for o in start.objects]).reshape(n, 3)
-        self._mass = np.array([[o.mass, o.mass, yaw_inertia(o)] for o in scene.objects])
+        self._mass = parameters.inertia_scale * np.array(
+            [[o.mass, o.mass, yaw_inertia(o)] for o in scene.objects]
+        )
         self._finger_mass = (parameters.finger_mass,) * 2 + (parameters.finger_inertia,)
         self._finger_geom = model.geom(FINGER_GEOM).id
         self._body_of_geom = [WALL] * model.ngeom
@@ -101,14 +103,20 @@ class MujocoWorld:
         if not (math.isfinite(twist.vx) and math.isfinite(twist.vy) and math.isfinite(twist.omega)):
             raise ValueError(f"{twist} is not finite")
         model, data = self._model, self._data
-        self._ctrl[:] = (twist.vx, twist.vy, twist.omega)
         self._touches.clear()
         self._contacts = self._state = None
         mass, _, inertia = self._finger_mass
         total_x = total_y = total_m = work = 0.0
         u0, v0, w0 = self._finger_qvel.tolist()
+        fx, fy, mz = self._finger_push.tolist()
         for _ in range(count):
             pose = self._finger_qpos.tolist()
+            # A motor that answers to speed alone gives way under load: make up for the last one.
+            self._ctrl[:] = (
+                twist.vx - fx * MOTOR_TIME / mass,
+                twist.vy - fy * MOTOR_TIME / mass,
+                twist.omega - mz * MOTOR_TIME / inertia,
+            )
             mujoco.mj_step(model, data)
             u1, v1, w1 = self._finger_qvel.tolist()
             fx, fy, mz = self._finger_push.tolist()

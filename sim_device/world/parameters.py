@@ -18,8 +18,12 @@ Where neither says, the figure is ours, and the reason stands beside it.
 | success | 7.5 mm, paper | 1 mm, simulator | the outcomes give both |
 | cupboard | 0.38 × 0.53 m, paper | 0.375 × 0.55 m, simulator | each its own |
 | friction | as simulator | simulator | paper silent |
-| finger | 4 kg, 0.45 kg·m², ours | 3 kg, 0.05 kg·m², ours | simulator's 1.0 and 0.237 (÷ 100) |
-| | | | chatter at 5 ms under these limits |
+| inertia | × 1 | × 10 | lengths ten times as great with forces and times |
+| | | | as they are: what moves there carries ten |
+| | | | times the momentum that its mass has here |
+| finger | 4 kg, 0.45 kg·m², ours | 3 kg, 0.05 kg·m², ours | its 1.0 × 10 would not be at rest |
+| | | | 0.1 s after the last command; its |
+| | | | 0.237 ÷ 10 would chatter at 5 ms |
 """
 
 from __future__ import annotations
@@ -59,8 +63,9 @@ class WorldParameters:
     ``limits``: what the arm is asked to keep. ``finger_mass`` kg, ``finger_inertia`` kg·m² about
     the pivot: a velocity-controlled arm's apparent inertia, high enough that one physics step of
     full force changes the speed by less than half its limit. ``goal_radius`` m, ``time_limit`` s.
-    ``lip``: m, how far the shelf reaches out in front of the front edge. ``finger_width``: m, to
-    which the finger's outline is stretched across.
+    ``inertia_scale``: by how much objects are harder to accelerate than their weight says; friction
+    goes by weight. ``lip``: m, how far the shelf reaches out in front of the front edge.
+    ``finger_width``: m, to which the finger's outline is stretched across.
     """
 
     name: str
@@ -73,6 +78,7 @@ class WorldParameters:
     friction: Friction
     finger_mass: float
     finger_inertia: float
+    inertia_scale: float = 1.0
     finger_width: float = FINGER_WIDTH
 
     @property
@@ -115,6 +121,7 @@ WORLD_PARAMETERS: Final = MappingProxyType(
             lip=0.02,
             friction=_SIMULATOR_FRICTION,
             finger_mass=3.0,  # 10 N × 5 ms / 3 kg = 17 mm/s, below half of 50
+            inertia_scale=10.0,
             finger_inertia=0.05,  # 1.5 N·m × 5 ms / 0.05 kg·m² = 0.15 rad/s, below half of 0.35
         ),
     }

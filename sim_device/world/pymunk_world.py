@@ -23,7 +23,7 @@ from sim_device.world.base import (
     merge_touches,
     substeps,
 )
-from sim_device.world.mujoco_model import MOTOR_TIME, mean_lever, yaw_inertia
+from sim_device.world.mujoco_model import GRAVITY, MOTOR_TIME, mean_lever, yaw_inertia
 from sim_device.world.parameters import WorldParameters, world_parameters
 from sim_device.world.plates import settled
 from sim_device.world.scenes import Scene, SceneObject, Shape
@@ -34,8 +34,6 @@ ITERATIONS = 30
 
 SLOP = 1e-4
 """m of overlap that is left alone, so that resting contacts persist."""
-
-GRAVITY = 9.81
 
 
 class PymunkWorld:
@@ -85,12 +83,14 @@ class PymunkWorld:
         space.add(finger, skin)
         self._steps = 0
         self._work = 0.0
+        self._push = np.zeros(3)
         self._wrench = (0.0, 0.0, 0.0)
         self._contacts: tuple[FingerContact, ...] = ()
 
     def _add_object(self, pymunk: Any, item: SceneObject, friction: float, shelf: float) -> Any:
         """Body of ``item`` with the shelf's friction as bounded joints to the ground."""
-        body = pymunk.Body(item.mass, yaw_inertia(item))
+        heavier = self._parameters.inertia_scale
+        body = pymunk.Body(heavier * item.mass, heavier * yaw_inertia(item))
         body.position = (item.x, item.y)
         body.angle = item.yaw
         if item.shape is Shape.DISC:
@@ -132,12 +132,14 @@ class PymunkWorld:
             wanted = np.array([twist.vx, twist.vy, twist.omega])
             inertia = np.array([p.finger_mass, p.finger_mass, p.finger_inertia])
             bound = np.array([self._f_max, self._f_max, self._m_max])
-            motor = np.clip(inertia / MOTOR_TIME * (wanted - v0), -bound, bound)
+            # A motor that answers to speed alone gives way under load: make up for the last one.
+            motor = np.clip(inertia / MOTOR_TIME * (wanted - v0) - self._push, -bound, bound)
             finger.apply_force_at_world_point((motor[0], motor[1]), finger.position)
             finger.torque += motor[2]
             self._space.step(PHYSICS_STEP)
             v1 = np.array([*finger.velocity, finger.angular_velocity])
             push = inertia * (v1 - v0) / PHYSICS_STEP - motor
+            self._push = push
             wrench += push
             self._work += float(motor @ (v0 + v1)) / 2 * PHYSICS_STEP
             self._read(touches)

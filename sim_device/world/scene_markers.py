@@ -8,7 +8,7 @@ from sim_device.world.base import World
 from sim_device.world.scenes import Shape
 from sim_device.world.touch import SHELF_CLEARANCE
 from tactile_bus.geometry import FINGER_HEIGHT, FINGER_OUTLINE
-from tactile_bus.markers import CUBE, CYLINDER, SPHERE, marker
+from tactile_bus.markers import CUBE, CYLINDER, DELETE, SPHERE, marker
 from tactile_bus.messages import MSG
 
 OBJECTS, CUPBOARD, FINGER, GOAL = "objects", "cupboard", "finger", "goal"
@@ -37,6 +37,13 @@ def scene_markers(world: World, wall_ns: int) -> Any:
     poses, standing = world.poses().tolist(), world.on_shelf().tolist()
     for number, thing in enumerate(scene.objects):
         if not standing[number]:
+            gone = (0.0, 0.0, 0.0, 0.0)
+            made.append(
+                marker(
+                    wall_ns, FRAME, OBJECTS, number, CUBE, gone, (0.0, 0.0, 0.0), gone,
+                    action=DELETE,
+                )
+            )  # fmt: skip
             continue
         x, y, yaw = poses[number]
         share = min(1.0, max(0.0, (thing.mass - LIGHTEST) / (HEAVIEST - LIGHTEST)))

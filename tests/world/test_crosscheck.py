@@ -60,4 +60,5 @@ def test_both_say_the_same_of_a_push_into_the_corner(build: Any) -> None:
             world.step(0.01, Twist(0.05, 0.0, 0.0))
         finger = world.finger()
         wrenches.append((finger.fx, finger.fy))
-    assert wrenches[0] == pytest.approx(wrenches[1], abs=0.1)
+    # Friction at rest may be anything within its cone; here it is next to nothing beside 10 N.
+    assert wrenches[0] == pytest.approx(wrenches[1], abs=0.3)

@@ -14,11 +14,12 @@ from sim_device.world.base import WALL, World, WorldError
 from sim_device.world.generate import authors_sim
 from sim_device.world.mujoco_model import mean_lever
 from sim_device.world.mujoco_world import MujocoWorld
-from sim_device.world.parameters import WORLD_PARAMETERS
+from sim_device.world.parameters import WORLD_PARAMETERS, world_parameters
 from sim_device.world.scenes import Pose
 from tactile_bus.arm_types import ZERO, Twist
 from tactile_bus.geometry import FINGER_OUTLINE
 
+INERTIA = world_parameters("authors_sim").inertia_scale
 G = 9.81
 FORWARD = Twist(0.05, 0.0, 0.0)
 TIP = FINGER_OUTLINE[3][0]  # m, front face of the finger
@@ -47,11 +48,11 @@ def test_a_block_starts_to_slide_at_mu_m_g(
     for share in np.arange(0.90, 1.11, 0.02):
         world.limit_wrench(share * onset, 1.5)
         before = world.poses()[0, 0]
-        run(world, 0.3, FORWARD)
-        if world.poses()[0, 0] - before > 0.0002:
+        run(world, 1.0, FORWARD)
+        if world.poses()[0, 0] - before > 0.00005:
             slid_at = share
             break
-    # Below the onset it creeps by less than 0.2 mm in 0.3 s; 4 % above, it is pushed further.
+    # Below the onset it creeps by less than 0.05 mm in 1 s; 4 % above, it is pushed further.
     assert slid_at == pytest.approx(1.01, abs=0.04)
 
 
@@ -85,9 +86,9 @@ def test_an_object_jammed_against_the_wall_bears_the_limit_too(engine: Engine, b
 def test_a_sliding_object_stops_after_v2_over_2_mu_g(build: Any) -> None:
     for item in (build.disc(0.1, 0.0), build.box(0.1, 0.0)):
         world = MujocoWorld(build.cupboard(item))
-        world.data.qvel[0] = speed = 0.3
-        run(world, 0.5, ZERO)
-        way = speed**2 / (2 * 0.20 * G)
+        world.data.qvel[0] = speed = 0.1
+        run(world, 1.0, ZERO)
+        way = INERTIA * speed**2 / (2 * 0.20 * G)
         assert world.poses()[0, 0] - 0.1 == pytest.approx(way, rel=0.03)
 
 
@@ -95,10 +96,10 @@ def test_a_spinning_object_stops_after_w2_over_2_alpha(build: Any) -> None:
     disc = build.disc(0.1, 0.0)
     world = MujocoWorld(build.cupboard(disc))
     world.data.qvel[3] = spin = 3.0
-    run(world, 0.5, ZERO)
+    run(world, 1.5, ZERO)
     # Torque μ m g ⅔r on an inertia of ½ m r².
-    alpha = 0.20 * G * (2 / 3 * 0.04) / (0.5 * 0.04**2)
-    # A physics step is long beside the 50 ms it spins: allow half of one at full speed.
+    alpha = 0.20 * G * (2 / 3 * 0.04) / (0.5 * 0.04**2) / INERTIA
+    # A physics step is long beside the 0.5 s it spins: allow half of one at full speed.
     assert world.poses()[0, 2] == pytest.approx(spin**2 / (2 * alpha), abs=spin * 0.0025)
 
 
@@ -122,8 +123,9 @@ def test_no_energy_comes_from_nowhere(engine: Engine) -> None:
         world.step(0.01, push)
         energy = world.kinetic_energy()
         greatest = max(greatest, energy)
-        assert energy <= world.motor_work + 1e-4
-    assert greatest > 1e-3  # something did move
+        # Objects are generated with overlaps of up to 0.6 mm, which let go of 0.3 mJ at first.
+        assert energy <= world.motor_work + 5e-4
+    assert greatest > 1e-2  # something did move
     # With the motors braking it all comes to rest, and stays there.
     run(world, 0.5, ZERO)
     assert world.kinetic_energy() < 1e-6
@@ -161,15 +163,20 @@ def test_a_side_touch_is_felt_where_it_is(
 ) -> None:
     world = engine(build.cupboard(build.disc(0.17, y), start=Pose(0.12, 0.0, 0.0)))
     run(world, 1.5, twist)
-    (contact,) = world.contacts()
-    assert contact.body == 0
-    assert contact.x == pytest.approx(0.05, abs=0.002)
-    assert contact.y == pytest.approx(normal * 0.0285, abs=1e-4)
-    assert (contact.normal_x, contact.normal_y) == pytest.approx((0.0, normal), abs=1e-3)
-    # It slides at a steady speed, so the finger bears its friction with the shelf.
-    assert contact.normal_force == pytest.approx(0.20 * 0.5 * G, rel=0.05)
-    assert contact.force_y * normal < 0
-    assert world.finger().fy == pytest.approx(contact.force_y, rel=0.02)
+    forces = []
+    for _ in range(100):
+        world.step(0.01, twist)
+        felt = world.contacts()
+        forces.append(sum(contact.normal_force for contact in felt))
+        assert world.finger().fy == pytest.approx(sum(c.force_y for c in felt), rel=0.02, abs=1e-6)
+        for contact in felt:
+            assert contact.body == 0
+            assert contact.x == pytest.approx(0.05, abs=0.004)
+            assert contact.y == pytest.approx(normal * 0.0285, abs=1e-4)
+            assert (contact.normal_x, contact.normal_y) == pytest.approx((0.0, normal), abs=1e-3)
+            assert contact.force_y * normal < 0
+    # It slides at a steady speed, so on average the finger bears its friction with the shelf.
+    assert np.mean(forces) == pytest.approx(0.20 * 0.5 * G, rel=0.05)
 
 
 @pytest.mark.parametrize("on", ["object", "wall"])
