@@ -26,11 +26,12 @@ from tactile_bus.instant import (
     monotonic_now,
     seconds_between,
 )
+from tactile_bus.markers import frame_transform
 from tactile_bus.messages import MSG, codec, header
 from tactile_bus.services import Service, ServiceError, declare_service
 from tactile_bus.session import BusConfig, BusError, close_session, open_session
 from tactile_bus.streams import Latest, Publisher, Tap, declare_publisher, latest
-from tactile_bus.topics import ARM_STATE, COMMAND, WORLD, alive_key, service_key
+from tactile_bus.topics import ARM_STATE, COMMAND, TF, WORLD, alive_key, service_key
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +42,10 @@ NAME_RETRY = 0.02
 """s between two such questions."""
 
 MARKER_PERIOD: Final = 1 / WORLD.rate
+FRAME_PERIOD: Final = 1 / TF.rate
+
+FINGER_FRAME: Final = "ee"
+"""Frame of the finger, in which contacts are told."""
 
 SEQUENCES = 2**32
 """Sequence numbers of states begin again after so many."""
@@ -94,6 +99,7 @@ class _Ends:
 
     states: Publisher
     markers: Publisher
+    frames: Publisher
     commands: Latest
     watch: Tap
     services: list[Service]
@@ -129,7 +135,7 @@ class ArmServer:
         self._lock = threading.Lock()
         self._session: zenoh.Session | None = None
         self._ends: _Ends | None = None
-        self._next_markers = Instant(0)
+        self._next_markers = self._next_frame = Instant(0)
         self._polled = Instant(0)
         self._obeyed: Instant | None = None
 
@@ -197,6 +203,11 @@ class ArmServer:
             wall_ns = self._wall.wall_ns(state.captured)
             message = state_message(state, self.sent % SEQUENCES, wall_ns)
             ends.states.put(self._codec.encode(ARM_STATE, message), wall_ns)
+            if state.captured >= self._next_frame:
+                self._next_frame = after(state.captured, FRAME_PERIOD)
+                pose = (state.x, state.y, 0.0, state.heading)
+                frame = frame_transform(wall_ns, FRAME, FINGER_FRAME, pose)
+                ends.frames.put(self._codec.encode(TF, frame), wall_ns)
         if now >= self._next_markers:
             self._next_markers = max(now, after(self._next_markers, MARKER_PERIOD))
             wall_ns = self._wall.wall_ns(now)
@@ -211,6 +222,7 @@ class ArmServer:
         return _Ends(
             states=declare_publisher(session, ARM_STATE, self.name),
             markers=declare_publisher(session, WORLD, self.world_name),
+            frames=declare_publisher(session, TF, "tf"),
             commands=latest(session, command_key),
             # The newest sample may hide another sender's, so that all are looked at beside it.
             watch=Tap(session, command_key, lambda s: self.commands.watch(s, monotonic_now())),

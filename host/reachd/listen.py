@@ -7,7 +7,7 @@ import zenoh
 from tactile_bus.instant import WallClock, monotonic_now
 from tactile_bus.recorder import Recorder
 from tactile_bus.streams import BusSample, Tap
-from tactile_bus.topics import ARM_STATE, NAME, WORLD, find_topic, service_key
+from tactile_bus.topics import ARM_STATE, NAME, TF, WORLD, find_topic, service_key
 
 MAX_NAMES = 16
 """Names of streams that are logged: a board's, an arm's and a world's, and some to spare; so that
@@ -18,7 +18,7 @@ ANSWER = 5.0
 
 
 class Listener:
-    """Logs all streams of ``board``, the state of ``arm`` and the objects of every world.
+    """Logs all streams of ``board``, the state of ``arm``, frames, and every world's objects.
 
     ``refused``: samples of topics or names that are not logged.
     """
@@ -33,7 +33,12 @@ class Listener:
         self._recorder = recorder
         self._wall = wall
         self._names: set[str] = set()
-        keys = (f"tactile/{board}/*", ARM_STATE.key(arm), WORLD.template.format(name="*"))
+        keys = (
+            f"tactile/{board}/*",
+            ARM_STATE.key(arm),
+            TF.template,
+            WORLD.template.format(name="*"),
+        )
         self._taps = [Tap(session, key, self._take) for key in keys]
 
     def ask_geometry(self) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactile_bus.geometry import SkinGeometry
 from tactile_bus.instant import NS_PER_S, Instant
@@ -49,37 +51,18 @@ class SkinPicture:
 
     def draw(self, cycle: Cycle, wall_ns: int) -> Any:
         """``MarkerArray`` of the taxels by their normal force, and of the contact patches."""
-        frame = self._frame
-        size = (TAXEL_M,) * 3
-        made = [
-            wipe(wall_ns, frame),
-            marker(
-                wall_ns, frame, TAXELS, 0, SPHERE_LIST, AT_ORIGIN, (size[0], size[1], size[2]),
-                IDLE, points=self._places, colours=self._colours(cycle),
-            ),
-        ]  # fmt: skip
-        for number, patch in enumerate(cycle.features.patches):
-            x, y, z = patch.centroid.tolist()
-            fx, fy, fz = (patch.force * METRES_PER_N).tolist()
-            wide = TAXEL_M * (1.0 + 2.0 * min(1.0, patch.normal_force / 10.0))
-            made += [
-                marker(
-                    wall_ns, frame, CONTACT, number, SPHERE, (x, y, z, 0.0),
-                    (wide, wide, wide), (0.9, 0.6, 0.0, 0.9),
-                ),
-                marker(
-                    wall_ns, frame, FORCE, number, ARROW, AT_ORIGIN,
-                    (SHAFT_M, 2 * SHAFT_M, 3 * SHAFT_M), (0.8, 0.1, 0.1, 1.0),
-                    # the tip touches the skin: an arrow shows what pushes on it
-                    points=((x - fx, y - fy, z - fz), (x, y, z)),
-                ),
-                marker(
-                    wall_ns, frame, LABEL, number, TEXT,
-                    (x - 1.2 * fx, y - 1.2 * fy, z - 1.2 * fz + LETTERS_M, 0.0),
-                    (LETTERS_M,) * 3, (0.1, 0.1, 0.1, 1.0), text=f"{patch.normal_force:.1f} N",
-                ),
-            ]  # fmt: skip
-        return MSG.MarkerArray(made)
+        size = (TAXEL_M, TAXEL_M, TAXEL_M)
+        taxels = marker(
+            wall_ns, self._frame, TAXELS, 0, SPHERE_LIST, AT_ORIGIN, size, IDLE,
+            points=self._places, colours=self._colours(cycle),
+        )  # fmt: skip
+        felt = [
+            (_triple(patch.centroid), _triple(patch.force), patch.normal_force)
+            for patch in cycle.features.patches
+        ]
+        return MSG.MarkerArray(
+            [wipe(wall_ns, self._frame), taxels, *patch_markers(wall_ns, self._frame, felt)]
+        )
 
     def _colours(self, cycle: Cycle) -> list[Colour]:
         share = np.clip(-np.nan_to_num(cycle.force[:, 2]) / FULL_N, 0.0, 1.0)[:, None]
@@ -88,3 +71,38 @@ class SkinPicture:
         return [
             SICK if bad else (r, g, b, a) for bad, (r, g, b, a) in zip(sick, colours, strict=True)
         ]
+
+
+def patch_markers(
+    wall_ns: int, frame: str, patches: Iterable[tuple[Triple, Triple, float]]
+) -> list[Any]:
+    """Markers of contact patches: where (m), what pushes on the skin there (N), normal force (N).
+
+    The arrow of a force ends on the skin.
+    """
+    made = []
+    for number, ((x, y, z), force, normal) in enumerate(patches):
+        fx, fy, fz = (METRES_PER_N * part for part in force)
+        wide = TAXEL_M * (1.0 + 2.0 * min(1.0, normal / 10.0))
+        above = (x - 1.2 * fx, y - 1.2 * fy, z - 1.2 * fz + LETTERS_M, 0.0)
+        made += [
+            marker(
+                wall_ns, frame, CONTACT, number, SPHERE, (x, y, z, 0.0), (wide, wide, wide),
+                (0.9, 0.6, 0.0, 0.9),
+            ),
+            marker(
+                wall_ns, frame, FORCE, number, ARROW, AT_ORIGIN,
+                (SHAFT_M, 2 * SHAFT_M, 3 * SHAFT_M), (0.8, 0.1, 0.1, 1.0),
+                points=((x - fx, y - fy, z - fz), (x, y, z)),
+            ),
+            marker(
+                wall_ns, frame, LABEL, number, TEXT, above, (LETTERS_M, LETTERS_M, LETTERS_M),
+                (0.1, 0.1, 0.1, 1.0), text=f"{normal:.1f} N",
+            ),
+        ]  # fmt: skip
+    return made
+
+
+def _triple(vector: NDArray[np.float64]) -> Triple:
+    x, y, z = vector.tolist()
+    return x, y, z

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_bus.geometry import FINGER_OUTLINE, TIP_X
+from tactile_bus.markers import ADD, CYLINDER
 from tactile_tools.reach_series import Contact, ReachSeries, read_reach, turned
 
 if TYPE_CHECKING:
@@ -37,7 +38,6 @@ LEAST_N = 0.3  # weaker touches are not numbered
 FAINT_EVERY_S = 0.2  # all the other touches, as faint circles
 
 BELOW_M = 0.235  # how far in front of the shelf the picture begins
-CYLINDER = 3  # visualization_msgs/Marker
 
 
 def draw_reach(path: Path, out: Path) -> None:
@@ -131,8 +131,8 @@ def _objects(axes: Axes, reach: ReachSeries) -> None:
     """Draw walls and objects at the end; those that were moved at the start as well, dashed."""
     if reach.last_world is None:
         return
-    before = {m.id: m for m in reach.first_world.markers if m.ns == "objects"}
-    for marker in reach.last_world.markers:
+    before = {m.id: m for m in _shown(reach.first_world) if m.ns == "objects"}
+    for marker in _shown(reach.last_world):
         tone = (marker.color.r, marker.color.g, marker.color.b)
         if marker.ns == "cupboard":
             axes.add_patch(_shape(marker, facecolor=tone, edgecolor="none"))
@@ -151,6 +151,11 @@ def _objects(axes: Axes, reach: ReachSeries) -> None:
         axes.add_patch(_shape(gone, fill=False, edgecolor=TOUCHED, ls="--", lw=1.0))
         place = _flip((gone.pose.position.x, gone.pose.position.y))
         axes.annotate("off the shelf", place, ha="center", fontsize=8, color=TOUCHED)
+
+
+def _shown(world: Any) -> list[Any]:
+    """Markers of a message but for those that only take away another, as of a fallen object."""
+    return [marker for marker in world.markers if marker.action == ADD]
 
 
 def _shape(marker: Any, **look: Any) -> Any:

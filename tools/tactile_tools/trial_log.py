@@ -18,24 +18,33 @@ from sim_device.world.scene_markers import scene_markers
 from sim_device.world.scenes import Scene
 from tactile_bus.geometry import Side
 from tactile_bus.instant import WallClock
+from tactile_bus.markers import frame_transform, wipe
 from tactile_bus.messages import MSG, codec, header
 from tactile_bus.recorder import Recorder
 from tactile_bus.topics import (
+    AMBIENT,
     ARM_STATE,
     COMMAND,
+    CONTACTS,
     FEATURES,
+    FORCES,
+    GEOMETRY,
     REACH_EVENT,
     REACH_STATE,
+    TF,
     WORLD,
     Topic,
 )
 from tactile_tools.lockstep import Result, Step
+from tactiled.blocks import Cycle
 from tactiled.outgoing import MessageMaker
+from tactiled.skin_picture import SkinPicture, patch_markers
 
 EPOCH_NS = 1_700_000_000_000_000_000
 """Wall-clock time at which every trial begins: a log is a function of the trial alone."""
 
 WORLD_PERIOD_NS = 100_000_000
+FRAME_PERIOD_NS = 40_000_000
 MAX_QUEUED = 8192  # half of the recorder's queue: virtual time outruns a disk, nothing may be lost
 BOARD, ARM, REACH = "finger", "arm", "reach"
 
@@ -50,10 +59,13 @@ class TrialLog:
         self._recorder.metadata(
             "trial", {"strategy": strategy, "seed": str(seed), "scene_seed": str(scene.seed)}
         )
-        self._maker = MessageMaker(factory_calibration("finger", seed), self._wall)
+        calibration = factory_calibration("finger", seed)
+        self._maker = MessageMaker(calibration, self._wall)
+        self._picture = SkinPicture(calibration.geometry)
+        self._described = False
         self._strategy = strategy
         self._sequence = 0
-        self._next_world = 0
+        self._next_world = self._next_frame = 0
         self._felt = -1
         self._last = 0
         self._state = ""
@@ -87,13 +99,17 @@ class TrialLog:
             arm.v_max, arm.omega_max, arm.f_max, arm.m_max,
         )  # fmt: skip
         self._write(ARM_STATE, ARM, state, now)
+        if now >= self._next_frame:
+            self._next_frame = now + FRAME_PERIOD_NS
+            pose = (arm.x, arm.y, 0.0, arm.heading)
+            frame = frame_transform(self._wall.wall_ns(arm.captured), "cupboard", "ee", pose)
+            self._write(TF, "tf", frame, now)
         if touch is not None and touch.captured != self._felt:
             self._felt = touch.captured
             if step.cycle is not None:
-                features = self._maker.features(step.cycle)
+                self._skin(step.cycle)
             else:
-                features = self._features(touch, step.world.contacts())
-            self._write(FEATURES, BOARD, features, touch.captured)
+                self._contacts(touch, step.world.contacts())
         stamp = header(self._wall.wall_ns(now), "cupboard")
         sent = _twist(step.decision.twist)
         self._write(COMMAND, ARM, MSG.TwistStamped(stamp, sent), now)
@@ -110,6 +126,32 @@ class TrialLog:
         self._last = now
         while self._recorder.stats.queued > MAX_QUEUED:
             time.sleep(0.002)
+
+    def _skin(self, cycle: Cycle) -> None:
+        """Write what a board felt, as tactiled does."""
+        maker, captured = self._maker, cycle.captured
+        if not self._described:
+            self._described = True
+            geometry = maker.geometry(self._wall.wall_ns(captured))
+            self._write(GEOMETRY, BOARD, geometry, captured)
+        self._write(FEATURES, BOARD, maker.features(cycle), captured)
+        self._write(FORCES, BOARD, maker.forces(cycle), captured)
+        if cycle.ambient.method != "off":
+            self._write(AMBIENT, BOARD, maker.ambient(cycle), captured)
+        if self._picture.due(captured):
+            picture = self._picture.draw(cycle, self._wall.wall_ns(captured))
+            self._write(CONTACTS, BOARD, picture, captured)
+
+    def _contacts(self, touch: Touch, contacts: tuple[FingerContact, ...]) -> None:
+        """Write what was felt where there are no taxels: the engine's own contacts."""
+        self._write(FEATURES, BOARD, self._features(touch, contacts), touch.captured)
+        if self._picture.due(touch.captured):
+            wall_ns = self._wall.wall_ns(touch.captured)
+            felt = [
+                ((c.x, c.y, 0.0), (c.force_x, c.force_y, 0.0), c.normal_force) for c in contacts
+            ]
+            made = [wipe(wall_ns, "ee"), *patch_markers(wall_ns, "ee", felt)]
+            self._write(CONTACTS, BOARD, MSG.MarkerArray(made), touch.captured)
 
     def outcome(self, result: Result) -> None:
         """Write how it ended, at the last cycle's time."""
