@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup test lint demo demo-skin bench fuzz crash fidelity mutation clean
+.PHONY: setup test lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage stress clean
 
 setup: $(STAMP)
 
@@ -43,6 +43,19 @@ fidelity: setup
 
 mutation: setup
 	$(BIN)/tactile mutation --json docs/results/mutation.json
+
+# A million random inputs through the safety gate.
+gate-random: setup
+	REACH_RANDOM_INPUTS=1000000 REACH_RANDOM_JSON=docs/results/gate.json $(BIN)/python -m pytest -q tests/reach/test_gate_random.py
+
+# Every branch of the safety gate is taken by its tests, or this fails.
+gate-coverage: setup
+	REACH_RANDOM_INPUTS=4000 $(BIN)/python -m coverage run --branch --source=host/reachd -m pytest -q tests/reach -k gate
+	$(BIN)/python -m coverage report -m --fail-under=100 --include='*/safety.py,*/limits.py,*/stillness.py,*/finite.py'
+
+# An hour of reaching while the machine is loaded and its memory churned.
+stress: setup
+	$(BIN)/tactile bench --only stress --json docs/results/stress.json
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache
