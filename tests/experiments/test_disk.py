@@ -1,0 +1,169 @@
+"""Folders that cannot be used and disks that fill up: a clear message, finished trials kept."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tactile_tools.experiments import journal as journal_module
+from tactile_tools.experiments.journal import DiskError, FolderError, Journal, parse_lines
+from tactile_tools.experiments.rows import Row, outcome_of, read_table
+from tactile_tools.experiments.studies import Study, strategies_study
+
+Run = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture
+def rows(alone: Path) -> list[Row]:
+    return list(parse_lines((alone / "trials.jsonl").read_bytes())[0].values())
+
+
+def test_a_folder_of_another_experiment_is_refused_by_what_differs(
+    study: Study, alone: Path, options_of: Callable[..., Any], run_of: Run
+) -> None:
+    other = strategies_study(options_of(scenes=4), ("straight",))
+    before = (alone / "trials.jsonl").read_bytes()
+    with pytest.raises(FolderError) as caught:
+        run_of(other, alone)
+    text = str(caught.value)
+    assert "holds another experiment" in text
+    assert "scenes is 3 there and 4 here" in text
+    assert "strategies is" in text
+    assert "choose another --out" in text
+    assert (alone / "trials.jsonl").read_bytes() == before
+
+
+def test_a_folder_with_other_files_is_left_alone(study: Study, tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(FolderError, match=r"not empty \(it has thesis.tex\)"):
+        Journal(tmp_path, study.definition)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".lock", "thesis.tex"]
+
+
+def test_a_folder_in_use_is_refused(study: Study, tmp_path: Path) -> None:
+    with (
+        Journal(tmp_path / "run", study.definition),
+        pytest.raises(FolderError, match="another run is writing"),
+    ):
+        Journal(tmp_path / "run", study.definition)
+    Journal(tmp_path / "run", study.definition).close()
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"format": 99}', '{"format": 1}'])
+def test_a_damaged_definition_is_refused(text: str, study: Study, tmp_path: Path) -> None:
+    (tmp_path / "experiment.json").write_text(text)
+    with pytest.raises(FolderError):
+        Journal(tmp_path, study.definition)
+
+
+def test_a_disk_that_fills_up_keeps_what_was_finished(
+    study: Study, alone: Path, run_of: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, left = os.write, 3
+
+    def write(descriptor: int, data: bytes) -> int:
+        nonlocal left
+        if not data.startswith(b'{"source"'):
+            return real(descriptor, data)
+        left -= 1
+        # The last line that finds any room is written in part, as the kernel does.
+        if left < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(descriptor, data if left else data[:100])
+
+    monkeypatch.setattr(journal_module.os, "write", write)
+    with pytest.raises(DiskError, match=r"is full: make room; finished trials are kept"):
+        run_of(study, tmp_path / "run")
+    monkeypatch.undo()
+    assert len((tmp_path / "run" / "trials.jsonl").read_bytes().splitlines()) == 2
+    summary = run_of(study, tmp_path / "run")
+    assert (summary["this_session"]["resumed"], summary["this_session"]["damaged_lines"]) == (2, 0)
+    assert [outcome_of(r) for r in read_table(tmp_path / "run" / "trials.parquet")] == [
+        outcome_of(r) for r in read_table(alone / "trials.parquet")
+    ]
+
+
+def test_a_full_disk_while_the_tables_are_written_leaves_the_old_ones(
+    study: Study, alone: Path, run_of: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = (alone / "trials.parquet").read_bytes()
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("tactile_tools.experiments.rows.os.fsync", full)
+    with pytest.raises(DiskError, match="is full"):
+        run_of(study, alone)
+    monkeypatch.undo()
+    assert (alone / "trials.parquet").read_bytes() == before
+    assert not list(alone.glob("*.part"))
+
+
+LIMITED = """
+import resource, sys, json
+from pathlib import Path
+from tactile_tools.experiments.journal import DiskError, Journal, parse_lines
+resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))
+folder, rows = Path(sys.argv[1]), parse_lines(Path(sys.argv[2]).read_bytes())[0].values()
+with Journal(folder, {"study": "x"}) as journal:
+    journal.load()
+    try:
+        for row in rows:
+            journal.append(row)
+    except DiskError as error:
+        print(error)
+"""
+
+
+def test_a_real_short_write_leaves_whole_lines(alone: Path, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, str(tmp_path / "run"), str(alone / "trials.jsonl")],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert "finished trials are kept" in done.stdout
+    found, damaged = parse_lines((tmp_path / "run" / "trials.jsonl").read_bytes())
+    assert damaged == 0
+    assert 1 <= len(found) < 9
+
+
+def test_a_folder_that_may_not_be_made_says_so(study: Study, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DiskError, match="cannot write to"):
+        Journal(tmp_path / "file" / "run", study.definition)
+
+
+def test_lines_that_are_no_trials_are_counted(rows: list[Row]) -> None:
+    lines = [
+        b"null\n",
+        b'{"source": "hardware"}\n',
+        b"\xff\xfe\n",
+        b"[1]\n",
+        b"torn",
+    ]
+    assert parse_lines(b"".join(lines)) == ({}, 5)
+    assert parse_lines(b"") == ({}, 0)
+
+
+def test_a_row_of_the_wrong_kind_is_no_trial(rows: list[Row]) -> None:
+    import json
+
+    wrong = {**rows[0], "distance_m": "near"}
+    assert parse_lines(json.dumps(wrong).encode() + b"\n")[1] == 1
+    wrong = {k: v for k, v in rows[0].items() if k != "ejected"}
+    assert parse_lines(json.dumps(wrong).encode() + b"\n")[1] == 1
+
+
+def test_specifications_of_equal_values_are_equal_trials(study: Study) -> None:
+    spec = study.specs[0]
+    assert replace(spec) in {spec}
