@@ -29,36 +29,34 @@ def means_of(rows: ByStrategy, column: str) -> dict[str, float]:
     return {name: fmean(row[column] for row in of) for name, of in rows.items() if of}
 
 
-def worst_is_straight(
-    means: Mapping[str, float], pairs: Sequence[PairedValues], what: str, unit: str
-) -> str:
+def worst_is_straight(means: Mapping[str, float], pairs: Sequence[PairedValues], what: str) -> str:
     """Whether straight is significantly worst in a measure where less is better."""
     others = [name for name in means if name != "straight"]
     if "straight" not in means or not others:
         return ""
     against = {pair.b if pair.a == "straight" else pair.a: pair for pair in pairs
                if "straight" in (pair.a, pair.b)}  # fmt: skip
-    worse = {n: _signed(against[n], "straight") for n in others}
-    clear = [n for n in others if worse[n] > 0 and against[n].adjusted < SIGNIFICANT]
-    rest = [n for n in others if n not in clear]
-    spread = _range([means[n] for n in others])
-    start = f"In {what}, straight has a mean of {means['straight']:.3f}{unit}, the others {spread}"
-    if not rest:
+    beyond = {n for n in others if against[n].adjusted < SIGNIFICANT}
+    worse = [n for n in others if n in beyond and _signed(against[n], "straight") > 0]
+    better = [n for n in others if n in beyond and n not in worse]
+    start = (
+        f"In {what}, straight has a mean of {means['straight']:.3f}, the others "
+        f"{_range([means[n] for n in others])}"
+    )
+    if len(worse) == len(others):
         p = max(against[n].adjusted for n in others)
         return f"{start}: it is significantly worse than each of them (the greatest {told_p(p)})."
     told = []
-    for n in rest:
-        pair = against[n]
-        how = "significantly better than" if pair.adjusted < SIGNIFICANT else "no clear loser to"
-        if pair.adjusted < SIGNIFICANT or worse[n] > 0:
-            told.append(f"{how} {spoken(n)} ({told_p(pair.adjusted)})")
-        else:
-            told.append(f"not worse than {spoken(n)} ({told_p(pair.adjusted)})")
-    if clear:
-        beaten = f"it is significantly worse than {listed([spoken(n) for n in clear])}, but "
-    else:
-        beaten = "it is "
-    return f"{start}: {beaten}{listed(told)}."
+    for word, names in (
+        ("significantly worse than", worse),
+        ("not significantly different from", [n for n in others if n not in beyond]),
+        ("significantly better than", better),
+    ):
+        if names:
+            told.append(
+                f"{word} " + listed([f"{spoken(n)} ({told_p(against[n].adjusted)})" for n in names])
+            )
+    return f"{start}: it is {'; '.join(told)}."
 
 
 def faster_by_touch(means: Mapping[str, float], pairs: Sequence[PairedValues]) -> str:

@@ -59,7 +59,8 @@ CLAIMS = (
     Claim("hybrid event is faster than the clock", "hybrid_event", "hybrid_clock", "time"),
 )
 
-HOLDS, TENDS, FLIPS_SOMEWHAT, FLIPS, UNKNOWN = "holds", "tends so", "tends not", "flips", "–"
+HOLDS, TENDS, EVEN, TENDS_NOT, FLIPS = "holds", "tends so", "even", "tends not", "flips"
+UNKNOWN = "–"
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,9 +91,11 @@ class Point:
                      for s in scenes]  # fmt: skip
             gain = fmean(t[1] - t[0] for t in times)
             p = signed_rank([t[1] for t in times], [t[0] for t in times])[0]
+        if gain == 0:
+            return EVEN
         if gain > 0:
             return HOLDS if p < SIGNIFICANT else TENDS
-        return FLIPS if p < SIGNIFICANT and gain < 0 else FLIPS_SOMEWHAT
+        return FLIPS if p < SIGNIFICANT else TENDS_NOT
 
 
 def robustness_sections(run: Run) -> list[Section]:
@@ -147,17 +150,19 @@ def _findings(axes: Mapping[str, Sequence[Point]], strategies: Sequence[str]) ->
         if not known:
             continue
         flips = [v for v in known if v[2] == FLIPS]
-        against = [v for v in known if v[2] == FLIPS_SOMEWHAT]
+        against = [v for v in known if v[2] == TENDS_NOT]
         holds = sum(v[2] == HOLDS for v in known)
         tends = sum(v[2] == TENDS for v in known)
         text = f"{claim.text[0].upper()}{claim.text[1:]}: at {holds} of {len(known)} conditions "
         text += "beyond chance"
         if tends:
             text += f", at {tends} more by tendency"
+        if even := sum(v[2] == EVEN for v in known):
+            text += f", at {even} neither way"
         if flips:
-            text += f". It flips at {_places(flips)}"
+            text += f". It flips beyond chance at {_places(flips)}"
         if against:
-            text += f". It is not seen at {_places(against)}"
+            text += f". By tendency it is the other way at {_places(against)}"
         if not flips and not against:
             text += ", nowhere the other way"
         told.append(text + ".")

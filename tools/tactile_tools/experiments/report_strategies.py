@@ -94,10 +94,8 @@ def _section(name: str, by: ByStrategy, references: Sequence[Reference], prefix:
     means = {column: means_of(by, column) for column in MEASURES}
     paper = references[0] if references else None
     told = [
-        findings.worst_is_straight(
-            means["normalized_distance"], distance, "distance to the goal", ""
-        ),
-        findings.worst_is_straight(means["normalized_time"], time, "time", ""),
+        findings.worst_is_straight(means["normalized_distance"], distance, "distance to the goal"),
+        findings.worst_is_straight(means["normalized_time"], time, "time"),
         findings.faster_by_touch(means["normalized_time"], time),
         findings.order_of_success(ours, paper),
         *(findings.beside(ours, r) for r in references),
