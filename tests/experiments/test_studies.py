@@ -128,9 +128,9 @@ def test_speed_is_told_as_the_issue_counts_it(study: Study, made_row: Callable[.
 
 def test_memory_that_grows_is_seen(study: Study, made_row: Callable[..., Any]) -> None:
     spec = study.specs[0]
-    flat = [made_row(spec, worker="a", worker_trials=i, memory_mb=80.0) for i in range(1, 50)]
+    flat = [made_row(spec, worker="a", worker_trials=i, memory_mb=80.0) for i in range(1, 400)]
     leak = [
-        made_row(spec, worker="b", worker_trials=i, memory_mb=80 + 0.05 * i) for i in range(1, 50)
+        made_row(spec, worker="b", worker_trials=i, memory_mb=80 + 0.05 * i) for i in range(1, 400)
     ]
     assert memory_of(flat)["growth_mb_per_1000"] == pytest.approx(0.0)
     found = memory_of([*flat, *leak])

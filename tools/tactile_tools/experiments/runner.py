@@ -19,6 +19,9 @@ from tactile_tools.experiments.trial import software_version
 REFERENCE_CPU = 0.30
 """CPU-s that the authors' simulator needs for a simulated second, without making the scene."""
 
+WARM_UP = 100
+"""Trials after which caches and the allocator's pools of a worker have filled."""
+
 Progress = Callable[[int, int, Row | None], None]
 """Called with trials finished, trials in all, and the row that was finished just now."""
 
@@ -151,8 +154,8 @@ def summarize(rows: Sequence[Row]) -> dict[str, Any]:
 def memory_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Resident memory of the workers: peak, and growth by a line through each one's course.
 
-    ``growth_mb_per_1000``: the greatest of workers with at least 20 trials, the first five left
-    out as caches fill; None where there is no such worker.
+    ``growth_mb_per_1000``: the greatest of workers with enough trials after their first
+    `WARM_UP`; None where there is none.
     """
     import numpy as np
 
@@ -161,8 +164,8 @@ def memory_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         courses.setdefault(row["worker"], []).append((row["worker_trials"], row["memory_mb"]))
     slopes = []
     for course in courses.values():
-        ordered = np.array(sorted(course))[5:]
-        if len(ordered) >= 15:
+        ordered = np.array(sorted(course))[WARM_UP:]
+        if len(ordered) >= 2 * WARM_UP:
             slopes.append(1000 * float(np.polyfit(ordered[:, 0], ordered[:, 1], 1)[0]))
     return {
         "workers": len(courses),
