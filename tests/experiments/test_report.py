@@ -175,6 +175,23 @@ def test_groups_are_told_apart(filled: Filled, tmp_path: Path) -> None:
     assert {"authors_sim · mujoco · contacts", "authors_sim · mujoco · taxels"} < set(titles)
     names = [p.name for s in document.sections for p in s.pictures]
     assert len(names) == len(set(names)) == 6
+    headline, success, values = document.sections[0].tables
+    assert [row[0] for row in headline.rows] == titles[1:]
+    assert "A contacts, B taxels (authors_sim · mujoco)" in success.caption
+    assert [row[5] for row in success.rows] == ["6"] * 5
+    assert len(values.rows) == 5
+
+
+def test_a_run_that_was_put_by_can_be_reported_and_run_again(
+    filled: Filled, tmp_path: Path
+) -> None:
+    run = filled(strategies_study(options(scenes=30)), tmp_path / "run", like_the_paper)
+    first = write_report(run, tmp_path / "put", rows=True)
+    assert {"experiment.json", "trials.parquet"} <= {p.name for p in first.parent.iterdir()}
+    assert load_run(first.parent).rows == load_run(run).rows
+    again = write_report(first.parent, tmp_path / "again")
+    assert again.read_bytes() == first.read_bytes()
+    assert sum(p.stat().st_size for p in first.parent.iterdir()) < 1_000_000
 
 
 def test_the_sweep_is_smoothed_and_judged(filled: Filled, tmp_path: Path) -> None:

@@ -113,6 +113,11 @@ def _report(words: Words[argparse.ArgumentParser]) -> None:
         metavar="DIR",
         help="where the report, its PNGs and a small CSV of each table go (default: RUN)",
     )
+    parser.add_argument(
+        "--rows",
+        action="store_true",
+        help="put the table of trials there too, small, so that --out can be used as RUN",
+    )
     parser.set_defaults(func=_call("report"))
 
 

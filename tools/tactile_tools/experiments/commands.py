@@ -189,7 +189,7 @@ def _report(options: argparse.Namespace) -> int:
     from tactile_tools.experiments.report import write_report
 
     try:
-        path = write_report(options.run, options.out or options.run)
+        path = write_report(options.run, options.out or options.run, rows=options.rows)
     except OSError as error:
         raise DiskError(f"cannot write the report: {error}") from error
     print(f"wrote {path}")

@@ -72,6 +72,8 @@ def comparison(a: Sequence[Row], b: Sequence[Row]) -> tuple[TableData, TableData
 
     Trials are paired by scene, seed, strategy and whatever varies within the runs.
     """
+    if not a or not b:
+        return _tables([], [])
     dropped = set(_constant(a, b)) - {"source"}
     keys = ["scene_seed", "trial_seed", *(n for n in COMPARED if n not in dropped)]
     success, values = [], []
@@ -85,6 +87,10 @@ def comparison(a: Sequence[Row], b: Sequence[Row]) -> tuple[TableData, TableData
         success.append([strategy, *_success(left.values(), right.values(), of_a, of_b)])
         if common:
             values.append([strategy, *_values(of_a, of_b)])
+    return _tables(success, values)
+
+
+def _tables(success: list[list[str]], values: list[list[str]]) -> tuple[TableData, TableData]:
     return (
         TableData(
             caption="Success, B beside A",

@@ -12,7 +12,7 @@ from tactile_tools.experiments.report_strategies import strategy_sections
 from tactile_tools.experiments.report_sweep import sweep_sections
 from tactile_tools.experiments.rows import TableError
 from tactile_tools.experiments.runner import summarize
-from tactile_tools.experiments.tables import Run, load_run
+from tactile_tools.experiments.tables import Run, load_run, put_by
 
 PAPER = (
     "A robot arm with a finger reaches into a cluttered cupboard toward a place it cannot see. "
@@ -39,10 +39,17 @@ TITLES = {
 }
 
 
-def write_report(run_directory: Path, out: Path) -> Path:
-    """Write the report of the run into ``out``; its path. FolderError, TableError or OSError."""
+def write_report(run_directory: Path, out: Path, *, rows: bool = False) -> Path:
+    """Write the report of the run into ``out``; its path. FolderError, TableError or OSError.
+
+    ``rows``: put the run's table there too, from which any row can be run and the report be made
+    again.
+    """
     run = load_run(run_directory)
-    return build(run).write(out)
+    document = build(run)
+    if rows and out.resolve() != run_directory.resolve():
+        put_by(run, out)
+    return document.write(out)
 
 
 def build(run: Run) -> Document:

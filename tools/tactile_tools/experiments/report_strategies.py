@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 from statistics import fmean, median
 
 from tactile_tools.experiments import findings
+from tactile_tools.experiments.compare import comparison
 from tactile_tools.experiments.document import (
     Picture,
     Section,
@@ -36,7 +38,7 @@ from tactile_tools.experiments.statistics import (
     paired_rates,
     stars,
 )
-from tactile_tools.experiments.tables import Run
+from tactile_tools.experiments.tables import GROUP, Run
 
 MEASURES = {
     "normalized_distance": ("distance", "d_goal / d_scene at the end"),
@@ -71,21 +73,34 @@ def strategy_sections(run: Run) -> list[Section]:
         references = REFERENCES.get(group[0], ()) if own else ()
         sections.append(_section(name, by, references, slug(name) + "-" if several else ""))
     if several:
-        sections.insert(
-            0,
-            Section(
-                "At a glance",
-                tables=[
-                    TableData(
-                        "Success by parameter set, engine and sensing",
-                        ["", *(spoken(n) for n in order)],
-                        headline,
-                        name="headline",
-                    )
-                ],
+        tables = [
+            TableData(
+                "Success by parameter set, engine and sensing",
+                ["", *(spoken(n) for n in order)],
+                headline,
+                name="headline",
             ),
-        )
+            *_across(run),
+        ]
+        sections.insert(0, Section("At a glance", tables=tables))
     return sections
+
+
+def _across(run: Run) -> list[TableData]:
+    """Groups of the same scenes that differ in their engine, or in what is felt, side by side."""
+    tables = []
+    for (left, a), (right, b) in combinations(run.groups().items(), 2):
+        apart = [i for i in range(len(GROUP)) if left[i] != right[i]]
+        if apart not in ([GROUP.index("engine")], [GROUP.index("depth")]):
+            continue
+        shared = " · ".join(v for i, v in enumerate(left) if i not in apart)
+        names = f"A {left[apart[0]]}, B {right[apart[0]]} ({shared})"
+        good = ([r for r in rows if r["error"] is None] for rows in (a, b))
+        tables += [
+            replace(t, caption=f"{t.caption}: {names}", name=f"{slug(names)}-{t.name}")
+            for t in comparison(*good)
+        ]
+    return tables
 
 
 def _section(name: str, by: ByStrategy, references: Sequence[Reference], prefix: str) -> Section:

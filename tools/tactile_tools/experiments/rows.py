@@ -106,8 +106,14 @@ def whole(row: Mapping[str, Any]) -> bool:
     return all(row[name] is not None for name in IDENTITY)
 
 
-def write_tables(rows: Sequence[Row], directory: Path) -> tuple[Path, Path]:
+def write_tables(rows: Sequence[Row], directory: Path) -> None:
     """Write ``rows`` as trials.parquet and trials.csv, each whole or not at all; OSError."""
+    replace_file(directory / "trials.parquet", parquet_bytes(rows))
+    replace_file(directory / "trials.csv", csv_text(rows).encode())
+
+
+def parquet_bytes(rows: Sequence[Row]) -> bytes:
+    """``rows`` as a Parquet file whose columns carry their unit and meaning."""
     import pyarrow
     import pyarrow.parquet
 
@@ -125,11 +131,8 @@ def write_tables(rows: Sequence[Row], directory: Path) -> tuple[Path, Path]:
     )
     table = pyarrow.Table.from_pylist([{n: r[n] for n in NAMES} for r in rows], schema=schema)
     buffer = io.BytesIO()
-    pyarrow.parquet.write_table(table, buffer, compression="zstd")
-    parquet, text = directory / "trials.parquet", directory / "trials.csv"
-    replace_file(parquet, buffer.getvalue())
-    replace_file(text, csv_text(rows).encode())
-    return parquet, text
+    pyarrow.parquet.write_table(table, buffer, compression="zstd", compression_level=19)
+    return buffer.getvalue()
 
 
 def csv_text(rows: Sequence[Row], names: Sequence[str] = NAMES) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tactile_tools.experiments.journal import read_definition, read_lines
-from tactile_tools.experiments.rows import Row, sort_rows
+from tactile_tools.experiments.rows import Row, parquet_bytes, read_table, replace_file, sort_rows
 from tactile_tools.experiments.spec import spec_of
 from tactile_tools.experiments.studies import Options, Study, rebuild
 
@@ -46,10 +46,22 @@ class Run:
 
 
 def load_run(directory: Path) -> Run:
-    """The run in ``directory``; FolderError or TableError."""
+    """The run in ``directory``, or what was put by of one; FolderError or TableError."""
     definition: dict[str, Any] = read_definition(directory)
     study, options = rebuild(directory, definition)
-    finished = read_lines(directory)
+    table = directory / "trials.parquet"
+    if table.exists() and not (directory / "trials.jsonl").exists():
+        # A run that was put by: `put_by` leaves the table alone.
+        found = read_table(table)
+    else:
+        found = list(read_lines(directory).values())
     wanted = set(study.specs)
-    rows = sort_rows([row for row in finished.values() if spec_of(row) in wanted])
+    rows = sort_rows([row for row in found if spec_of(row) in wanted])
     return Run(directory, study, options, rows)
+
+
+def put_by(run: Run, directory: Path) -> None:
+    """Put into ``directory`` what `load_run` needs of ``run``, as small as it can be; OSError."""
+    directory.mkdir(parents=True, exist_ok=True)
+    replace_file(directory / "experiment.json", (run.directory / "experiment.json").read_bytes())
+    replace_file(directory / "trials.parquet", parquet_bytes(run.rows))
