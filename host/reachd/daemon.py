@@ -50,8 +50,11 @@ SWITCH_INTERVAL = 0.0002
 """s after which Python hands the interpreter on: the control loop must get it soon after it
 wakes."""
 
-ASK_COMMANDERS = 0.3
-"""s to ask the bus whether somebody else commands the arm."""
+ASK_COMMANDERS = 0.5
+"""s to ask the bus whether somebody else commands the arm; links take some of it to come about."""
+
+ASK_AGAIN = 0.02
+"""s between two such questions."""
 
 STOP_TIMEOUT = 0.3
 """s for the control loop to end: a cycle takes 10 ms."""
@@ -165,8 +168,12 @@ class Daemon:
         self._tokens = [
             session.liveliness().declare_token(key) for key in (mine, alive_key(name, "reach"))
         ]
-        replies = session.liveliness().get(f"arm/{arm}/commander/*", timeout=ASK_COMMANDERS)
-        others = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None} - {mine}
+        deadline = time.monotonic() + ASK_COMMANDERS
+        others: set[str] = set()
+        while not others and (left := deadline - time.monotonic()) > 0:
+            replies = session.liveliness().get(f"arm/{arm}/commander/*", timeout=left)
+            others = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None} - {mine}
+            time.sleep(ASK_AGAIN)
         if others:
             who = others.pop().rsplit("/", 1)[1].rpartition("-")[0]
             raise StartError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import signal
@@ -69,6 +70,7 @@ class FakeArm:
         self.force = (0.0, 0.0, 0.0)
         self.mode = "ready"
         self.paused = False
+        self.frozen: Any = None  # a state whose values are repeated under fresh stamps
         self.deaf_to_limits = False
         self.limits = ArmLimits(0.5, 1.0, 100.0, 20.0)
         self.heard: list[Heard] = []
@@ -126,8 +128,15 @@ class FakeArm:
                 data = codec().encode(ARM_STATE, self._state(sequence))
                 publisher.put(data, self._wall.wall_ns(monotonic_now()))
 
+    def freeze(self) -> None:
+        """Go on reporting what is the case now, whatever happens."""
+        self.frozen = self._state(0)
+
     def _state(self, sequence: int) -> Any:
         now, limits = monotonic_now(), self.limits
+        if self.frozen is not None:
+            stamp = header(self._wall.wall_ns(now), "cupboard")
+            return replace(self.frozen, header=stamp, captured_ns=now, sequence=sequence)
         vx, vy, omega = self.speed
         fx, fy, mz = self.force
         return MSG.ArmState(
@@ -147,16 +156,73 @@ class FakeArm:
         )
 
 
+class Wire:
+    """A TCP connection to ``target`` that can be cut so that neither end is told."""
+
+    def __init__(self, target: str) -> None:
+        self._target = int(target.rpartition(":")[2])
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+        self._whole = threading.Event()
+        self._whole.set()
+        self._ends: list[socket.socket] = [self._listener]
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self) -> None:
+        """Pass nothing on; what is sent stays under way."""
+        self._whole.clear()
+
+    def mend(self) -> None:
+        """Pass everything on again, and first what was under way."""
+        self._whole.set()
+
+    def close(self) -> None:
+        self._whole.set()
+        for end in self._ends:
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+            end.close()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = self._listener.accept()
+                far = self._far()
+                if far is None:
+                    near.close()
+                    continue
+                self._ends += [near, far]
+                for pair in ((near, far), (far, near)):
+                    threading.Thread(target=self._pump, args=pair, daemon=True).start()
+
+    def _far(self) -> socket.socket | None:
+        try:
+            return socket.create_connection(("127.0.0.1", self._target), timeout=SLOW)
+        except OSError:
+            return None  # nobody listens yet; whoever connects tries again
+
+    def _pump(self, source: socket.socket, sink: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(65536):
+                self._whole.wait()
+                sink.sendall(data)
+        for end in (source, sink):
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+
 class Program:
     """A process with its output in a file."""
 
-    def __init__(self, folder: Path, words: list[str]) -> None:
+    def __init__(self, folder: Path, words: list[str], **environment: str) -> None:
         self.output = folder / f"{time.monotonic_ns()}.txt"
         with self.output.open("wb") as file:
             self.process = subprocess.Popen(
                 [sys.executable, *words],
                 stdout=file, stderr=subprocess.STDOUT, cwd=folder,
-                env=os.environ | {"TACTILE_RUNTIME_DIR": str(folder), "COLUMNS": "200"},
+                env=os.environ
+                | {"TACTILE_RUNTIME_DIR": str(folder), "COLUMNS": "200"}
+                | environment,
             )  # fmt: skip
 
     @property
@@ -186,6 +252,7 @@ class Lab:
         self.states: list[Any] = []
         self._arm: FakeArm | None = None
         self._programs: list[Program] = []
+        self._wires: list[Wire] = []
 
     @property
     def arm(self) -> FakeArm:
@@ -196,13 +263,26 @@ class Lab:
                 session.declare_subscriber(topic.key("reach"), _into(topic, into))
         return self._arm
 
-    def board(self, name: str = "board0", ahead: float = 0.0, prefix: str = "") -> Program:
-        script = str(Path(__file__).with_name("board_process.py"))
-        return self._start([script, self.reachd_at, name, str(ahead), prefix])
+    def wire(self, target: str) -> Wire:
+        """A way to ``target`` that can be cut."""
+        self._wires.append(Wire(target))
+        return self._wires[-1]
 
-    def reachd(self, *words: str, listen: str | None = None) -> Program:
-        bus = ["--listen", listen or self.reachd_at, "--connect", self.arm_at]
-        return self._start(["-m", "reachd", *bus, *words])
+    def board(
+        self,
+        name: str = "board0",
+        ahead: float = 0.0,
+        prefix: str = "",
+        via: str | None = None,
+    ) -> Program:
+        script = str(Path(__file__).with_name("board_process.py"))
+        return self._start([script, via or self.reachd_at, name, str(ahead), prefix])
+
+    def reachd(
+        self, *words: str, listen: str | None = None, via: str | None = None, **environment: str
+    ) -> Program:
+        bus = ["--listen", listen or self.reachd_at, "--connect", via or self.arm_at]
+        return self._start(["-m", "reachd", *bus, *words], **environment)
 
     def ask(self, service: str, request: object = None) -> Any:
         return call(self.arm.session, service_key("reach", service, "reach"), request, SLOW)
@@ -218,11 +298,13 @@ class Lab:
     def close(self) -> None:
         for program in self._programs:
             program.end()
+        for wire in self._wires:
+            wire.close()
         if self._arm is not None:
             self._arm.close()
 
-    def _start(self, words: list[str]) -> Program:
-        program = Program(self.folder, words)
+    def _start(self, words: list[str], **environment: str) -> Program:
+        program = Program(self.folder, words, **environment)
         self._programs.append(program)
         return program
 

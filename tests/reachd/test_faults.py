@@ -1,0 +1,152 @@
+"""reachd as it is run, with what goes wrong round it: rows of the fault table, one by one."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+
+NEAR = ("--strategy", "straight", "--target", "0.04,0.0", "--seed", "1")
+FAR = ("--strategy", "straight", "--target", "0.36,0.0", "--seed", "1")
+
+Until = Callable[..., None]
+
+
+def stopped(lab: Any) -> bool:
+    """Whether the arm has been told to stand still for good: ten commands in a row."""
+    last = lab.arm.heard[-10:]
+    return len(last) == 10 and all(h.still for h in last)
+
+
+def test_an_arm_whose_state_freezes_latches_the_gate(lab: Any, wait_until: Until) -> None:
+    """Stamps and sequence go on, values do not: the arm moves, and nobody could see it."""
+    arm, _ = lab.arm, lab.board()
+    program = lab.reachd(*FAR, "--no-log")
+    lab.reaching(program)
+    wait_until(lambda: arm.travelled > 0.01)
+    arm.freeze()
+    assert program.wait() == 1, program.said
+    assert "does not change although the arm is told to move" in program.said
+    assert "arm_frozen" in lab.codes("intervention")
+    assert arm.heard[-1].still
+    # Told to move on for 0.3 s and what a busy machine adds, at 4 cm/s: not far.
+    assert arm.travelled < 0.2
+
+
+@pytest.mark.parametrize("hours", [1, -1])
+def test_a_step_of_the_system_clock_changes_nothing(
+    hours: int, lab: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Row 17: the processes' wall clocks step while the arm moves; only they, not the machine's."""
+    (lab.folder / "sitecustomize.py").write_text(
+        "import time\n"
+        "start, seconds, nanoseconds = time.monotonic(), time.time, time.time_ns\n"
+        f"step = lambda: {3600 * hours} if time.monotonic() - start > 3.0 else 0\n"
+        "time.time = lambda: seconds() + step()\n"
+        "time.time_ns = lambda: nanoseconds() + step() * 10**9\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(lab.folder))
+    arm, _ = lab.arm, lab.board()
+    program = lab.reachd(*NEAR, "--log", "trial.mcap")
+    assert program.wait() == 0, program.said
+    assert arm.travelled > 0.03
+    assert set(lab.codes("intervention")) <= {"not_armed", "features_lost", "features_stale",
+                                              "arm_stale", "arm_lost", "arm_limits",
+                                              "acceleration", "slow_down"}  # fmt: skip
+    with (lab.folder / "trial.mcap").open("rb") as file:
+        stamps = [
+            (message.log_time, message.publish_time)
+            for _, _, message in make_reader(file).iter_messages(log_time_order=False)
+        ]
+    assert len(stamps) > 300
+    logged = [log for log, _ in stamps]
+    assert max(logged) - min(logged) < 60e9
+    assert all(abs(log - published) < 10e9 for log, published in stamps)
+
+
+@pytest.mark.parametrize("side", ["board", "arm"])
+def test_a_network_that_falls_silent_stops_the_arm(side: str, lab: Any, wait_until: Until) -> None:
+    """Row 19: nobody's session ends and every liveliness token stands; age alone tells."""
+    arm = lab.arm
+    wire = lab.wire(lab.reachd_at if side == "board" else lab.arm_at)
+    lab.board(via=wire.endpoint if side == "board" else None)
+    program = lab.reachd(*FAR, "--no-log", via=wire.endpoint if side == "arm" else None)
+    lab.reaching(program)
+    wire.cut()
+    if side == "board":
+        wait_until(lambda: stopped(lab))
+    else:  # nor can reachd's zero reach it: its commands expire
+        wait_until(lambda: not arm.moving)
+    assert program.wait() == 1, program.said
+    assert "NOT REACHED (held)" in program.said
+    lost = "no valid features for" if side == "board" else "no arm state for"
+    assert lost in program.said
+    wire.mend()
+    assert not arm.moving or all(h.still for h in arm.heard[-3:])
+
+
+def test_a_short_silence_of_the_network_is_outlived(lab: Any, wait_until: Until) -> None:
+    """What comes late, all at once, is old: it is not acted on before it is new again."""
+    arm = lab.arm
+    wire = lab.wire(lab.reachd_at)
+    lab.board(via=wire.endpoint)
+    config = lab.folder / "reach.toml"
+    config.write_text("[parameters.safety]\nfeatures_latch = 30.0\n")
+    program = lab.reachd(*FAR, "--no-log", "--config", str(config))
+    lab.reaching(program)
+    wire.cut()
+    wait_until(lambda: stopped(lab))
+    wire.mend()
+    wait_until(lambda: arm.moving)
+    program.signal(signal.SIGTERM)
+    assert program.wait() == 1
+
+
+def test_a_load_at_the_limit_stops_motion_against_it(lab: Any, wait_until: Until) -> None:
+    """Row 25, judged on the arm's own state: the features see nothing."""
+    arm, _ = lab.arm, lab.board()
+    program = lab.reachd(*FAR, "--no-log")
+    lab.reaching(program)
+    wait_until(lambda: arm.travelled > 0.01)
+    fast = max(h.vx for h in arm.heard)
+    assert fast > 0.03
+    arm.force = (-13.5, 0.0, 0.0)  # 90 %: half of the approach is left
+    wait_until(lambda: all(h.vx < 0.6 * fast for h in arm.heard[-10:]))
+    arm.force = (-15.0, 0.0, 0.0)
+    wait_until(lambda: all(h.vx <= 1e-9 for h in arm.heard[-10:]))
+    assert "wrench" in lab.codes("intervention")
+    arm.force = (0.0, 0.0, 0.0)
+    wait_until(lambda: arm.heard[-1].vx > 0.8 * fast)
+    program.signal(signal.SIGTERM)
+    assert program.wait() == 1
+
+
+def test_a_target_that_is_not_reached_in_time_ends_in_zero(lab: Any) -> None:
+    """Row 36."""
+    arm, _ = lab.arm, lab.board()
+    program = lab.reachd(*FAR, "--no-log", "--time-limit", "1.5")
+    assert program.wait() == 1, program.said
+    assert "NOT REACHED (timeout)" in program.said
+    assert "not reached within 1.5 s" in program.said
+    assert all(h.still for h in arm.heard[-3:])
+    assert arm.travelled > 0.01
+
+
+def test_a_second_reachd_elsewhere_on_the_bus_is_refused(lab: Any, wait_until: Until) -> None:
+    """Row 35 where no lock is shared, as between two machines."""
+    arm, _ = lab.arm, lab.board()
+    first = lab.reachd("--serve", "--strategy", "straight", "--no-log")
+    wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
+    locks = lab.folder / "elsewhere"
+    locks.mkdir()
+    second = lab.reachd(
+        *NEAR, "--no-log", "--connect", lab.reachd_at, "--name", "other",
+        listen="tcp/127.0.0.1:0", TACTILE_RUNTIME_DIR=str(locks),
+    )  # fmt: skip
+    assert second.wait() == 3
+    assert "commanded by another reachd (reach 'reach') on this bus" in second.said
+    assert first.process.poll() is None
+    assert all(h.still for h in arm.heard)
