@@ -181,6 +181,13 @@ class Codec:
             self._schemas[msgtype] = schema
         return schema
 
+    def fields(self, msgtype: str) -> tuple[tuple[str, Any], ...]:
+        """Names and descriptions (rosbags' own) of a type's fields; ValueError when unknown."""
+        definition = self._store.fielddefs.get(msgtype)
+        if definition is None:
+            raise ValueError(f"no message type {msgtype!r}")
+        return tuple(definition[1])
+
     def _annotate(self, msgtype: str, text: str) -> str:
         """Put the remarks of our own definitions, with their units, beside the fields again."""
         notes = self._notes.get(msgtype.replace("/msg/", "/"), {})
@@ -194,11 +201,8 @@ class Codec:
 
     def _find_arrays(self, msgtype: str) -> tuple[tuple[str, np.dtype[Any]], ...]:
         """Fields of a type that must be numpy arrays: a same-sized wrong type encodes silently."""
-        definition = self._store.fielddefs.get(msgtype)
-        if definition is None:
-            raise ValueError(f"no message type {msgtype!r}")
         found = []
-        for name, description in definition[1]:
+        for name, description in self.fields(msgtype):
             if description[0] in (3, 4):  # rosbags Nodetype: array, sequence
                 element: Any = description[1][0]
                 if element[0] == 1 and element[1][0] in NUMBER_TYPES:  # of base type

@@ -137,7 +137,7 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
     time = np.asarray(board.feature_time)
     applied = _applied(press, time + (board.start_ns - power_on) * 1e-9)
     _summarise(board, applied)
-    from tactile_tools.plot import draw
+    from tactile_tools.plot_skin import draw
 
     draw(board, options.png, applied=(time, applied.sum(axis=1)))
     print(f"wrote {options.out} and {options.png}")

@@ -40,7 +40,7 @@ FAINT_EVERY_S = 0.2  # all the other touches, as faint circles
 BELOW_M = 0.235  # how far in front of the shelf the picture begins
 
 
-def draw_reach(path: Path, out: Path) -> None:
+def draw_reach(path: Path | Sequence[Path], out: Path) -> None:
     """Write the picture of the last reach in a log; LogUnreadableError when there is none."""
     import matplotlib as mpl  # 0.3 s: not before a picture is really wanted
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -133,7 +134,7 @@ def turned(points: Any, x: float, y: float, heading: float) -> Float:
     return np.asarray(np.asarray(points) @ np.array([[c, s], [-s, c]]) + (x, y))
 
 
-def read_reach(path: Path) -> ReachSeries:
+def read_reach(path: Path | Sequence[Path]) -> ReachSeries:
     """Return the last reach in a log; LogUnreadableError when there is none."""
     series: ReachSeries | None = None
     world: Any = None
@@ -153,8 +154,9 @@ def read_reach(path: Path) -> ReachSeries:
         if series is not None:
             _add(series, topic, message)
     if series is None or not series.arm:
+        first = path if isinstance(path, Path) else path[0]
         raise LogUnreadableError(
-            f"{path} holds no reach: was it written by reachd or `tactile reach --log`?"
+            f"{first} holds no reach: was it written by reachd or `tactile reach --log`?"
         )
     return series
 

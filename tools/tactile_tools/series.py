@@ -1,8 +1,8 @@
-"""Time series of one board out of a log, for plots and summaries."""
+"""Time series of boards out of a log, for plots and summaries. Memory is bounded on any length."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,37 +10,171 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bus.log_reader import read_messages
+from tactile_bus.log_bytes import Progress
 from tactile_bus.log_records import LogError
-from tactile_bus.messages import DecodeError, codec
-from tactile_bus.topics import AMBIENT, FEATURES, FORCES, GEOMETRY, Topic, find_topic
+from tactile_bus.messages import DROPS_PREFIX, DecodeError, codec, stamp_ns
+from tactile_bus.topics import (
+    AMBIENT,
+    DIAGNOSTICS,
+    FEATURES,
+    FIELD,
+    FORCES,
+    GEOMETRY,
+    LOG,
+    REACH_EVENT,
+    Topic,
+    find_topic,
+)
+from tactile_tools.logs.decode import Decoder
+from tactile_tools.logs.sources import find_series
+from tactile_tools.logs.stream import Reading, Record, Stream, read_merged
+from tactile_tools.logs.terminal import ToolError
 
 Float = NDArray[np.float64]
 
-WANTED = frozenset({AMBIENT, FEATURES, FORCES, GEOMETRY})
+WANTED = frozenset({AMBIENT, DIAGNOSTICS, FEATURES, FIELD, FORCES, GEOMETRY, LOG, REACH_EVENT})
 
-MAX_POINTS = 200_000
-"""Cycles kept for a plot: over half an hour at 100 Hz; no picture shows more."""
+MAX_POINTS = 16_384
+"""Points of one curve: ten times the pixels of a picture's width. Beyond, every two become one."""
+
+MAX_EVENTS = 200
+"""Remarks and events kept: more would not be legible."""
+
+WARNING = 30
+"""Level of ``rcl_interfaces/Log`` from which a remark is an event."""
+
+LATENCY_BINS = np.geomspace(1e-5, 100.0, 281)
+"""s; 40 to a decade, so that a percentile is right to 6 %."""
 
 
 class LogUnreadableError(Exception):
     """The file is no MCAP log, or holds nothing that was asked for. The text names the remedy."""
 
 
+class Track:
+    """Points of one curve. When there are too many, of every two neighbours the greater stays."""
+
+    def __init__(self, limit: int = MAX_POINTS) -> None:
+        self.time: list[float] = []
+        self.items: list[Any] = []
+        self._weights: list[float] = []
+        self._limit = limit
+        self._share = 1
+        self._best: tuple[float, float, Any] | None = None
+        self._taken = 0
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def add(self, time: float, item: Any, weight: float = 0.0) -> None:
+        """Add a point; ``weight``: what makes it worth keeping beside its neighbour."""
+        if self._best is None or weight > self._best[1]:
+            self._best = (time, weight, item)
+        self._taken += 1
+        if self._taken < self._share:
+            return
+        kept, weight, item = self._best
+        self._best, self._taken = None, 0
+        self.time.append(kept)
+        self.items.append(item)
+        self._weights.append(weight)
+        if len(self.time) >= self._limit:
+            self._halve()
+
+    def _halve(self) -> None:
+        weights = np.nan_to_num(np.array(self._weights))
+        first = weights[0::2] >= weights[1::2]
+        chosen = np.arange(0, len(weights), 2) + ~first
+        self.time = [self.time[i] for i in chosen.tolist()]
+        self.items = [self.items[i] for i in chosen.tolist()]
+        self._weights = [self._weights[i] for i in chosen.tolist()]
+        self._share *= 2
+
+
+@dataclass(eq=False)
+class Spread:
+    """Distribution of a duration, s; exact count, least, greatest and mean, percentiles to 6 %."""
+
+    counts: NDArray[np.int64] = field(
+        default_factory=lambda: np.zeros(len(LATENCY_BINS) + 1, np.int64)
+    )
+    total: float = 0.0
+    least: float = np.inf
+    greatest: float = -np.inf
+
+    def add(self, seconds: float) -> None:
+        """Count one."""
+        self.counts[int(np.searchsorted(LATENCY_BINS, seconds))] += 1
+        self.total += seconds
+        self.least, self.greatest = min(self.least, seconds), max(self.greatest, seconds)
+
+    @property
+    def number(self) -> int:
+        """How many were counted."""
+        return int(self.counts.sum())
+
+    def percentile(self, share: float) -> float:
+        """s below which ``share`` (0 to 1) of them lie; NaN for none."""
+        if not self.number:
+            return float("nan")
+        index = int(np.searchsorted(np.cumsum(self.counts), share * self.number))
+        edge = LATENCY_BINS[min(index, len(LATENCY_BINS) - 1)]
+        return float(min(max(edge, self.least), self.greatest))
+
+
 @dataclass(eq=False)
 class BoardSeries:
-    """What a log says of one board. Times are s since the first cycle; lists grow together."""
+    """What a log says of one board. Times are s since the first cycle of the log."""
 
     name: str
     start_ns: int = 0  # monotonic clock of the sender at time 0
     geometry: Any = None
-    time: list[float] = field(default_factory=list)
-    force: list[Float] = field(default_factory=list)  # (N, 3) N, taxel axes
-    latency: list[float] = field(default_factory=list)  # s, captured to received
-    feature_time: list[float] = field(default_factory=list)
-    features: list[Any] = field(default_factory=list)
-    ambient_time: list[float] = field(default_factory=list)
-    ambient: list[Any] = field(default_factory=list)
+    cycles: int = 0
+    first: float = 0.0
+    last: float = 0.0
+    lost: int = 0  # cycles by the gaps of their numbers
+    forces: Track = field(default_factory=Track)  # (N, 3) N, taxel axes
+    delays: Track = field(default_factory=Track)  # (captured to received, uncertainty, to log), s
+    felt: Track = field(default_factory=Track)  # features
+    removed: Track = field(default_factory=Track)  # ambient
+    warmth: Track = field(default_factory=Track)  # °C, one an array
+    told: Track = field(default_factory=Track)  # diagnostics as a dictionary
+    latency_spread: Spread = field(default_factory=Spread)
+    logging_spread: Spread = field(default_factory=Spread)
+    period_spread: Spread = field(default_factory=Spread)
+    events: list[tuple[float, str]] = field(default_factory=list)
+    drops: dict[str, int] = field(default_factory=dict)
+    _sequence: int | None = None
+
+    @property
+    def time(self) -> list[float]:
+        """Of `force`."""
+        return self.forces.time
+
+    @property
+    def force(self) -> list[Float]:
+        """(N, 3) N each."""
+        return self.forces.items
+
+    @property
+    def feature_time(self) -> list[float]:
+        """Of `features`."""
+        return self.felt.time
+
+    @property
+    def features(self) -> list[Any]:
+        """Messages."""
+        return self.felt.items
+
+    @property
+    def ambient_time(self) -> list[float]:
+        """Of `ambient`."""
+        return self.removed.time
+
+    @property
+    def ambient(self) -> list[Any]:
+        """Messages."""
+        return self.removed.items
 
     def array_slices(self) -> list[tuple[str, slice]]:
         """Name and taxels of each array, in order."""
@@ -56,58 +190,142 @@ class BoardSeries:
         force = np.zeros((len(self.features), len(self.array_slices())))
         for row, features in enumerate(self.features):
             for patch in features.patches:
-                force[row, patch.array] += patch.normal_force
+                if patch.array < force.shape[1]:
+                    force[row, patch.array] += patch.normal_force
         return force
 
+    def take(self, topic: Topic, message: Any, log_ns: int, start: int) -> None:
+        """Add one message of this board; ``start``: monotonic ns of time 0."""
+        if topic == GEOMETRY:
+            self.geometry = message
+        elif topic == DIAGNOSTICS:
+            self._take_diagnostics(message)
+        elif topic == LOG:
+            if message.level >= WARNING and len(self.events) < MAX_EVENTS:
+                self.events.append((self.last, message.msg))
+        elif topic == FORCES:
+            self._take_forces(message, log_ns, (message.captured_ns - start) * 1e-9)
+        else:
+            now = (message.captured_ns - start) * 1e-9
+            if topic == FEATURES:
+                total = sum(patch.normal_force for patch in message.patches)
+                self.felt.add(now, message, max(total, message.peak_force))
+            elif topic == AMBIENT:
+                self.removed.add(now, message)
+            elif topic == FIELD:
+                self.warmth.add(now, np.asarray(message.temperature_c, np.float32).copy())
 
-def messages(path: Path, wanted: frozenset[Topic] = WANTED) -> Iterator[tuple[Topic, str, Any]]:
+    def _take_forces(self, message: Any, log_ns: int, now: float) -> None:
+        force = np.asarray(message.force, np.float32).reshape(-1, 3).copy()
+        self.forces.add(now, force, float(np.nan_to_num(-force[:, 2]).max(initial=0.0)))
+        delay = (message.received_ns - message.captured_ns) * 1e-9
+        # The header's stamp is the captured instant on the wall clock that the log goes by.
+        offset = stamp_ns(message.header.stamp) - message.captured_ns
+        logged = (log_ns - offset - message.received_ns) * 1e-9
+        self.delays.add(now, (delay, float(message.uncertainty), logged), delay + max(0.0, logged))
+        self.latency_spread.add(delay)
+        self.logging_spread.add(logged)
+        if self.cycles:
+            self.period_spread.add(now - self.last)
+        else:
+            self.first = now
+        if self._sequence is not None:
+            step = (message.sequence - self._sequence) & 0xFFFFFFFF
+            self.lost += step - 1 if 0 < step < 1 << 31 else 0
+        self._sequence = message.sequence
+        self.cycles += 1
+        self.last = now
+
+    def _take_diagnostics(self, message: Any) -> None:
+        for status in message.status:
+            if status.name == f"tactiled/{self.name}":
+                values = {pair.key: pair.value for pair in status.values}
+                self.told.add(self.last, values)
+                self.drops = {
+                    key.removeprefix(DROPS_PREFIX): int(text)
+                    for key, text in values.items()
+                    if key.startswith(DROPS_PREFIX) and text.isdecimal()
+                }
+
+
+def messages(
+    source: Path | Sequence[Path],
+    wanted: frozenset[Topic] = WANTED,
+    progress: Progress | None = None,
+) -> Iterator[tuple[Topic, str, Any]]:
     """Yield (topic, name, message) of a log in file order, also of one that was cut off.
 
     LogUnreadableError when the file cannot be read, or when a message is not what it says.
     """
-    decode = codec().decode
+    for topic, name, message, _ in _timed(source, wanted, progress):
+        yield topic, name, message
+
+
+def _timed(
+    source: Path | Sequence[Path], wanted: frozenset[Topic], progress: Progress | None
+) -> Iterator[tuple[Topic, str, Any, int]]:
+    """The same with the log time of each."""
+    decoder = Decoder()
     found: dict[str, tuple[Topic, str] | None] = {}
+    checked: set[Stream] = set()
+
+    def is_wanted(name: str) -> bool:
+        found[name] = known = find_topic(name)
+        return known is not None and known[0] in wanted
+
+    paths = [source] if isinstance(source, Path) else list(source)
     try:
-        for channel, record in read_messages(path):
-            if channel.topic not in found:
-                found[channel.topic] = find_topic(channel.topic)
-            if (known := found[channel.topic]) is not None and known[0] in wanted:
-                yield *known, decode(known[0], record.data)
-    except (LogError, DecodeError) as error:
+        logs = find_series(paths)
+        for _, item in read_merged(logs, Reading(), progress, is_wanted):
+            if isinstance(item, Record) and (known := found[item.stream.topic]) is not None:
+                if item.stream.msgtype != known[0].msgtype:
+                    continue  # another program's topic of the same name
+                if item.stream not in checked:
+                    checked.add(item.stream)
+                    _require_fields(decoder, item.stream)
+                yield *known, decoder.decode(item.stream, item.data), item.log_ns
+    except (LogError, DecodeError, ToolError) as error:
         raise LogUnreadableError(str(error)) from error
     except OSError as error:
-        raise LogUnreadableError(f"{path}: {error.strerror}") from error
+        raise LogUnreadableError(f"{paths[0]}: {error.strerror}") from error
 
 
-def read_boards(path: Path) -> dict[str, BoardSeries]:
+def _require_fields(decoder: Decoder, stream: Stream) -> None:
+    """DecodeError where another version's definition lacks a field that this one goes by."""
+    ours = {name for name, _ in codec().fields(stream.msgtype)}
+    theirs = {name for name, _ in decoder.reader(stream).fields[stream.msgtype][1]}
+    if lacking := ours - theirs:
+        raise DecodeError(
+            f"{stream.topic} is of another version: its {stream.msgtype} has no "
+            f"{', '.join(sorted(lacking))}; use the tools of the version that wrote it"
+        )
+
+
+def read_boards(
+    source: Path | Sequence[Path], progress: Progress | None = None
+) -> dict[str, BoardSeries]:
     """Return the series of every board in a log, by board name; raises LogUnreadableError."""
     boards: dict[str, BoardSeries] = {}
+    reach: list[tuple[int, str]] = []
     start: int | None = None
-    for topic, name, message in messages(path):
-        board = boards.setdefault(name, BoardSeries(name))
-        if topic == GEOMETRY:
-            board.geometry = message
+    for topic, name, message, log_ns in _timed(source, WANTED, progress):
+        if topic == REACH_EVENT:
+            if message.kind != "intervention" and len(reach) < MAX_EVENTS:
+                reach.append((message.stamped_ns, f"{message.kind}: {message.code}"))
             continue
-        captured = message.captured_ns
+        board = boards.setdefault(name, BoardSeries(name))
         if start is None:
-            start = captured
-        now = (captured - start) * 1e-9
-        if topic == FORCES and len(board.time) < MAX_POINTS:
-            board.time.append(now)
-            board.force.append(np.asarray(message.force, float).reshape(-1, 3))
-            board.latency.append((message.received_ns - captured) * 1e-9)
-        elif topic == FEATURES and len(board.feature_time) < MAX_POINTS:
-            board.feature_time.append(now)
-            board.features.append(message)
-        elif topic == AMBIENT and len(board.ambient_time) < MAX_POINTS:
-            board.ambient_time.append(now)
-            board.ambient.append(message)
+            start = getattr(message, "captured_ns", None)
+        board.take(topic, message, log_ns, start or 0)
+    boards = {n: b for n, b in boards.items() if b.geometry is not None and b.time}
     for board in boards.values():
         board.start_ns = start or 0
-    boards = {n: b for n, b in boards.items() if b.geometry is not None and b.time}
+        board.events += [((at - board.start_ns) * 1e-9, text) for at, text in reach]
+        board.events.sort()
     if not boards:
+        paths = source if isinstance(source, Path) else source[0]
         raise LogUnreadableError(
-            f"{path} holds no taxel forces: was it written by tactiled? "
-            f"`tactile log info {path}` lists what is in it"
+            f"{paths} holds no taxel forces: was it written by tactiled? "
+            f"`tactile log info {paths}` lists what is in it"
         )
     return boards
