@@ -145,7 +145,7 @@ def make_settings(options: argparse.Namespace) -> Settings:
         parameters=values,
         seed=secrets.randbelow(SEEDS) if seed is None else seed,
         goal=goal,
-        home=_home(options, file),
+        home=_home(options, file, values),
         auto_reset=file.auto_reset,
         board=board,
         arm=arm,
@@ -207,7 +207,7 @@ def _goal(options: argparse.Namespace, file: ConfigFile, values: Parameters) -> 
         raise SettingsError(str(error)) from error
 
 
-def _home(options: argparse.Namespace, file: ConfigFile) -> Pose | None:
+def _home(options: argparse.Namespace, file: ConfigFile, values: Parameters) -> Pose | None:
     given = file.home
     if options.home is not None:
         try:
@@ -221,4 +221,19 @@ def _home(options: argparse.Namespace, file: ConfigFile) -> Pose | None:
         return None
     if not all(math.isfinite(v) for v in given):
         raise SettingsError(f"home {given} is not finite")
-    return Pose(given[0], given[1], math.radians(given[2]))
+    home = Pose(given[0], given[1], math.radians(given[2]))
+    safety = values.safety
+    tip_x = home.x + safety.tip_length * math.cos(home.heading)
+    tip_y = home.y + safety.tip_length * math.sin(home.heading)
+    for what, region, x, y in (
+        ("pivot", safety.pivot_region, home.x, home.y),
+        ("tip", safety.tip_region, tip_x, tip_y),
+    ):
+        if region.depth(x, y) < 0.0:
+            corners = ", ".join(f"({cx:g}, {cy:g})" for cx, cy in region.corners)
+            raise SettingsError(
+                f"at home {given[0]:g},{given[1]:g},{given[2]:g} the {what} is at {x:.3f}, "
+                f"{y:.3f} m, outside the region where it may go, with corners {corners}; change "
+                f"the home or safety.{what}_region"
+            )
+    return home

@@ -79,7 +79,7 @@ class Supervisor:
         self._home = home
         self._auto_reset = auto_reset
         self._state = State.IDLE
-        self._since = Instant(0)
+        self._since: Instant | None = None  # until the first cycle
         self._activity = "idle"
         self._text = ""
         self._returning = False
@@ -127,7 +127,7 @@ class Supervisor:
         return Status(
             state=self._state,
             activity=self._activity,
-            elapsed=seconds_between(self._since, now),
+            elapsed=self._elapsed(now),
             goal=None if trial is None or self._state is State.IDLE else trial.goal,
             distance=math.nan if trial is None else trial.distance,
             text=self._text,
@@ -136,6 +136,8 @@ class Supervisor:
 
     def step(self, touch: Touch | None, arm: ArmState | None, now: Instant) -> Command:
         """What is wanted in this cycle; zero as long as an input has never come."""
+        if self._since is None:
+            self._since = now
         trial = self._trial
         if trial is None or self._state is State.IDLE:
             return Command(ZERO)
@@ -196,9 +198,13 @@ class Supervisor:
     def _towards_home(self, arm: ArmState) -> Twist | None:
         return None if self._home is None else home_twist(arm, self._home, self._parameters)
 
+    def _elapsed(self, now: Instant) -> float:
+        """s since the state began."""
+        return 0.0 if self._since is None else seconds_between(self._since, now)
+
     def _in_time(self, twist: Twist, now: Instant) -> Command:
         """``twist``, or standing still when going home takes too long."""
-        if seconds_between(self._since, now) < HOMING_LIMIT:
+        if self._elapsed(now) < HOMING_LIMIT:
             return Command(twist)
         text = f"not home after {HOMING_LIMIT:g} s: free the arm and bring it home by hand"
         if self._state is State.HOMING:

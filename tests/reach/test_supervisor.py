@@ -420,3 +420,10 @@ def test_home_is_a_pose_with_a_tolerance(pose: tuple[float, float, float], there
     arm = Bench(pose=pose).arm()
     twist = home_twist(arm, HOME, HARDWARE)
     assert (twist is None) == there
+
+
+def test_time_spent_idle_counts_from_the_first_cycle() -> None:
+    supervisor = Supervisor(load_strategy("straight", HARDWARE, np.random.default_rng(1)), HARDWARE)
+    assert supervisor.status(T0).elapsed == 0.0
+    supervisor.step(None, None, T0)
+    assert supervisor.status(after(T0, 1.5)).elapsed == pytest.approx(1.5)
