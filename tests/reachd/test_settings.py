@@ -120,7 +120,7 @@ def test_a_wrong_file_is_refused_by_line(tmp_path: Path, text: str, line: int, w
         (("--home", "1,2"), "X,Y,DEGREES"),
         (("--home", "1,2,inf"), "not finite"),
         (("--home", "9,0,0"), "the pivot is at 9.000, 0.000 m, outside the region"),
-        (("--home=-0.2,0.2,90"), "the tip is at -0.200, 0.358 m, outside the region"),
+        (("--home=-0.2,0.2,90",), "the tip is at -0.200, 0.358 m, outside the region"),
         (("--board", "a/b"), "letters"),
         (("--arm", "*"), "letters"),
     ],
