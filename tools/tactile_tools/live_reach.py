@@ -96,7 +96,13 @@ class LiveReach:
     """
 
     def __init__(
-        self, folder: Path, scene: Sequence[str], *, strategy: str, relay: bool = False
+        self,
+        folder: Path,
+        scene: Sequence[str],
+        *,
+        strategy: str,
+        relay: bool = False,
+        real_time: bool = True,
     ) -> None:
         self.folder = folder
         self.heard: dict[Topic, list[tuple[int, bytes]]] = {t: [] for t in WATCHED}
@@ -104,6 +110,11 @@ class LiveReach:
         self._with_relay = relay
         self._scene = scene
         self._strategy = strategy
+        # What is asked of reachd beside: no priority even where the system would grant it.
+        self._config: list[str] = []
+        if not real_time:
+            (folder / "ordinary.toml").write_text("[loop]\npriority = 0\n", encoding="utf-8")
+            self._config = ["--config", "ordinary.toml"]
         self._ends = {n: f"tcp/127.0.0.1:{free_port()}" for n in ("cupboard", "tactiled", "reachd")}
         self._started = 0
         self._running: dict[str, subprocess.Popen[bytes]] = {}
@@ -192,7 +203,7 @@ class LiveReach:
             ]
         return [
             *(command("reachd"), "--serve", "--strategy", self._strategy, "--set", "authors_sim"),
-            *("--board", BOARD, "--seed", "1", "--log", log),
+            *("--board", BOARD, "--seed", "1", "--log", log, *self._config),
             *("--listen", reach, "--connect", arm, "--connect", skin),
         ]
 
@@ -268,13 +279,17 @@ class LiveReach:
                     raise WatchError(f"no reach could be begun: {error}") from error
                 time.sleep(0.05)
 
+    def ended(self) -> bool:
+        """Whether the last that was heard of the reach is its end."""
+        return bool(self.heard[REACH_STATE]) and self.last(REACH_STATE).state == "resetting"
+
     def moving(self) -> bool:
         """Whether the arm moves."""
         states = self.heard[ARM_STATE]
         return bool(states) and is_moving(self.last(ARM_STATE).twist)
 
 
-def is_moving(twist: Any) -> bool:
-    """Whether a twist of a message is not that of an arm at rest: 0.1 mm/s, 0.1 mrad/s."""
+def is_moving(twist: Any, at_rest: float = 1e-4) -> bool:
+    """Whether a twist of a message is above ``at_rest`` (m/s, rad/s) in any part."""
     linear, angular = twist.linear, twist.angular
-    return bool(max(abs(linear.x), abs(linear.y), abs(angular.z)) > 1e-4)
+    return bool(max(abs(linear.x), abs(linear.y), abs(angular.z)) > at_rest)
