@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from tactile_tools.experiments.backends import BackendError
 from tactile_tools.experiments.dask_backend import DaskCluster
 from tactile_tools.experiments.rows import Row, outcome_of, read_table
 from tactile_tools.experiments.runner import run_study
-from tactile_tools.experiments.studies import Study
+from tactile_tools.experiments.studies import Study, strategies_study
 
 distributed = pytest.importorskip("distributed", reason="Dask is an optional extra")
 
@@ -22,8 +22,37 @@ def silent(finished: int, total: int, row: Row | None) -> None:
     """No progress."""
 
 
+KILLER = """
+import os
+
+class Killer:
+    activity = "killing"
+
+    def __init__(self, parameters, rng):
+        pass
+
+    def start(self, goal, now):
+        pass
+
+    def step(self, touch, arm, goal, now):
+        os.kill(os.getpid(), 9)
+"""
+
+
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Any]:
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    import dask
+
+    folder = tmp_path_factory.mktemp("plugin")
+    (folder / "killer.py").write_text(KILLER)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(folder))  # which the workers' processes inherit
+        # One dead worker is enough to give a task up: each takes seconds to start again.
+        with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
+            yield from started()
+
+
+def started() -> Iterator[Any]:
     with distributed.LocalCluster(
         n_workers=2,
         threads_per_worker=1,
@@ -45,6 +74,16 @@ def test_two_dask_workers_give_the_rows_of_one_process(
     ]
     assert summary["this_session"]["workers"] == 2
     assert len({row["worker"] for row in rows}) == 2
+
+
+def test_a_trial_that_kills_its_worker_is_a_row_and_its_neighbours_are_not(
+    cluster: Any, options_of: Callable[..., Any], tmp_path: Path
+) -> None:
+    study = strategies_study(options_of(scenes=1), ("killer:Killer", "straight"))
+    run_study(study, tmp_path / "run", DaskCluster(cluster.scheduler_address), silent)
+    rows = {row["strategy"]: row for row in read_table(tmp_path / "run" / "trials.parquet")}
+    assert "workers that ran it died" in rows["killer:Killer"]["error"]
+    assert rows["straight"]["error"] is None
 
 
 def test_no_scheduler_says_where_and_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:

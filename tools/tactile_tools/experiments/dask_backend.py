@@ -71,16 +71,20 @@ class DaskCluster:
 
         waiting = deque(batches(specs, BATCH))
         asked: dict[Any, list[TrialSpec]] = {}
+        suspects: deque[TrialSpec] = deque()
         done = as_completed([], loop=self._client.loop)
         try:
-            while waiting or asked:
+            while waiting or asked or suspects:
                 while waiting and len(asked) < AHEAD * self.workers:
                     batch = waiting.popleft()
                     future = self._submit(batch)
                     asked[future] = batch
                     done.add(future)
-                future = next(done)
-                yield from self._take(future, asked.pop(future), waiting)
+                if asked:
+                    future = next(done)
+                    yield from self._take(future, asked.pop(future), suspects)
+                else:
+                    yield self._try(suspects.popleft())
         except OSError as error:
             raise self._gone(error) from error
 
@@ -91,27 +95,44 @@ class DaskCluster:
         return self._client.submit(run_batch, list(batch), pure=False)
 
     def _take(
-        self, future: Any, batch: list[TrialSpec], waiting: deque[list[TrialSpec]]
+        self, future: Any, batch: list[TrialSpec], suspects: deque[TrialSpec]
     ) -> Iterator[Row]:
-        """Rows of a task that ended; a batch that killed its workers is tried one by one."""
+        """Rows of a task that ended; the trials of one whose workers died are suspects."""
+        if self._died(future):
+            suspects.extend(batch)
+        else:
+            yield from future.result()
+
+    def _try(self, spec: TrialSpec) -> Row:
+        """The row of a suspect, run while nothing else runs that could kill its worker."""
+        from distributed import wait
+
+        from tactile_tools.experiments.trial import lost
+
+        future = self._submit([spec])
+        with self._client.as_current():
+            wait(future)
+        if self._died(future):
+            return lost(spec, "the Dask workers that ran it died, one after another")
+        row: Row = future.result()[0]
+        return row
+
+    def _died(self, future: Any) -> bool:
+        """Whether the workers of a task that ended died of it, or of its neighbours; BackendError
+        where it ended in any other way than with its rows.
+        """
         from distributed.scheduler import KilledWorker
 
         if future.status == "finished":
-            yield from future.result()
-            return
+            return False
         if future.status in ("lost", "cancelled"):
             raise self._gone(future.status)
         error = future.exception()
-        if not isinstance(error, KilledWorker):
-            raise BackendError(
-                f"a worker of {self._address} cannot run trials: {type(error).__name__}: {error}"
-            )
-        if len(batch) > 1:
-            waiting.extend([spec] for spec in batch)
-            return
-        from tactile_tools.experiments.trial import lost
-
-        yield lost(batch[0], f"the workers that ran it died: {error}")
+        if isinstance(error, KilledWorker):
+            return True
+        raise BackendError(
+            f"a worker of {self._address} cannot run trials: {type(error).__name__}: {error}"
+        )
 
     def _check(self) -> None:
         """Every worker has this software in this version; BackendError."""
