@@ -7,6 +7,7 @@ import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,7 @@ class Decoder:
         return plain(message, reader.fields, reader.msgtype) if reader.fields else message
 
 
+@lru_cache(maxsize=256)
 def _make_reader(stream: Stream) -> Reader:
     if stream.encoding == "json":
         return Reader(json.loads, {}, stream.msgtype)

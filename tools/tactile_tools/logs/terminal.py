@@ -57,13 +57,14 @@ def cannot_write(what: object, error: OSError) -> ToolError:
 
 
 @contextmanager
-def progress(what: str) -> Iterator[Report]:
-    """A progress bar in bytes, on a terminal alone; it goes away when done."""
+def progress(what: str) -> Iterator[Report | None]:
+    """A progress bar in bytes, on a terminal alone (else None); it goes away when done."""
+    if not sys.stderr.isatty():
+        yield None
+        return
     console = Console(stderr=True)
     columns = (TextColumn(what), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
+    with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(what)
         yield lambda done, size: bar.update(task, completed=done, total=size)
 
