@@ -1,0 +1,37 @@
+"""The table of faults in ``tests/README.md`` names tests that there are, for every row."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).parents[1]
+ROW = re.compile(r"\| (\d+) \|")
+NAMED = re.compile(r"`([a-z_]+/test_\w+\.py)(?:::(test_\w+))?`")
+ROWS = 36
+
+
+def table() -> dict[int, list[tuple[str, str]]]:
+    """File and function (or "") of each test that a row names."""
+    found: dict[int, list[tuple[str, str]]] = {}
+    for line in (TESTS / "README.md").read_text(encoding="utf-8").splitlines():
+        if row := ROW.match(line):
+            found[int(row[1])] = NAMED.findall(line)
+    return found
+
+
+def test_every_fault_has_its_row_and_every_row_a_test() -> None:
+    rows = table()
+    assert sorted(rows) == list(range(1, ROWS + 1))
+    assert [row for row, named in rows.items() if not named] == []
+
+
+@pytest.mark.parametrize("row", range(1, ROWS + 1))
+def test_the_tests_that_a_row_names_exist(row: int) -> None:
+    for file, function in table()[row]:
+        tree = ast.parse((TESTS / file).read_text(encoding="utf-8"))
+        functions = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+        assert not function or function in functions, f"{file} has no {function}"
