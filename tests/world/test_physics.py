@@ -179,6 +179,19 @@ def test_a_side_touch_is_felt_where_it_is(
     assert np.mean(forces) == pytest.approx(0.20 * 0.5 * G, rel=0.05)
 
 
+def test_motors_hold_their_speed_under_load(engine: Engine, build: Any) -> None:
+    # Three boxes in a row: 3 N of friction of the 10 N the motor has.
+    row = [build.box(0.05 + 0.045 * i, 0.0, mass=0.5) for i in range(3)]
+    world = engine(build.cupboard(*row, start=Pose(0.05 - 0.02 - TIP - 0.01, 0.0, 0.0)))
+    run(world, 2.0, FORWARD)
+    loads, start = [], world.finger().x
+    for _ in range(150):
+        world.step(0.01, FORWARD)
+        loads.append(-world.finger().fx)
+    assert np.mean(loads) == pytest.approx(3 * 0.20 * 0.5 * G, rel=0.1)
+    assert (world.finger().x - start) / 1.5 == pytest.approx(FORWARD.vx, rel=0.01)
+
+
 @pytest.mark.parametrize("on", ["object", "wall"])
 def test_shear_is_bounded_by_friction_and_reached_in_sliding(
     engine: Engine, build: Any, on: str
