@@ -166,17 +166,16 @@ def test_every_condition_changes_what_happens_and_repeats_to_the_bit() -> None:
         assert outcome_of(run_one(spec(seconds=4.0, **changed))) == outcome_of(row)
 
 
-@pytest.mark.parametrize(
-    "conditions", [{"noise": 0.1}, {"dead_taxels": 0.1}, {"feature_rate": 10.0}]
-)
-def test_worse_boards_are_felt_through_the_whole_chain(conditions: dict[str, float]) -> None:
+def test_a_worse_board_is_felt_through_the_whole_chain() -> None:
     from tactile_tools.experiments.rows import outcome_of
 
-    plain = run_one(spec("taxels", 5.0))
-    worse = run_one(spec("taxels", 5.0, **conditions))
+    conditions = {"noise": 0.1, "dead_taxels": 0.1, "feature_rate": 10.0}
+    plain = run_one(spec("taxels", 4.0))
+    worse = run_one(spec("taxels", 4.0, **conditions))
     assert plain["error"] is worse["error"] is None
+    assert plain["peak_contact_n"] > 0
     assert worse["peak_contact_n"] != plain["peak_contact_n"]
-    assert outcome_of(run_one(spec("taxels", 5.0, **conditions))) == outcome_of(worse)
+    assert outcome_of(run_one(spec("taxels", 4.0, **conditions))) == outcome_of(worse)
 
 
 def test_a_board_with_dead_taxels_flags_them() -> None:
