@@ -5,15 +5,15 @@ Floats are written as their shortest exact decimals, so a file gives back the ve
 
 from __future__ import annotations
 
-import math
 import os
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bus.calibration_table import Table, matrix_lines, number, numbers, quoted
 from tactile_bus.calibration_types import (
     ArrayCalibration,
     BoardCalibration,
@@ -21,11 +21,13 @@ from tactile_bus.calibration_types import (
     yaw_degrees,
 )
 from tactile_bus.geometry import ArrayGeometry, Side
+from tactile_bus.net_file import net_lines, read_net
 
 Float = NDArray[np.float64]
 
 FORMAT_NAME = "tactile-calibration"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""2 added ``[[net]]``, fitted models of the whole contact; a file without any is written as 1."""
 SUFFIX = ".cal.toml"
 MAX_FILE_BYTES = 64 * 1024 * 1024
 """Four arrays of 128 taxels with every coupling block come to about 13 MB of text."""
@@ -71,17 +73,19 @@ def saves(calibration: BoardCalibration) -> str:
     lines = [
         "# Calibration of one taxel board. Lengths in m, angles in deg, fields in uT, forces in N;",
         "# vectors in taxel axes (z is the outward normal) unless a key says otherwise.",
-        f"format = {_text(FORMAT_NAME)}",
-        f"format_version = {FORMAT_VERSION}",
-        f"serial_number = {_text(calibration.serial_number)}",
-        f"model = {_text(calibration.model)}",
-        f"frame = {_text(calibration.frame)}",
-        f"created = {_text(calibration.created)}",
-        f"provenance = {_text(calibration.provenance)}",
+        f"format = {quoted(FORMAT_NAME)}",
+        f"format_version = {FORMAT_VERSION if calibration.nets else 1}",
+        f"serial_number = {quoted(calibration.serial_number)}",
+        f"model = {quoted(calibration.model)}",
+        f"frame = {quoted(calibration.frame)}",
+        f"created = {quoted(calibration.created)}",
+        f"provenance = {quoted(calibration.provenance)}",
         f"nominal = {'true' if calibration.nominal else 'false'}",
     ]
     for array in calibration.arrays:
         lines += ["", *_array_lines(array)]
+    for net in calibration.nets:
+        lines += ["", *net_lines(net)]
     return "\n".join(lines) + "\n"
 
 
@@ -91,7 +95,7 @@ def loads(text: str, source: str = "calibration") -> BoardCalibration:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise CalibrationError(f"{source}: not TOML: {error}") from error
-    top = _Table(source, "", table)
+    top = Table(source, "", table)
     if top.text("format") != FORMAT_NAME:
         raise top.wrong("format", table["format"], repr(FORMAT_NAME))
     version = top.integer("format_version", 1, 2**31)
@@ -108,9 +112,16 @@ def loads(text: str, source: str = "calibration") -> BoardCalibration:
     arrays = top.take("array")
     if not isinstance(arrays, list) or not arrays:
         raise top.wrong("array", arrays, "at least one [[array]] table")
-    parsed = tuple(_read_array(_Table(source, f"array[{i}].", a)) for i, a in enumerate(arrays))
+    parsed = tuple(_read_array(Table(source, f"array[{i}].", a)) for i, a in enumerate(arrays))
+    nets = top.take("net") if "net" in table else []
+    if not isinstance(nets, list):
+        raise top.wrong("net", nets, "[[net]] tables")
+    fitted = tuple(read_net(Table(source, f"net[{i}].", net)) for i, net in enumerate(nets))
     top.done()
-    return BoardCalibration(serial, model, frame, created, provenance, nominal, parsed)
+    try:
+        return BoardCalibration(serial, model, frame, created, provenance, nominal, parsed, fitted)
+    except CalibrationError as error:
+        raise CalibrationError(f"{source}: {error}") from error
 
 
 def _array_lines(array: ArrayCalibration) -> Iterable[str]:
@@ -118,51 +129,31 @@ def _array_lines(array: ArrayCalibration) -> Iterable[str]:
     n = g.taxels
     blocks = array.newton_per_ut.reshape(n, 3, n, 3).swapaxes(1, 2)
     yield "[[array]]"
-    yield f"name = {_text(g.name)}"
-    yield f"side = {_text(g.side.name.lower())}"
+    yield f"name = {quoted(g.name)}"
+    yield f"side = {quoted(g.side.name.lower())}"
     yield f"rows = {g.rows}"
     yield f"columns = {g.columns}"
-    yield from _matrix("position_m", g.position, "x, y, z of each taxel in the frame above")
-    yield from _matrix("rotation", g.rotation.reshape(n, 9), "taxel axes to the frame, row-major")
-    yield from _matrix("surface_m", g.surface, "place on the unrolled skin")
-    yield f"chip_yaw_deg = [{_numbers(yaw_degrees(g.chip_yaw))}]"
-    yield f"reference_c = {_number(array.reference_c)}"
-    yield from _matrix("rest_ut", array.rest_ut, "unloaded, at reference_c")
-    yield from _matrix("drift_ut_per_k", array.drift_ut_per_k, "change with temperature")
+    yield from matrix_lines("position_m", g.position, "x, y, z of each taxel in the frame above")
+    yield from matrix_lines(
+        "rotation", g.rotation.reshape(n, 9), "taxel axes to the frame, row-major"
+    )
+    yield from matrix_lines("surface_m", g.surface, "place on the unrolled skin")
+    yield f"chip_yaw_deg = [{numbers(yaw_degrees(g.chip_yaw))}]"
+    yield f"reference_c = {number(array.reference_c)}"
+    yield from matrix_lines("rest_ut", array.rest_ut, "unloaded, at reference_c")
+    yield from matrix_lines("drift_ut_per_k", array.drift_ut_per_k, "change with temperature")
     yield "[array.force]"
     yield 'kind = "linear"  # force of a taxel = own block * its field + coupling * others\' fields'
     own = blocks[np.arange(n), np.arange(n)].reshape(n, 9)
-    yield from _matrix("own_n_per_ut", own, "3 x 3 of each taxel, row-major")
+    yield from matrix_lines("own_n_per_ut", own, "3 x 3 of each taxel, row-major")
     yield "coupling_n_per_ut = [  # [force of taxel, field of taxel, 3 x 3 row-major]; others zero"
     for i, j in np.argwhere(blocks.any(axis=(2, 3))).tolist():
         if i != j:
-            yield f"  [{i}, {j}, {_numbers(blocks[i, j].ravel())}],"
+            yield f"  [{i}, {j}, {numbers(blocks[i, j].ravel())}],"
     yield "]"
 
 
-def _matrix(key: str, values: Float, remark: str) -> Iterable[str]:
-    yield f"{key} = [  # {remark}"
-    for row in values:
-        yield f"  [{_numbers(row)}],"
-    yield "]"
-
-
-def _numbers(values: Float) -> str:
-    return ", ".join(_number(v) for v in values.tolist())
-
-
-def _number(value: float) -> str:
-    return repr(float(value))
-
-
-def _text(value: str) -> str:
-    escaped = "".join(
-        f"\\u{ord(c):04x}" if c in '"\\' or ord(c) < 32 or ord(c) == 127 else c for c in value
-    )
-    return f'"{escaped}"'
-
-
-def _read_array(table: _Table) -> ArrayCalibration:
+def _read_array(table: Table) -> ArrayCalibration:
     name = table.text("name")
     side = table.text("side")
     if side not in _SIDES:
@@ -204,93 +195,3 @@ def _read_array(table: _Table) -> ArrayCalibration:
     table.done()
     matrix = np.ascontiguousarray(blocks.swapaxes(1, 2).reshape(3 * n, 3 * n))
     return ArrayCalibration(geometry, rest, drift, reference, matrix)
-
-
-class _Table:
-    """One TOML table being read: every refusal names file, key, what was given and allowed."""
-
-    def __init__(self, source: str, prefix: str, values: object) -> None:
-        if not isinstance(values, Mapping):
-            raise CalibrationError(f"{source}: {prefix.rstrip('.')} must be a table")
-        self._source, self._prefix, self._values = source, prefix, dict(values)
-
-    def wrong(self, key: str, given: object, allowed: str) -> CalibrationError:
-        shown = repr(given) if not isinstance(given, str) or not given else given
-        if len(shown) > 80:
-            shown = shown[:77] + "..."
-        return CalibrationError(
-            f"{self._source}: {self._prefix}{key} is {shown}; allowed: {allowed}"
-        )
-
-    def take(self, key: str) -> object:
-        if key not in self._values:
-            raise CalibrationError(f"{self._source}: {self._prefix}{key} is missing")
-        return self._values.pop(key)
-
-    def done(self) -> None:
-        if self._values:
-            unknown = ", ".join(f"{self._prefix}{key}" for key in self._values)
-            raise CalibrationError(
-                f"{self._source}: unknown key {unknown}; format_version {FORMAT_VERSION} has none "
-                "of that name"
-            )
-
-    def text(self, key: str) -> str:
-        value = self.take(key)
-        if not isinstance(value, str) or not value:
-            raise self.wrong(key, value, "a text that is not empty")
-        return value
-
-    def integer(self, key: str, low: int, high: int) -> int:
-        value = self.take(key)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise self.wrong(key, value, f"a whole number from {low} to {high}")
-        return value
-
-    def number(self, key: str) -> float:
-        return self._finite(key, self.take(key))
-
-    def vector(self, key: str, length: int) -> Float:
-        return self._row(key, self.take(key), length)
-
-    def matrix(self, key: str, rows: int, columns: int) -> Float:
-        value = self.take(key)
-        if not isinstance(value, list) or len(value) != rows:
-            given = f"{len(value)} rows" if isinstance(value, list) else repr(value)
-            raise self.wrong(key, given, f"{rows} rows of {columns} numbers")
-        out = [self._row(f"{key}[{i}]", row, columns) for i, row in enumerate(value)]
-        return np.array(out).reshape(rows, columns)
-
-    def table(self, key: str) -> _Table:
-        return _Table(self._source, f"{self._prefix}{key}.", self.take(key))
-
-    def coupling(self, key: str, taxels: int) -> Iterable[tuple[str, int, int, Float]]:
-        value = self.take(key)
-        if not isinstance(value, list):
-            raise self.wrong(key, value, "a list of [taxel, taxel, 9 numbers]")
-        for k, row in enumerate(value):
-            at = f"{key}[{k}]"
-            if not isinstance(row, list) or len(row) != 11:
-                raise self.wrong(at, row, "[taxel, taxel, 9 numbers]")
-            i, j = row[:2]
-            for index in (i, j):
-                if type(index) is not int or not 0 <= index < taxels:
-                    raise self.wrong(at, index, f"taxels from 0 to {taxels - 1}")
-            yield at, i, j, self._row(at, row[2:], 9).reshape(3, 3)
-
-    def _row(self, key: str, value: object, length: int) -> Float:
-        if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != length:
-            given = f"{len(value)} numbers" if isinstance(value, list) else repr(value)
-            raise self.wrong(key, given, f"{length} numbers")
-        return np.array([self._finite(key, v) for v in value])
-
-    def _finite(self, key: str, value: object) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.wrong(key, value, "a number")
-        try:
-            number = float(value)
-        except OverflowError:
-            number = math.inf
-        if not math.isfinite(number):
-            raise self.wrong(key, value, "a finite number")
-        return number

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bus.geometry import ArrayGeometry, SkinGeometry
+from tactile_bus.net_types import NetModel
 
 Float = NDArray[np.float64]
 
@@ -71,7 +72,8 @@ class BoardCalibration:
     """Calibration of the board with ``serial_number``.
 
     ``nominal``: made from typical figures, not from measurements of this board; then the rest
-    field is unknown and must be tared.
+    field is unknown and must be tared. ``nets``: fitted models of the contact as a whole, each
+    with targets of its own; the arrays' matrices then only say how it is shared among taxels.
     """
 
     serial_number: str
@@ -81,6 +83,21 @@ class BoardCalibration:
     provenance: str
     nominal: bool
     arrays: tuple[ArrayCalibration, ...]
+    nets: tuple[NetModel, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse models of another number of taxels, and two for the same target."""
+        taxels = sum(array.geometry.taxels for array in self.arrays)
+        seen: set[str] = set()
+        for i, net in enumerate(self.nets):
+            if net.taxels != taxels:
+                raise CalibrationError(
+                    f"net[{i}] is for {net.taxels} taxels, the board has {taxels}"
+                )
+            for target in net.targets:
+                if target in seen:
+                    raise CalibrationError(f"net[{i}]: another model predicts {target!r} already")
+                seen.add(target)
 
     @property
     def geometry(self) -> SkinGeometry:
@@ -111,6 +128,8 @@ class BoardCalibration:
             numbers(array.drift_ut_per_k)
             numbers(np.array([array.reference_c]))
             numbers(array.newton_per_ut)
+        for net in self.nets:
+            net.digest(text, numbers)
         return digest.hexdigest()
 
     def require_board(self, serial_number: str, source: str = "the calibration") -> None:

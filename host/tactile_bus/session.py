@@ -37,7 +37,7 @@ MAX_SESSIONS = 16
 CLOSE_TIMEOUT = 1.0
 """s to wait for zenoh to close; it waits up to 10 s by itself for a peer that is stopped."""
 
-KEYS = ("tactile/**", "arm/**", "reach/**", "world/**", "replay/**", "tf")
+KEYS = ("tactile/**", "arm/**", "reach/**", "reference/**", "world/**", "replay/**", "tf")
 """All that a peer over TLS may speak of."""
 
 

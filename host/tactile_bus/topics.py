@@ -54,6 +54,10 @@ COMMAND = Topic("arm/{name}/cmd_vel", "geometry_msgs/msg/TwistStamped", 100, sta
 REACH_STATE = Topic("reach/{name}/state", f"{_OWN}/ReachState", 100)
 REACH_EVENT = Topic("reach/{name}/event", f"{_OWN}/ReachEvent", 0)
 TF = Topic("tf", "tf2_msgs/msg/TFMessage", 25)
+REFERENCE = Topic("reference/{name}/wrench", "geometry_msgs/msg/WrenchStamped", 100)
+"""What a load cell, a weight or a gauge says of the force on board ``name`` while it is calibrated:
+N that the environment exerts on the skin, in the axes of the taxels pressed, so that a press has a
+negative z. The header's stamp is when it was true."""
 WORLD = Topic("world/{name}/objects", "visualization_msgs/msg/MarkerArray", 10)
 
 TOPICS = (

@@ -12,6 +12,7 @@ from importlib.metadata import version
 TOOLS = (
     "log",
     "plot",
+    "calibrate",
     "reach",
     "demo",
     "demo_skin",

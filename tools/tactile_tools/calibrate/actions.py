@@ -1,0 +1,195 @@
+"""What the subcommands of ``tactile calibrate`` do; exit codes 2 and 3 are decided here."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from tactile_bus.calibration import (
+    BoardCalibration,
+    CalibrationError,
+    load,
+    nominal,
+    save,
+)
+from tactile_bus.calibration_file import SUFFIX
+
+if TYPE_CHECKING:
+    from tactile_tools.calibrate.evaluate import Judged
+    from tactile_tools.calibrate.recording import Recording
+
+BAD_INPUT, REFUSED = 2, 3
+
+
+class ActionError(Exception):
+    """Why a command cannot go on, and the exit code that says so."""
+
+    def __init__(self, message: str, code: int = BAD_INPUT) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+def guarded(
+    run: Callable[[argparse.Namespace], None],
+) -> Callable[[argparse.Namespace], int]:
+    """Command that prints what was refused, never a traceback."""
+
+    def command(options: argparse.Namespace) -> int:
+        from tactile_tools.calibrate.recording import RecordingError
+
+        try:
+            run(options)
+        except (RecordingError, CalibrationError) as error:
+            return _complain(str(error), BAD_INPUT)
+        except ActionError as error:
+            return _complain(str(error), error.code)
+        return 0
+
+    return command
+
+
+def _complain(message: str, code: int) -> int:
+    print(f"tactile calibrate: {message}", file=sys.stderr)
+    return code
+
+
+def _info(options: argparse.Namespace) -> None:
+    from tactile_tools.calibrate.describe import as_dict, as_text
+
+    calibration = load(options.file)
+    if options.json:
+        print(json.dumps(as_dict(calibration), indent=1))
+    else:
+        Console(soft_wrap=True).print(as_text(calibration), markup=False, highlight=False)
+
+
+def _evaluate(options: argparse.Namespace) -> None:
+    from tactile_tools.calibrate.assemble import group
+    from tactile_tools.calibrate.evaluate import leave_one_out, tail20
+    from tactile_tools.calibrate.fit import require_alike
+    from tactile_tools.calibrate.results import as_json, table
+    from tactile_tools.calibrate.source import open_recordings
+
+    recordings = open_recordings(options.recordings, options.name, options.target)
+    _check_folder(options.report)
+    judged = []
+    with _watching() as progress:
+        for members in group(recordings):
+            if options.split == "tail20":
+                judged += tail20(members, progress=progress)
+                continue
+            if len(members) < 2:
+                raise ActionError(
+                    f"leave-one-out needs two recordings of {'+'.join(members[0].targets)}, only "
+                    f"{members[0].path} is given; add one, or use --split tail20"
+                )
+            require_alike(members)
+            judged += leave_one_out(members, progress=progress)
+    if options.report is not None:
+        _report(options.report, options.split, judged)
+    if options.json:
+        print(json.dumps(as_json(options.split, judged), indent=1))
+    else:
+        Console(width=160 if not sys.stdout.isatty() else None).print(table(options.split, judged))
+
+
+def _fit(options: argparse.Namespace) -> None:
+    from tactile_tools.calibrate.assemble import board, fitted, group
+    from tactile_tools.calibrate.describe import as_text
+    from tactile_tools.calibrate.fit import require_alike
+    from tactile_tools.calibrate.source import open_recordings
+
+    out: Path = options.out
+    if not out.name.endswith(SUFFIX):
+        raise ActionError(f"--out {out}; allowed: a name that ends in {SUFFIX}")
+    if not out.resolve().parent.is_dir():
+        raise ActionError(f"--out {out}: there is no folder {out.parent}; create it", REFUSED)
+    if out.is_dir():
+        raise ActionError(f"--out {out} is a folder; name a file", REFUSED)
+    recordings = open_recordings(options.recordings, options.name, options.target)
+    require_alike(recordings)
+    _check_folder(options.report)
+    base = _base(options.base, recordings[0])
+    serial = options.serial or recordings[0].serial_number
+    if not serial:
+        raise ActionError(
+            f"{recordings[0].path} does not say which board it is of; give --serial, as "
+            "tactiled --list-ports shows it"
+        )
+    if options.serial and recordings[0].serial_number not in ("", options.serial):
+        raise ActionError(
+            f"--serial {options.serial}, but {recordings[0].path} is of board "
+            f"{recordings[0].serial_number}; leave --serial out"
+        )
+    nets, judged = [], []
+    with _watching() as progress:
+        for members in group(recordings):
+            net, _, tests = fitted(members, progress)
+            nets.append(net)
+            judged += tests
+    calibration = board(base, recordings, nets, serial)
+    try:
+        save(calibration, out)
+    except CalibrationError as error:
+        raise ActionError(str(error), REFUSED) from error
+    if options.report is not None:
+        _report(options.report, "as in the file", judged)
+    Console(soft_wrap=True).print(as_text(calibration), markup=False, highlight=False)
+    print(f"wrote {out}")
+
+
+def _base(path: Path | None, recording: Recording) -> BoardCalibration:
+    if path is None:
+        return recording.calibration or nominal("anyskin", "unknown", recording.taxels)
+    base = load(path)
+    if base.geometry.taxels != recording.taxels:
+        raise ActionError(
+            f"--base {path} is of {base.geometry.taxels} taxels, {recording.path} of "
+            f"{recording.taxels}; give the calibration of that board"
+        )
+    return base
+
+
+def _check_folder(folder: Path | None) -> None:
+    if folder is None:
+        return
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ActionError(
+            f"--report {folder}: cannot be made ({error.strerror}); name another", REFUSED
+        ) from error
+
+
+def _report(folder: Path, split: str, judged: Sequence[Judged]) -> None:
+    from tactile_tools.calibrate.report import write_report
+
+    try:
+        page = write_report(folder, split, judged)
+    except OSError as error:
+        raise ActionError(f"--report {folder}: {error.strerror}; name another", REFUSED) from error
+    print(f"wrote {page}", file=sys.stderr)
+
+
+@contextmanager
+def _watching() -> Iterator[Callable[[str], None]]:
+    """A status line on standard error that says what is being tried."""
+    from sklearn.exceptions import ConvergenceWarning
+
+    console = Console(stderr=True)
+    with warnings.catch_warnings(), console.status("reading") as status:
+        warnings.simplefilter("ignore", ConvergenceWarning)  # iterations are bounded on purpose
+        yield lambda text: status.update(f"trying {text}")
+
+
+info = guarded(_info)
+evaluate_command = guarded(_evaluate)
+fit_command = guarded(_fit)

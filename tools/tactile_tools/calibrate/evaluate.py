@@ -1,0 +1,106 @@
+"""Judging models on samples they were not fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bus.net_types import NetModel
+from tactile_tools.calibrate.fit import Choice, Progress, choose, fit, quiet
+from tactile_tools.calibrate.recipes import Recipe
+from tactile_tools.calibrate.recording import Recording
+from tactile_tools.calibrate.rows import causal
+from tactile_tools.calibrate.splits import TAIL_SHARE
+from tactiled.net_force import batch_features, readout
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """One model on the samples of one recording that it was not fitted to.
+
+    ``time_s`` (k,), ``measured`` and ``predicted`` (k, targets); ``tested`` (k,) marks what the
+    errors are taken over. ``fitted_on``: what the model was fitted to; ``choice``: what
+    cross-validation chose on that.
+    """
+
+    recording: Recording
+    model: NetModel
+    choice: Choice
+    measured: Float
+    predicted: Float
+    time_s: Float
+    tested: NDArray[np.bool_]
+    fitted_on: tuple[Recording, ...]
+
+    @property
+    def errors(self) -> Float:
+        """(tested, targets)."""
+        return (self.predicted - self.measured)[self.tested]
+
+    @property
+    def rmse(self) -> Float:
+        """(targets,)."""
+        value: Float = np.sqrt((self.errors**2).mean(axis=0))
+        return value
+
+
+def predict(model: NetModel, recording: Recording) -> Float:
+    """(k, targets) for every label of ``recording``, causal, tared at its beginning."""
+    features = batch_features(model.features, recording.time_s, recording.change_ut())
+    at = causal(recording.time_s, features, recording.label_time_s, model.delay_s)
+    return readout(model, at)
+
+
+def tail20(
+    recordings: Sequence[Recording],
+    recipes: Sequence[Recipe] | None = None,
+    progress: Progress = quiet,
+) -> list[Judged]:
+    """Each recording by itself: chosen and fitted on its first 80 %, tested on its last 20 %."""
+    out = []
+    for recording in recordings:
+        head = recording.until(TAIL_SHARE)
+        choice = choose([head], recipes, progress)
+        model = fit([head], choice)
+        tested = recording.label_time_s > head.time_s[-1]
+        out.append(_judge(recording, model, choice, tested, [head]))
+    return out
+
+
+def leave_one_out(
+    recordings: Sequence[Recording],
+    recipes: Sequence[Recipe] | None = None,
+    progress: Progress = quiet,
+) -> list[Judged]:
+    """Each recording whole, by a model chosen and fitted on all the others."""
+    out = []
+    for recording in recordings:
+        others = [other for other in recordings if other is not recording]
+        choice = choose(others, recipes, progress)
+        model = fit(others, choice)
+        out.append(_judge(recording, model, choice, np.ones(len(recording.labels), bool), others))
+    return out
+
+
+def _judge(
+    recording: Recording,
+    model: NetModel,
+    choice: Choice,
+    tested: NDArray[np.bool_],
+    fitted_on: Sequence[Recording],
+) -> Judged:
+    return Judged(
+        recording=recording,
+        model=model,
+        choice=choice,
+        measured=recording.labels,
+        predicted=predict(model, recording),
+        time_s=recording.label_time_s,
+        tested=tested,
+        fitted_on=tuple(fitted_on),
+    )

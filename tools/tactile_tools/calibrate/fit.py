@@ -1,0 +1,155 @@
+"""Choosing a model by cross-validation, and fitting it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bus.net_types import NetModel
+from tactile_tools.calibrate.readouts import export, pipeline
+from tactile_tools.calibrate.recipes import (
+    FORCE_RECIPES,
+    PLACE_RECIPES,
+    Recipe,
+    feature_map,
+    floor,
+)
+from tactile_tools.calibrate.recording import Recording, RecordingError
+from tactile_tools.calibrate.rows import Rows, align, copies
+from tactile_tools.calibrate.splits import block_edges, block_masks
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+DELAYS_S = tuple(round(0.05 * i, 2) for i in range(-2, 9))
+"""s, by how much labels may lag behind the field: a load cell that averages for 0.2 s lags by
+0.1 s; a negative one means that the board is read late."""
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Cross-validated error of one candidate, in the targets' unit."""
+
+    recipe: Recipe
+    penalty: float
+    rmse: float
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What cross-validation chose. ``delays``: (delay s, error) as they were tried."""
+
+    recipe: Recipe
+    penalty: float
+    delay_s: float
+    scores: tuple[Score, ...]
+    delays: tuple[tuple[float, float], ...]
+
+
+def quiet(_: str) -> None:
+    """Progress that nobody watches."""
+
+
+def require_alike(recordings: Sequence[Recording]) -> None:
+    """Refuse, with `RecordingError`, recordings that no one model could be fitted to."""
+    first = recordings[0]
+    for other in recordings[1:]:
+        if other.taxels != first.taxels:
+            raise RecordingError(
+                f"{other.path} is of {other.taxels} magnetometers, {first.path} of {first.taxels}; "
+                "calibrate one board at a time"
+            )
+        if other.serial_number != first.serial_number:
+            raise RecordingError(
+                f"{other.path} is of board {other.serial_number or 'unknown'}, {first.path} of "
+                f"{first.serial_number or 'unknown'}; calibrate one board at a time"
+            )
+
+
+def recipes_for(recordings: Sequence[Recording]) -> tuple[Recipe, ...]:
+    """The kinds of model to try."""
+    return FORCE_RECIPES if recordings[0].forces else PLACE_RECIPES
+
+
+def choose(
+    recordings: Sequence[Recording],
+    recipes: Sequence[Recipe] | None = None,
+    progress: Progress = quiet,
+) -> Choice:
+    """Delay, recipe and penalty with the least cross-validated error on ``recordings``."""
+    recipes = recipes_for(recordings) if recipes is None else tuple(recipes)
+    delays: list[tuple[float, float]] = []
+    delay = 0.0
+    judge = next((r for r in recipes if r.knows_history), None)
+    if judge is not None:
+        progress("delay of the labels")
+        made = copies(feature_map(judge, recordings), recordings, judge.restarts)
+        penalty = judge.penalties[0]
+        for each in DELAYS_S:
+            rows = align(made, recordings, each)
+            delays.append((each, cross_validate(rows, recordings, judge, penalty)))
+        delay = min(delays, key=lambda pair: pair[1])[0]
+    scores = []
+    for recipe in recipes:
+        progress(recipe.name)
+        made = copies(feature_map(recipe, recordings), recordings, recipe.restarts)
+        rows = align(made, recordings, delay)
+        scores += [
+            Score(recipe, penalty, cross_validate(rows, recordings, recipe, penalty))
+            for penalty in recipe.penalties
+        ]
+    best = min(scores, key=lambda score: score.rmse)
+    return Choice(best.recipe, best.penalty, delay, tuple(scores), tuple(delays))
+
+
+def cross_validate(
+    rows: Rows, recordings: Sequence[Recording], recipe: Recipe, penalty: float
+) -> float:
+    """Root of the mean square error over all folds, in the targets' unit."""
+    squares = []
+    for fit, test in folds(rows, recordings):
+        model = pipeline(recipe, penalty, int(fit.sum()))
+        model.fit(rows.features[fit], rows.labels[fit])
+        guess = model.predict(rows.features[test]).reshape(-1, rows.labels.shape[1])
+        guess = np.maximum(guess, floor(recordings))
+        squares.append(float(((guess - rows.labels[test]) ** 2).mean()))
+    return float(np.sqrt(np.mean(squares)))
+
+
+def folds(rows: Rows, recordings: Sequence[Recording]) -> Iterator[tuple[Bool, Bool]]:
+    """Rows to fit on and to test on: blocks of time of every recording, and whole recordings."""
+    numbers = range(len(recordings))
+    for number in numbers:
+        own = rows.recording == number
+        for edges in block_edges(recordings[number].label_time_s):
+            fit, test = block_masks(rows.time_s, edges)
+            yield fit | ~own, test & own
+    if len(recordings) > 1:
+        for number in numbers:
+            own = rows.recording == number
+            yield ~own, own & rows.whole
+
+
+def fit(recordings: Sequence[Recording], choice: Choice) -> NetModel:
+    """Model of ``choice``, fitted to all of ``recordings``."""
+    recipe = choice.recipe
+    features = feature_map(recipe, recordings)
+    rows = align(copies(features, recordings, recipe.restarts), recordings, choice.delay_s)
+    fitted = pipeline(recipe, choice.penalty, len(rows.labels)).fit(rows.features, rows.labels)
+    mean, scale, layers = export(fitted)
+    return NetModel(
+        recipe=recipe.name,
+        targets=recordings[0].targets,
+        features=features,
+        mean=mean,
+        scale=scale,
+        layers=layers,
+        floor=floor(recordings),
+        delay_s=choice.delay_s,
+        figures=(),
+    )

@@ -1,0 +1,171 @@
+"""Reader of a log (MCAP) that holds a board's field and what a reference said of the force on it.
+
+Field: ``tactile/<name>/field``, µT over the rest field at the time, in taxel axes. Reference:
+``reference/<name>/wrench``, see `tactile_bus.topics.REFERENCE`; a row with a value that is not
+finite is no reading.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bus.calibration import BoardCalibration, CalibrationError, loads
+from tactile_bus.calibration_file import SUFFIX
+from tactile_bus.instant import NS_PER_S
+from tactile_bus.log_reader import LogReader
+from tactile_bus.log_records import AttachmentRecord, Block, LogError
+from tactile_bus.messages import DecodeError, codec, stamp_ns
+from tactile_bus.topics import FIELD, REFERENCE, find_topic
+from tactile_tools.calibrate.recording import MIN_FRAMES, Recording, RecordingError, check
+
+Float = NDArray[np.float64]
+
+MAX_FRAMES = 2_000_000
+"""Over five hours at 100 Hz; more of one log is a mistake and would fill the memory."""
+SHEAR_SHARE = 0.02
+"""Shear that never reaches this share of the largest force was not measured, or is noise."""
+MAX_MASKED = 0.2
+"""Share of frames with an unhealthy taxel beyond which a recording is refused."""
+
+
+@dataclass(slots=True)
+class _Board:
+    """What the log says of one board; stamps in ns."""
+
+    field_ns: list[int] = field(default_factory=list)
+    field_ut: list[Float] = field(default_factory=list)
+    masked: int = 0
+    reference_ns: list[int] = field(default_factory=list)
+    force: list[tuple[float, float, float]] = field(default_factory=list)
+
+
+def read_log(path: Path, name: str | None = None) -> Recording:
+    """Recording of board ``name`` (None: the only one with a reference) in the log ``path``."""
+    try:
+        boards, attached = _collect(path)
+    except (LogError, DecodeError) as error:
+        raise RecordingError(f"{path}: {error}") from error
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}; name a log that can be read") from error
+    name = _which(path, boards, name)
+    board = boards[name]
+    calibration = attached.get(name)
+    if calibration is None:
+        raise RecordingError(
+            f"{path}: holds no calibration of {name!r}, so nothing says where its taxels are; "
+            "logs of tactiled and of `tactile calibrate record` do"
+        )
+    total = len(board.field_ns) + board.masked
+    if total and board.masked > MAX_MASKED * total:
+        raise RecordingError(
+            f"{path}: {board.masked} of {total} frames have a taxel that is not healthy; see what "
+            "ails the board (tactiled says it), then record again"
+        )
+    for what, count in (("frames", len(board.field_ns)), ("reference", len(board.force))):
+        if count < MIN_FRAMES:
+            raise RecordingError(
+                f"{path}: {count} {what} of {name!r}, at least {MIN_FRAMES} are needed; record for "
+                "longer"
+            )
+    widths = {len(frame) for frame in board.field_ut}
+    if widths != {3 * calibration.geometry.taxels}:
+        raise RecordingError(f"{path}: fields of {name!r} are not of its {widths} channels")
+    force = np.array(board.force)
+    targets = _targets(force)
+    begin = board.field_ns[0]
+    return check(
+        Recording(
+            path=path,
+            geometry=calibration.geometry,
+            serial_number=calibration.serial_number,
+            started=datetime.fromtimestamp(begin / NS_PER_S, UTC).isoformat(timespec="seconds"),
+            time_s=(np.array(board.field_ns) - begin) / NS_PER_S,
+            field_ut=np.array(board.field_ut, np.float64),
+            rest_ut=None,
+            label_time_s=(np.array(board.reference_ns) - begin) / NS_PER_S,
+            labels=np.column_stack([_label(force, t) for t in targets]),
+            targets=targets,
+            calibration=calibration,
+        )
+    )
+
+
+def _collect(path: Path) -> tuple[dict[str, _Board], dict[str, BoardCalibration]]:
+    boards: dict[str, _Board] = defaultdict(_Board)
+    attached: dict[str, BoardCalibration] = {}
+    decode = codec().decode
+    with LogReader(path) as reader:
+        for event in reader.events():
+            if isinstance(event, AttachmentRecord) and event.name.endswith(SUFFIX):
+                text = reader.read_at(event.position, event.size).decode("utf-8", "replace")
+                try:
+                    calibration = loads(text, f"{path}: {event.name}")
+                except CalibrationError as error:
+                    raise RecordingError(str(error)) from error
+                attached[event.name.removesuffix(SUFFIX)] = calibration
+            if not isinstance(event, Block):
+                continue
+            for message in reader.messages(event):
+                channel = reader.channels.get(message.channel)
+                found = None if channel is None else find_topic(channel.topic)
+                if found is None or found[0] not in (FIELD, REFERENCE):
+                    continue
+                board, value = boards[found[1]], decode(found[0], message.data)
+                if found[0] is REFERENCE:
+                    _take_reference(board, value)
+                else:
+                    _take_field(board, value, path)
+    return boards, attached
+
+
+def _take_reference(board: _Board, message: object) -> None:
+    force = message.wrench.force  # type: ignore[attr-defined]
+    vector = (float(force.x), float(force.y), float(force.z))
+    if np.isfinite(vector).all():
+        board.reference_ns.append(stamp_ns(message.header.stamp))  # type: ignore[attr-defined]
+        board.force.append(vector)
+
+
+def _take_field(board: _Board, message: object, path: Path) -> None:
+    values = np.asarray(message.field_ut, np.float64)  # type: ignore[attr-defined]
+    if not np.isfinite(values).all():
+        board.masked += 1
+        return
+    if len(board.field_ns) >= MAX_FRAMES:
+        raise RecordingError(f"{path}: over {MAX_FRAMES} frames; `tactile log split` it")
+    board.field_ns.append(stamp_ns(message.header.stamp))  # type: ignore[attr-defined]
+    board.field_ut.append(values)
+
+
+def _which(path: Path, boards: dict[str, _Board], name: str | None) -> str:
+    usable = sorted(n for n, b in boards.items() if b.field_ns and b.force)
+    if name is not None:
+        if name not in usable:
+            held = ", ".join(usable) or "none"
+            raise RecordingError(f"{path}: no board {name!r} with a reference; it holds {held}")
+        return name
+    if not usable:
+        raise RecordingError(
+            f"{path}: no board has both a field and a reference force (reference/<name>/wrench); "
+            "make such a log with `tactile calibrate record`"
+        )
+    if len(usable) > 1:
+        raise RecordingError(f"{path}: holds boards {', '.join(usable)}; say which with --name")
+    return usable[0]
+
+
+def _targets(force: Float) -> tuple[str, ...]:
+    """Normal force always; shear where it was measured."""
+    least = SHEAR_SHARE * np.abs(force).max()
+    shear = np.abs(force[:, :2]).max(axis=0) > least
+    return ("normal", *(n for n, there in zip(("shear_x", "shear_y"), shear, strict=True) if there))
+
+
+def _label(force: Float, target: str) -> Float:
+    return -force[:, 2] if target == "normal" else force[:, ("shear_x", "shear_y").index(target)]
