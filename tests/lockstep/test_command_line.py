@@ -141,6 +141,15 @@ def test_demo_refuses_what_it_cannot_do(
     assert not list(folder.iterdir())
 
 
+def test_demo_deletes_no_file_that_is_no_log(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("thesis.txt").write_text("years of work")
+    assert code_of(["demo", "--out", "thesis.txt"]) == 2
+    assert "thesis.txt is there and is no log" in capsys.readouterr().err
+    assert Path("thesis.txt").read_text() == "years of work"
+
+
 def test_bench_measures_a_part_and_keeps_the_rest(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

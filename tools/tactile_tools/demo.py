@@ -17,6 +17,9 @@ from tactile_tools.series import LogUnreadableError
 
 BOARD = "finger"
 
+MAGIC = b"\x89MCAP"
+ORDERLY_S = 5.0  # for zero twist and the end of a log; both take a second at most
+
 SEED = 29
 """A scene that is crowded from the front edge on, and that hybrid_event gets through nearly always:
 in five of five runs in real time and five of five in lockstep, with and without an excavation."""
@@ -90,6 +93,18 @@ def _ask(words: list[str]) -> str:
     return done.stdout.strip()
 
 
+def _start_of(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(len(MAGIC))
+
+
+def _make_room(log: Path) -> None:
+    """Delete the log of an earlier demo; `BadArgumentError` for what is no log."""
+    if log.is_dir() or (log.exists() and _start_of(log) != MAGIC):
+        raise BadArgumentError(f"--out {log} is there and is no log: name another")
+    log.unlink(missing_ok=True)
+
+
 def _set(options: argparse.Namespace) -> str:
     """Parameter set that belongs to the scene."""
     return "hardware" if options.scene == "hardware" else "authors_sim"
@@ -102,7 +117,7 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
     scene = ["--scene", options.scene, "--seed", str(options.seed)]
     goal = _ask([simdevice, "cupboard", *scene, "--print-goal"])
     _ask([simdevice, "calibration", "--seed", str(options.seed), "--out", str(calibration)])
-    options.out.unlink(missing_ok=True)
+    _make_room(options.out)
     arm, skin, reach = (f"tcp/127.0.0.1:{free_port()}" for _ in range(3))
     cupboard = [simdevice, "cupboard", *scene, "--pty", str(board), "--listen", arm]
     sensing = [
@@ -110,25 +125,39 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
         *("--listen", skin, "--connect", arm, "--no-log"),
     ]
     print(
-        f"A cupboard ({options.scene} {options.seed}), the target at {goal} m, and three processes."
+        f"A cupboard ({options.scene} {options.seed}), the target at {goal} m, and three processes.",
+        flush=True,
     )
     with contextlib.ExitStack() as stack:
         said = folder / "cupboard.txt"
         first = stack.enter_context(running([*cupboard, "--connect", skin], said))
         wait_for(board, first, said)
         stack.enter_context(running(sensing, folder / "tactiled.txt"))
-        done = subprocess.run(
+        reaching = subprocess.Popen(
             [
                 *(reachd, "--strategy", options.strategy, "--target", goal),
                 *("--set", _set(options)),
                 *("--board", BOARD, "--seed", str(options.seed), "--log", str(options.out)),
                 *("--listen", reach, "--connect", arm, "--connect", skin),
             ],
-            check=False,
             # Its arm is its own: another reach on this machine is no reason to refuse this one.
             env=os.environ | {"TACTILE_RUNTIME_DIR": str(folder)},
         )
-        if done.returncode == 3:
+        code = _ended(reaching)
+        if code == 3:
             for name in ("cupboard.txt", "tactiled.txt"):
                 print(f"--- {name}\n{(folder / name).read_text(errors='replace')[-1500:]}")
-    return done.returncode
+    return code
+
+
+def _ended(process: subprocess.Popen[bytes]) -> int:
+    """Exit code of a process; one that Ctrl-C has reached, too, is given time to end in order."""
+    try:
+        return process.wait()
+    except KeyboardInterrupt:
+        try:
+            process.wait(timeout=ORDERLY_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        raise
