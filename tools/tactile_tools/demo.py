@@ -125,7 +125,7 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
         *("--listen", skin, "--connect", arm, "--no-log"),
     ]
     print(
-        f"A cupboard ({options.scene} {options.seed}), the target at {goal} m, and three processes.",
+        f"A cupboard ({options.scene} {options.seed}), the target at {goal} m, three processes.",
         flush=True,
     )
     with contextlib.ExitStack() as stack:
