@@ -72,6 +72,8 @@ def run(options: argparse.Namespace) -> int:
     except (BadArgumentError, StrategyError) as error:
         print(f"tactile demo: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:
+        raise  # whoever read our words has gone, which is the umbrella's affair
     except (RuntimeError, OSError, LogUnreadableError) as error:
         print(f"tactile demo: {error}", file=sys.stderr)
         return 3

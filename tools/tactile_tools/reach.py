@@ -87,6 +87,8 @@ def run(options: argparse.Namespace) -> int:
     except (StrategyError, SettingError, ValueError) as error:
         print(f"tactile reach: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:
+        raise  # whoever read our words has gone, which is the umbrella's affair
     except (WorldError, RecorderError, LogUnreadableError, OSError, RuntimeError) as error:
         print(f"tactile reach: {error}", file=sys.stderr)
         return 3
