@@ -141,7 +141,7 @@ def test_comparing_runs_pairs_their_trials(
     code, out, _ = run(capsys, "compare", alone, alone, "--csv", tmp_path / "c.csv")
     assert code == 0
     line = next(line for line in out.splitlines() if "straight" in line)
-    assert "100%" in line
+    assert "100 %" in line
     assert "+0 [" in line
     head = (tmp_path / "c.csv").read_text().splitlines()[0]
     assert head == "strategy,A [95 %],B [95 %],B − A [95 %],p,paired,same"

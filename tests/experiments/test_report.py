@@ -220,7 +220,7 @@ def test_the_sweep_is_smoothed_and_judged(filled: Filled, tmp_path: Path) -> Non
     assert grid.smooth("time") == pytest.approx(np.full((10, 10), 0.75))
     text = told(build(run))
     assert "the claim about time holds here, the other does not" in text
-    assert "The least success of a setting is 100%" in text
+    assert "The least success of a setting is 100 %" in text
 
 
 def test_smoothing_passes_over_cells_that_are_missing() -> None:
@@ -288,7 +288,7 @@ def test_sets_are_compared_on_their_own_terms(filled: Filled, tmp_path: Path) ->
     success, values = comparison(load_run(a).rows, load_run(b).rows)
     burrow = {row[0]: row for row in success.rows}["burrow"]
     assert burrow[3].startswith("+0 [")
-    assert burrow[5:] == ["20", "100%"]
+    assert burrow[5:] == ["20", "100 %"]
     assert len(values.rows) == 5
 
 

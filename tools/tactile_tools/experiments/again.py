@@ -98,5 +98,6 @@ def _run(spec: TrialSpec, path: Path | None) -> Row:
     try:
         with TrialLog(path, scene_of(spec), spec.strategy, spec.trial_seed) as log:
             return run_one(spec, watch=log, done=log.outcome)
-    except (RecorderError, OSError) as error:
+    except (RecorderError, OSError, RuntimeError) as error:
+        # A log that is not whole is a RuntimeError; those of the trial itself are in its row.
         raise DiskError(f"cannot write {path}: {error}") from error

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tactile_tools.experiments.document import TableData, percent, points, shown_p
+from tactile_tools.experiments.document import TableData, percent, points, shown_p, whole
 from tactile_tools.experiments.journal import DiskError
 from tactile_tools.experiments.rows import Row, TableError
 from tactile_tools.experiments.spec import STRATEGIES
@@ -127,7 +127,7 @@ def _success(
         points(paired.difference, paired.interval),
         shown_p(paired.p),
         str(paired.scenes),
-        f"{same / paired.scenes:.0%}",
+        f"{whole(same / paired.scenes)} %",
     ]
 
 

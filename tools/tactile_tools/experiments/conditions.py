@@ -96,12 +96,9 @@ def parameters_of(spec: TrialSpec) -> Parameters:
 def sense_of(spec: TrialSpec, scene: Scene) -> Sense | None:
     """The sense of touch of ``spec``; None where it is the plain one of its depth."""
     conditions = spec.changed
-    plain = Conditions(
-        objects=conditions.objects,
-        friction_objects=conditions.friction_objects,
-        friction_all=conditions.friction_all,
-    )
-    if conditions == plain:
+    if conditions == replace(
+        conditions, noise=0.0, feature_rate=None, dead_taxels=0.0, finger_width=None
+    ):
         return None
     figures = world_parameters(scene.parameters)
     stretch = _figures(figures, conditions).finger_width / figures.finger_width

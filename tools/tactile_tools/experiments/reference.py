@@ -77,7 +77,9 @@ PAPER_EJECTED = MappingProxyType({"hybrid_clock": (5, 25), "hybrid_event": (1, 2
 
 @dataclass(frozen=True, slots=True)
 class SweepReference:
-    """The paper's sweep: means of straight, and the worst of all cells."""
+    """The paper's sweep: means of straight, the worst of all cells, and what to avoid by primitive
+    and measure.
+    """
 
     straight_distance: float
     straight_time: float
@@ -85,6 +87,7 @@ class SweepReference:
     worst_distance_ratio: float
     worst_time_ratio: float
     worst_success: Mapping[str, float]
+    avoid: Mapping[tuple[str, str], str]
 
 
 PAPER_SWEEP = SweepReference(
@@ -94,4 +97,12 @@ PAPER_SWEEP = SweepReference(
     worst_distance_ratio=1 / 3,  # "≈ 3-fold"
     worst_time_ratio=0.8,  # "≈ 20 %"
     worst_success=MappingProxyType({"burrow": 0.62, "excavate": 0.68}),
+    avoid=MappingProxyType(
+        {
+            ("burrow", "distance"): "low A_bur with high f_bur",
+            ("burrow", "time"): "high A_bur",
+            ("excavate", "distance"): "high t_trig with high t_excv",
+            ("excavate", "time"): "low t_trig with high t_excv",
+        }
+    ),
 )

@@ -90,8 +90,8 @@ def _section(run: Run, name: str, rows: Sequence[Row], prefix: str) -> Section |
         text=[
             f"Straight on the same {len(straight)} scenes: mean normalised distance "
             f"{means['distance']:.3f} (paper {PAPER_SWEEP.straight_distance}), time "
-            f"{means['time']:.3f} (paper {PAPER_SWEEP.straight_time}), success {success:.0%} "
-            f"(paper {PAPER_SWEEP.straight_success:.0%}). Each cell of a grid is the mean over the "
+            f"{means['time']:.3f} (paper {PAPER_SWEEP.straight_time}), success {whole(success)} % "
+            f"(paper {whole(PAPER_SWEEP.straight_success)} %). Each cell of a grid is the mean over the "
             "scenes as a ratio to that of straight; below 1 the primitive is better. The plots "
             "show it smoothed by a Gaussian of one cell, as the paper does; the tables say both.",
             "The paper gives f_bur in Hz and writes sin(f t); its authors' simulator puts the "
@@ -150,7 +150,29 @@ def _finding(grid: Grid) -> str:
     else:
         verdict = "neither claim holds here"
     paper = PAPER_SWEEP.worst_success[grid.key[0]]
-    return f"{text}{verdict}. The least success of a setting is {worst:.0%} (paper {paper:.0%})."
+    least = f"The least success of a setting is {whole(worst)} % (paper {whole(paper)} %)."
+    return f"{text}{verdict}. {least} {_where(grid)}"
+
+
+def _where(grid: Grid) -> str:
+    """Which quarter of the grid is worst, and which the paper says should be avoided."""
+    rows, columns = ("A_bur", "f_bur") if grid.key[0] == "burrow" else ("t_excv", "t_trig")
+    told = []
+    for metric in METRICS:
+        smooth = grid.smooth(metric)
+        if not np.isfinite(smooth).all():
+            continue
+        quarters = {
+            (down, across): float(smooth[i : i + 5, j : j + 5].mean())
+            for i, down in ((0, "low"), (5, "high"))
+            for j, across in ((0, "low"), (5, "high"))
+        }
+        down, across = max(quarters, key=lambda q: quarters[q])
+        paper = PAPER_SWEEP.avoid[grid.key[0], metric]
+        told.append(
+            f"{metric} is worst where {rows} is {down} and {columns} {across} (paper: {paper})"
+        )
+    return f"By quarters of the grid, {'; '.join(told)}." if told else ""
 
 
 def _worst_table(grids: Sequence[Grid], prefix: str) -> TableData:

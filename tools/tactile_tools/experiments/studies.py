@@ -65,10 +65,9 @@ class Cell:
 def strategies_study(options: Options, strategies: tuple[str, ...] = STRATEGIES) -> Study:
     """Every strategy in every scene."""
     specs = [
-        spec
+        _with(base, strategy, options.parameters)
         for base in _bases(options)
         for strategy in strategies
-        for spec in [_with(base, strategy, options.parameters)]
     ]
     return _study("strategies", options, specs, strategies=strategies)
 
