@@ -15,7 +15,7 @@ import pytest
 
 from tactile_tools.experiments import report_sweep
 from tactile_tools.experiments.compare import comparison
-from tactile_tools.experiments.document import Document, points, shown_p, whole
+from tactile_tools.experiments.document import Document, points, shown_p, typeset, whole
 from tactile_tools.experiments.report import build, write_report
 from tactile_tools.experiments.report_robustness import FLIPS, HOLDS
 from tactile_tools.experiments.rows import TableError
@@ -163,7 +163,7 @@ def test_trials_that_failed_are_told_and_count_for_nothing(filled: Filled, tmp_p
     page = write_report(run, tmp_path / "out").read_text()
     assert "25 of 50 trials" in page
     assert "&lt;physics&gt; gave up" in page  # text of a trial is never taken for markup
-    assert "100 % [57, 100]" in page
+    assert "100\u00a0% [57, 100]" in page
 
 
 def test_groups_are_told_apart(filled: Filled, tmp_path: Path) -> None:
@@ -172,7 +172,10 @@ def test_groups_are_told_apart(filled: Filled, tmp_path: Path) -> None:
     document = build(load_run(run))
     titles = [s.title for s in document.sections]
     assert titles[0] == "At a glance"
-    assert {"authors_sim · mujoco · contacts", "authors_sim · mujoco · taxels"} < set(titles)
+    assert titles[1:] == [
+        "authors_sim · MuJoCo · exact contacts",
+        "authors_sim · MuJoCo · touch through taxels",
+    ]
     names = [p.name for s in document.sections for p in s.pictures]
     assert len(names) == len(set(names)) == 6
     headline, success, values = document.sections[0].tables
@@ -297,6 +300,11 @@ def test_sets_are_compared_on_their_own_terms(filled: Filled, tmp_path: Path) ->
 )
 def test_p_values_are_told_as_they_are_read(p: float, text: str) -> None:
     assert shown_p(p) == text
+
+
+def test_signs_stay_with_their_numbers() -> None:
+    assert typeset("61 % (p = 0.03)") == "61\u00a0% (p\u00a0=\u00a00.03)"
+    assert typeset("-8 [-20, +2] of t-test 12-16") == "−8 [−20, +2] of t-test 12-16"
 
 
 def test_rates_are_rounded_as_in_print() -> None:

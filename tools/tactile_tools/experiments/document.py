@@ -78,6 +78,7 @@ class Document:
             trim_blocks=True,
             lstrip_blocks=True,
         )
+        environment.filters["set"] = typeset
         html = environment.get_template("report.html.j2").render(document=self)
         directory.mkdir(parents=True, exist_ok=True)
         for section in self.sections:
@@ -89,6 +90,12 @@ class Document:
         path = directory / "report.html"
         replace_file(path, html.encode())
         return path
+
+
+def typeset(text: str) -> str:
+    """``text`` with signs that are not torn from their numbers, and minus for a hyphen there."""
+    text = re.sub(r" (?=%)|(?<=\bp) (?=[=<] )|(?<=\bp [=<]) (?=\d)", "\u00a0", text)
+    return re.sub(r"(?<![\w.–])-(?=\d)", "−", text)
 
 
 def percent(rate: Rate) -> str:

@@ -29,7 +29,9 @@ PAPER = (
 MEASURES = (
     "Success is reaching the goal within the time limit. Normalised distance is how far the tip "
     "is from the goal at the end, over the depth of the cupboard; normalised time is the time "
-    "taken over the time limit, 1 where the goal was not reached. Less is better for both."
+    "taken over the time limit, 1 where the goal was not reached. Less is better for both. A "
+    "difference is called significant, or beyond chance, where one as large would come up by "
+    "chance in fewer than one of twenty repeats (p < 0.05)."
 )
 
 TITLES = {

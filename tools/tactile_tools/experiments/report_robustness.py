@@ -23,7 +23,7 @@ from tactile_tools.experiments.plots import heat_map
 from tactile_tools.experiments.rows import Row
 from tactile_tools.experiments.spec import canonical
 from tactile_tools.experiments.statistics import SIGNIFICANT, Rate, paired_rates, signed_rank
-from tactile_tools.experiments.tables import Run
+from tactile_tools.experiments.tables import Run, title_of
 
 Float = NDArray[np.float64]
 
@@ -103,8 +103,8 @@ def robustness_sections(run: Run) -> list[Section]:
     several = len(run.groups()) > 1
     sections = []
     for group, rows in run.groups().items():
-        name = " · ".join(group)
-        prefix = slug(name) + "-" if several else ""
+        name = title_of(group)
+        prefix = slug(" ".join(group)) + "-" if several else ""
         axes = {a: points_of(run, a, group[0], rows) for a in run.study.definition["axes"]}
         strategies = run.study.definition["strategies"]
         tables = [_rate_table(a, points, strategies, prefix) for a, points in axes.items()]

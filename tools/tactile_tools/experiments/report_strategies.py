@@ -31,6 +31,7 @@ from tactile_tools.experiments.reference import (
 from tactile_tools.experiments.rows import DIRECTIONS, TRIGGERS, Row
 from tactile_tools.experiments.statistics import (
     PairedValues,
+    Rate,
     all_pairs,
     contrast,
     holm,
@@ -38,7 +39,7 @@ from tactile_tools.experiments.statistics import (
     paired_rates,
     stars,
 )
-from tactile_tools.experiments.tables import GROUP, Run
+from tactile_tools.experiments.tables import GROUP, Run, title_of
 
 MEASURES = {
     "normalized_distance": ("distance", "d_goal / d_scene at the end"),
@@ -67,11 +68,13 @@ def strategy_sections(run: Run) -> list[Section]:
         by = {name: of for name, of in by.items() if of}
         if not by:
             continue
-        name = " · ".join(group)
+        name = title_of(group)
         headline.append([name, *(percent(rate_of(by.get(n, []))) for n in order)])
         own = run.options.source in (None, group[0]) and not run.options.parameters
         references = REFERENCES.get(group[0], ()) if own else ()
-        sections.append(_section(name, by, references, slug(name) + "-" if several else ""))
+        sections.append(
+            _section(name, by, references, slug(" ".join(group)) + "-" if several else "")
+        )
     if several:
         tables = [
             TableData(
@@ -122,6 +125,7 @@ def _section(name: str, by: ByStrategy, references: Sequence[Reference], prefix:
         findings=[text for text in told if text],
         tables=[
             _success_table(by, references, prefix),
+            _entered_table(by, references, prefix),
             _measures_table(by, bool(references), prefix),
             _pairs_table("Normalised distance, all pairs", distance, prefix + "pairs-distance"),
             _pairs_table("Normalised time, all pairs", time, prefix + "pairs-time"),
@@ -137,43 +141,63 @@ def _values(by: ByStrategy, column: str) -> dict[str, dict[int, float]]:
 
 
 def _success_table(by: ByStrategy, references: Sequence[Reference], prefix: str) -> TableData:
-    head = ["strategy", "scenes", "success [95 %]"]
-    for reference in references:
-        head += [reference.label, "difference [95 %]", "p"]
-    head.append("ever within 7.5 mm [95 %]")
-    with_entered = [r for r in references if r.entered]
-    for reference in with_entered:
-        head += [reference.label, "p"]
+    return _beside(
+        "Success",
+        "success",
+        by,
+        {r.label: r.success for r in references},
+        "; ".join(f"{r.label}: {r.what}" for r in references),
+        prefix,
+    )
+
+
+def _entered_table(by: ByStrategy, references: Sequence[Reference], prefix: str) -> TableData:
+    return _beside(
+        "Tip ever within 7.5 mm of the goal, the region that the paper calls the goal",
+        "entered",
+        by,
+        {r.label: r.entered for r in references if r.entered},
+        "",
+        prefix,
+    )
+
+
+def _beside(
+    caption: str,
+    column: str,
+    by: ByStrategy,
+    others: Mapping[str, Mapping[str, Rate]],
+    sources: str,
+    prefix: str,
+) -> TableData:
+    """How often ``column`` is true, beside the rates of others."""
+    head = ["strategy", "scenes", "ours [95 %]"]
+    for label in others:
+        head += [label, "difference [95 %]", "p"]
     body = []
     for name, rows in by.items():
-        rate, entered = rate_of(rows), rate_of(rows, "entered")
+        rate = rate_of(rows, column)
         cells = [spoken(name), str(len(rows)), percent(rate)]
-        for reference in references:
-            if name not in reference.success:
+        for theirs in others.values():
+            if name not in theirs:
                 cells += ["–"] * 3
                 continue
-            found = contrast(rate, reference.success[name])
+            found = contrast(rate, theirs[name])
             cells += [
-                f"{whole(reference.success[name].value)} %",
+                f"{whole(theirs[name].value)} %",
                 points(found.difference, found.interval),
                 shown_p(found.p),
             ]
-        cells.append(percent(entered))
-        for reference in with_entered:
-            theirs = reference.entered.get(name)
-            if theirs is None:
-                cells += ["–"] * 2
-            else:
-                cells += [f"{whole(theirs.value)} %", shown_p(contrast(entered, theirs).p)]
         body.append(cells)
-    sources = "; ".join(f"{r.label}: {r.what}" for r in references)
+    note = "Wilson intervals of rates"
+    if others:
+        note += "; Newcombe's of differences, in percentage points; p by Fisher's exact test"
     return TableData(
-        "Success",
+        caption,
         head,
         body,
-        note="Wilson intervals of rates, Newcombe intervals of differences in percentage points, "
-        "p by Fisher's exact test." + (f" {sources[0].upper()}{sources[1:]}." if sources else ""),
-        name=prefix + "success",
+        note=note + "." + (f" {sources[0].upper()}{sources[1:]}." if sources else ""),
+        name=prefix + column,
     )
 
 

@@ -23,7 +23,7 @@ from tactile_tools.experiments.studies import (
     Cell,
     sweep_cells,
 )
-from tactile_tools.experiments.tables import Run
+from tactile_tools.experiments.tables import Run, title_of
 
 Float = NDArray[np.float64]
 
@@ -67,9 +67,9 @@ def sweep_sections(run: Run) -> list[Section]:
     several = len(run.groups()) > 1
     sections = []
     for group, rows in run.groups().items():
-        name = " · ".join(group)
+        name = title_of(group)
         good = [row for row in rows if row["error"] is None]
-        if section := _section(run, name, good, slug(name) + "-" if several else ""):
+        if section := _section(run, name, good, slug(" ".join(group)) + "-" if several else ""):
             sections.append(section)
     return sections
 
@@ -91,8 +91,8 @@ def _section(run: Run, name: str, rows: Sequence[Row], prefix: str) -> Section |
             f"Straight on the same {len(straight)} scenes: mean normalised distance "
             f"{means['distance']:.3f} (paper {PAPER_SWEEP.straight_distance}), time "
             f"{means['time']:.3f} (paper {PAPER_SWEEP.straight_time}), success {whole(success)} % "
-            f"(paper {whole(PAPER_SWEEP.straight_success)} %). Each cell of a grid is the mean over the "
-            "scenes as a ratio to that of straight; below 1 the primitive is better. The plots "
+            f"(paper {whole(PAPER_SWEEP.straight_success)} %). Each cell is the mean over "
+            "the scenes as a ratio to that of straight; below 1 the primitive is better. The plots "
             "show it smoothed by a Gaussian of one cell, as the paper does; the tables say both.",
             "The paper gives f_bur in Hz and writes sin(f t); its authors' simulator puts the "
             "sweep's numbers into the sine as they are, so that they are rad/s. The reading makes "

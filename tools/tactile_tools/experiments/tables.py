@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,19 @@ from tactile_tools.experiments.studies import Options, Study, rebuild
 
 GROUP = ("set", "engine", "depth")
 """Columns that part a run into studies of their own."""
+
+
+_WORDS = {
+    "mujoco": "MuJoCo",
+    "pymunk": "Chipmunk",
+    "contacts": "exact contacts",
+    "taxels": "touch through taxels",
+}
+
+
+def title_of(group: Sequence[str]) -> str:
+    """A group in words."""
+    return " · ".join(_WORDS.get(value, value) for value in group)
 
 
 @dataclass(frozen=True, slots=True)
