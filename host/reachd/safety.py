@@ -29,6 +29,10 @@ from tactile_bus.records import record
 
 Effect = Literal["ignored", "limited", "stopped", "latched", "refused"]
 
+ON_THE_WAY = 0.003
+"""s from a cycle's deadline to the arm: what the loop is late and what the bus takes. An input is
+too old by so much and a period before its age is reached, so that zero is there in time."""
+
 CONFIRMED_WITHIN = 1e-3
 """Part by which a limit read back may differ from the one sent: arms round theirs. A lower one is
 refused too, for the arm would clip what the strategy wants without a word."""
@@ -242,8 +246,7 @@ class SafetyGate:
                 oldest = min(touch.captured, touch.received)
                 self._felt = oldest if self._felt is None else max(self._felt, oldest)
         age = math.inf if self._felt is None else seconds_between(self._felt, now)
-        # One period early, so that zero is sent before the age is reached, not after.
-        if age <= s.features_age - s.period:
+        if age <= s.features_age - s.period - ON_THE_WAY:
             return
         text = f"no valid features for {age:.3f} s"
         if age > s.features_latch and self._on(Check.FEATURES_LOST):
@@ -268,7 +271,7 @@ class SafetyGate:
         if ahead > s.future and self._on(Check.ARM_FUTURE):
             text = f"arm state stamped {ahead:.3f} s ahead of now"
             stops.append(Intervention(Check.ARM_FUTURE, "stopped", text))
-        if age > s.arm_age - s.period:
+        if age > s.arm_age - s.period - ON_THE_WAY:
             text = f"no arm state for {age:.3f} s"
             if age > s.arm_latch and self._on(Check.ARM_LOST):
                 faults.append(Intervention(Check.ARM_LOST, "latched", text))

@@ -316,13 +316,13 @@ def test_in_a_corner_both_borders_hold(send: Callable[..., Decision]) -> None:
 def test_it_comes_to_rest_before_the_border(
     make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
 ) -> None:
-    """State 40 ms old, commands kept for the whole of their life: it stays inside."""
+    """State 37 ms old, commands kept for the whole of their life: it stays inside."""
     gate = make_gate(settings)
     xs = [0.0] * 5  # tip 0.158 inside
     held = ZERO
     for k in range(1, 1500):
         now = Instant(T0 + k * 10_000_000)
-        seen = Instant(now - 40_000_000)
+        seen = Instant(now - 37_000_000)
         arm = make_arm(seen, x=xs[-5])
         decision = gate.step(Twist(0.06, 0.0, 0.0), make_touch(now), arm, None, now)
         if k % 6 == 0:  # five of six commands are lost; the arm goes on with the last
