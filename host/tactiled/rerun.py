@@ -162,7 +162,7 @@ class Rerun:
 
     def _settle(self) -> None:
         """Act on every event whose place among the chunks is known."""
-        while self._events and self._events[0].after_ns <= self._newest:
+        while self._events and _place(self._events[0]) <= self._newest:
             self._act(self._events.popleft())
 
     def _act(self, event: Any) -> None:
@@ -245,6 +245,11 @@ class Rerun:
         if medium is Medium.SERIAL:
             port.add_station(0, recorded.name)
         return port
+
+
+def _place(event: Any) -> int:
+    """Up to which chunk an event tells what became of them."""
+    return max(int(event.after_ns), int(event.until_ns))
 
 
 class ClockedSink(Sink, Protocol):

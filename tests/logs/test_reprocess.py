@@ -1,0 +1,245 @@
+"""The pipeline again over a log: the same to the bit whatever happened, or as newly asked."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sim_device.board_clock import ClockParameters
+from sim_device.faults import FaultPlan
+from tactile_bus.calibration import save
+from tactile_bus.log_info import info
+from tactile_bus.log_reader import read_messages
+from tactile_bus.messages import codec
+from tactile_bus.recorder import RecorderSettings
+from tactile_bus.topics import FEATURES
+from tactiled.pipeline_settings import PipelineSettings
+
+COUNTED = re.compile(r"^(\S+): (\d+) messages, (\d+) in the log; (\d+) the same to the bit$", re.M)
+
+
+@pytest.fixture(scope="module")
+def virtual() -> Any:
+    """The helper module beside this file: there is no package to import it from."""
+    path = Path(__file__).with_name("virtual_daemon.py")
+    spec = importlib.util.spec_from_file_location("virtual_daemon", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["virtual_daemon"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def counts(out: str) -> dict[str, tuple[int, int, int]]:
+    return {row[0]: (int(row[1]), int(row[2]), int(row[3])) for row in COUNTED.findall(out)}
+
+
+def all_same(outcome: Any, least: int, board: str = "finger") -> None:
+    assert outcome.code == 0, outcome.err
+    found = counts(outcome.out)
+    for topic in ("features", "forces", "field", "ambient", "contacts"):
+        new, old, same = found[f"/tactile/{board}/{topic}"]
+        assert new == old == same, (topic, outcome.out)
+    assert found[f"/tactile/{board}/features"][0] >= least
+    assert "estimated anew" not in outcome.out
+
+
+def features(path: Path, board: str = "finger") -> list[Any]:
+    topic = FEATURES.channel(board)
+    return [codec().decode(FEATURES, m.data) for _, m in read_messages(path, {topic})]
+
+
+@pytest.fixture(scope="module")
+def pressed_log(virtual: Any, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("pressed") / "run.mcap"
+    board = virtual.make_board(contacts=virtual.press, clock=ClockParameters(error=0.03))
+    daemon = virtual.VirtualDaemon(path, [board], [virtual.calibration()])
+    daemon.run(2.0)
+    daemon.close()
+    return path.read_bytes()
+
+
+@pytest.fixture
+def pressed(pressed_log: bytes, tmp_path: Path) -> Path:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(pressed_log)
+    return path
+
+
+def test_the_same_settings_give_the_same_bytes(log_tool: Any, pressed: Path) -> None:
+    all_same(log_tool("reprocess", pressed), 150)
+    out = pressed.with_name("run_reprocessed.mcap")
+    found = info(out)
+    assert found.whole
+    assert found.metadata["reprocessed"]["timing"] == "as recorded"
+    assert {c.topic: c.messages for c in found.channels} == {
+        c.topic: c.messages for c in info(pressed).channels
+    }
+    assert found.attachments.keys() == info(pressed).attachments.keys()
+    # What came out is a log like any other: it can be run again.
+    all_same(log_tool("reprocess", out, "--out", out.with_name("third.mcap")), 150)
+
+
+def test_so_it_does_whatever_happened_on_the_way(
+    log_tool: Any, virtual: Any, tmp_path: Path
+) -> None:
+    """Bad wire, tare, new rate, silence, unplugging, reset, a stalled pipeline, a recalibration."""
+    path = tmp_path / "run.mcap"
+    plan = FaultPlan(seed=3, flip=2e-5, loss=0.01, duplicate=0.01, reorder=0.01, reset=(4.9,))
+    board = virtual.make_board(plan=plan, clock=ClockParameters(error=-0.02), rate=50.0)
+    first = virtual.calibration()
+    daemon = virtual.VirtualDaemon(path, [board], [first], inbox=20)
+    daemon.run(1.0)
+    report = daemon.tare()
+    daemon.run(0.8)
+    assert report.done()
+    daemon.set_rate(60.0)
+    daemon.run(0.6)
+    daemon.stalled = True
+    daemon.run(0.8)  # more than the inbox holds
+    daemon.stalled = False
+    daemon.run(0.4)
+    assert daemon.inbox.dropped > 0
+    daemon.unplug()
+    daemon.run(0.5)
+    daemon.open()
+    daemon.run(1.0)
+    arrays = tuple(replace(a, newton_per_ut=a.newton_per_ut * 1.5) for a in first.arrays)
+    daemon.recalibrate(replace(first, arrays=arrays))
+    daemon.run(1.2)
+    daemon.close()
+    kinds = {
+        codec().decode("tactile_msgs/msg/PortEvent", m.data).kind
+        for _, m in read_messages(path, {"/tactile/finger/port"})
+    }
+    assert kinds >= {
+        "opened", "lost", "tick", "skipped", "tare", "set_rate", "recalibrate", "worked", "ended"
+    }  # fmt: skip
+    all_same(log_tool("reprocess", path), 120)
+
+
+def test_boards_on_a_can_bus_in_split_files(log_tool: Any, virtual: Any, tmp_path: Path) -> None:
+    boards = [virtual.make_can_board(seed, node, rate=50.0) for seed, node in ((7, 3), (8, 4))]
+    small = RecorderSettings(min_free_bytes=0, split_bytes=40_000, flush_period=0.02)
+    daemon = virtual.VirtualDaemon(
+        tmp_path / "bus.mcap", boards, [virtual.calibration(7)], recorder=small
+    )
+    daemon.run(1.6)
+    daemon.close()
+    assert log_tool("split", tmp_path / "bus", "--every", "0.5").code == 0
+    parts = tmp_path / "bus_split"
+    assert len(list(parts.iterdir())) > 2
+    outcome = log_tool("reprocess", parts, "--out", tmp_path / "o.mcap")
+    all_same(outcome, 40, "finger-3")
+    all_same(outcome, 40, "finger-4")
+
+
+def test_new_settings_and_calibrations_give_new_features(
+    log_tool: Any, virtual: Any, pressed: Path, tmp_path: Path
+) -> None:
+    first = virtual.calibration()
+    arrays = tuple(replace(a, newton_per_ut=a.newton_per_ut * 2) for a in first.arrays)
+    save(replace(first, arrays=arrays), tmp_path / "new.cal.toml")
+    out = tmp_path / "new.mcap"
+    given = ("--calibration", tmp_path / "new.cal.toml", "--out", out)
+    outcome = log_tool("reprocess", pressed, *given)
+    assert outcome.code == 0, outcome.err
+    new, old, same = counts(outcome.out)["/tactile/finger/features"]
+    assert new == old
+    assert same < new  # without contact both say 0 N, to the bit
+    before, after = features(pressed)[-1], features(out)[-1]
+    assert after.peak_force == pytest.approx(2 * before.peak_force, rel=0.1)
+    assert info(out).attachments["finger.cal.toml"][1] != info(pressed).attachments
+    # and the new log holds the new calibration: alone it gives the same again
+    all_same(log_tool("reprocess", out, "--out", tmp_path / "again.mcap"), 150)
+    slow = log_tool(
+        "reprocess", pressed, "--feature-rate", "15", "--compensation", "off", "--out",
+        tmp_path / "slow.mcap",
+    )  # fmt: skip
+    rows = counts(slow.out)
+    assert rows["/tactile/finger/ambient"][0] == 0
+    assert 18 < rows["/tactile/finger/features"][0] < 40
+    assert info(tmp_path / "slow.mcap").metadata["pipeline"]["feature_rate_hz"] == "15.0"
+    config = tmp_path / "c.toml"
+    config.write_text("[sensing]\ncontact_minimum_n = 5.0\n")
+    high = log_tool("reprocess", pressed, "--config", config, "--out", tmp_path / "high.mcap")
+    assert high.code == 0
+    assert not any(f.patches for f in features(tmp_path / "high.mcap"))
+
+
+def test_a_log_that_was_cut_off_gives_what_its_bytes_give(
+    log_tool: Any, pressed: Path, tmp_path: Path
+) -> None:
+    data = pressed.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(data[: len(data) * 2 // 3])
+    outcome = log_tool("reprocess", cut)
+    assert outcome.code == 0, outcome.err
+    new, old, same = counts(outcome.out)["/tactile/finger/features"]
+    # Raw bytes may be in the log before the features made of them, never the other way round here.
+    assert new >= old == same > 20
+    assert "not closed" in outcome.out
+
+
+def test_a_log_whose_beginning_is_missing_is_only_listened_to(
+    log_tool: Any, virtual: Any, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    board = virtual.make_board(rate=50.0)
+    daemon = virtual.VirtualDaemon(path, [board], [virtual.calibration()])
+    daemon.run(0.6)
+    daemon.unplug()
+    daemon.run(0.1)
+    daemon.open()  # whereupon the board is asked who it is
+    daemon.run(0.8)
+    daemon.close()
+    assert log_tool("split", path, "--at", "0.5").code == 0
+    outcome = log_tool("reprocess", tmp_path / "run_split" / "run_0001.mcap")
+    assert outcome.code == 0, outcome.err
+    assert "estimated anew" in outcome.out
+    assert 20 < counts(outcome.out)["/tactile/finger/features"][0] < 60
+
+
+def test_what_cannot_be_reprocessed_is_refused(
+    log_tool: Any, virtual: Any, pressed: Path, recorded: Any, tmp_path: Path
+) -> None:
+    other = tmp_path / "other.cal.toml"
+    save(virtual.calibration(99), other)
+    silent = recorded(tmp_path / "reach.mcap", 0.1)
+    bad = tmp_path / "bad.toml"
+    bad.write_text("[sensing]\ntare_s = -1\n")
+    pressed.with_name("run_reprocessed.mcap").touch()
+    for words, text in (
+        ((pressed, "--calibration", other, "--out", tmp_path / "o.mcap"), "fits none in"),
+        ((pressed, "--calibration", bad, "--out", tmp_path / "o.mcap"), "bad.toml"),
+        ((pressed, "--config", bad, "--out", tmp_path / "o.mcap"), "tare_s"),
+        ((pressed, "--feature-rate", "-3", "--out", tmp_path / "o.mcap"), "feature_rate_hz is"),
+        ((silent,), "holds no raw bytes"),
+        ((pressed, silent, "--out", tmp_path / "o.mcap"), "2 logs given"),
+        ((pressed,), "exists and is not overwritten"),
+        ((pressed, "--out", pressed, "--force"), "is what is read"),
+    ):
+        outcome = log_tool("reprocess", *words)
+        assert outcome.code == 2, outcome
+        assert text in outcome.err
+    assert not (tmp_path / "o.mcap").exists()
+
+
+def test_settings_of_a_newer_version_are_named(log_tool: Any, virtual: Any, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    daemon = virtual.VirtualDaemon(path, [virtual.make_board()], [virtual.calibration()])
+    daemon.recorder.metadata("pipeline", {"method": '"off"', "quantum": "1"})
+    daemon.run(0.3)
+    daemon.close()
+    outcome = log_tool("reprocess", path)
+    assert outcome.code == 2
+    assert "quantum" in outcome.err
+    assert "update tactile-reach" in outcome.err
+    assert PipelineSettings().method == "consensus"
