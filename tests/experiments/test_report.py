@@ -262,7 +262,7 @@ def test_robustness_says_where_a_conclusion_flips(filled: Filled, tmp_path: Path
     (finding,) = document.sections[0].findings
     assert finding == (
         "Burrow succeeds more than straight: at 3 of 4 conditions beyond chance. It flips beyond "
-        "chance at objects in the cupboard (30–34)."
+        "chance at objects in the cupboard 30–34."
     )
     claims, density = document.sections[0].tables
     assert [row[1] for row in claims.rows] == [HOLDS, HOLDS, HOLDS, FLIPS]

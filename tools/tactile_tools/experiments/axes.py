@@ -28,10 +28,21 @@ class Level:
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """Something that is varied: its name in words with its unit, and its levels for a set."""
+    """Something that is varied: its name in words, its levels for a set, and their unit."""
 
-    title: str
+    name: str
     levels: Callable[[str], list[Level]]
+    unit: str = ""
+
+    @property
+    def title(self) -> str:
+        """Name and unit, as on an axis."""
+        return f"{self.name}, {self.unit}" if self.unit else self.name
+
+    def at(self, *labels: str) -> str:
+        """Levels in words, such as "width of the finger 4 and 5 cm"."""
+        several = " and ".join([", ".join(labels[:-1]), labels[-1]] if labels[1:] else labels)
+        return f"{self.name} {several}" + (f" {self.unit}" if self.unit else "")
 
 
 OBJECTS = MappingProxyType({"authors_sim": (20, 30), "hardware": (15, 22)})
@@ -131,12 +142,12 @@ AXES: Mapping[str, Axis] = MappingProxyType(
         "density": Axis("objects in the cupboard", _density),
         "friction_objects": Axis("friction of object on object", _friction_objects),
         "friction_all": Axis("friction of every pair", _friction_all),
-        "force": Axis("force limit of the arm, N", _force),
-        "width": Axis("width of the finger, cm", _width),
-        "time": Axis("time limit, s", _time),
-        "noise": Axis("noise of the sensor, N", _noise),
-        "rate": Axis("rate of the features, Hz", _rate),
-        "dead": Axis("dead taxels, %", _dead),
+        "force": Axis("force limit of the arm", _force, "N"),
+        "width": Axis("width of the finger", _width, "cm"),
+        "time": Axis("time limit", _time, "s"),
+        "noise": Axis("noise of the sensor", _noise, "N"),
+        "rate": Axis("rate of the features", _rate, "Hz"),
+        "dead": Axis("dead taxels", _dead, "%"),
     }
 )
 """By the name a user gives."""

@@ -14,7 +14,6 @@ from tactile_tools.experiments.document import (
     Picture,
     Section,
     TableData,
-    listed,
     percent,
     slug,
     spoken,
@@ -31,6 +30,8 @@ REFUSED = "the gate refuses to arm"
 """Part of the error of a trial whose touch is so bad that the safety gate does not let it begin.
 That is an outcome: the goal was not reached."""
 
+
+OWN = "the set's own values"
 
 EXPLAINED = (
     "One condition at a time is varied, everything else stays as the parameter set has it; the "
@@ -141,11 +142,7 @@ def _findings(axes: Mapping[str, Sequence[Point]], strategies: Sequence[str]) ->
     """A sentence for each claim that all its strategies were run for."""
     told = []
     for claim in _testable(strategies):
-        verdicts = [
-            (axis, point.level, point.verdict(claim))
-            for axis, points in axes.items()
-            for point in points
-        ]
+        verdicts = [(axis, p.level, p.verdict(claim)) for axis, p in _conditions(axes)]
         known = [v for v in verdicts if v[2] != UNKNOWN]
         if not known:
             continue
@@ -169,12 +166,19 @@ def _findings(axes: Mapping[str, Sequence[Point]], strategies: Sequence[str]) ->
     return told
 
 
+def _conditions(axes: Mapping[str, Sequence[Point]]) -> list[tuple[str, Point]]:
+    """Every level with its axis; the set's own values, which most axes have, but once."""
+    own = [(axis, p) for axis, points in axes.items() for p in points if p.level.nominal]
+    rest = [(axis, p) for axis, points in axes.items() for p in points if not p.level.nominal]
+    return [*own[:1], *rest]
+
+
 def _places(found: Sequence[tuple[str, Level, str]]) -> str:
     """Levels by axis in words."""
     by: dict[str, list[str]] = {}
     for axis, level, _ in found:
-        by.setdefault(axis, []).append(level.label)
-    return listed([f"{AXES[axis].title} ({', '.join(labels)})" for axis, labels in by.items()])
+        by.setdefault("" if level.nominal else axis, []).append(level.label)
+    return "; ".join(AXES[axis].at(*labels) if axis else OWN for axis, labels in by.items())
 
 
 def _testable(strategies: Sequence[str]) -> list[Claim]:
@@ -186,9 +190,11 @@ def _verdict_table(
 ) -> TableData:
     claims = _testable(strategies)
     body = [
-        [f"{AXES[axis].title}: {point.level.label}", *(point.verdict(c) for c in claims)]
-        for axis, points in axes.items()
-        for point in points
+        [
+            OWN if point.level.nominal else AXES[axis].at(point.level.label),
+            *(point.verdict(c) for c in claims),
+        ]
+        for axis, point in _conditions(axes)
     ]
     return TableData(
         "Which conclusions survive where",
