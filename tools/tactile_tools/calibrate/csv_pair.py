@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tactile_bus.geometry import SkinGeometry
 from tactile_bus.nominal import MAX_ANYSKIN_MAGNETOMETERS, nominal
-from tactile_tools.calibrate.recording import Recording, RecordingError, check
+from tactile_tools.calibrate.recording import Recording, RecordingError, check, with_clock
 
 Float = NDArray[np.float64]
 
@@ -71,7 +71,7 @@ def read_pair(path: Path, target: str | None = None) -> Recording:
     begin = float(sensor[0, 0])
     if not 0 <= begin < LATEST_S:
         raise RecordingError(f"{path}/sensor.csv: first time {begin:g}; allowed: s since 1970")
-    return check(
+    whole = check(
         Recording(
             path=path,
             geometry=geometry,
@@ -85,6 +85,7 @@ def read_pair(path: Path, target: str | None = None) -> Recording:
             targets=targets,
         )
     )
+    return with_clock(whole)
 
 
 def to_taxel_axes(field: Float, geometry: SkinGeometry) -> Float:

@@ -49,10 +49,16 @@ class Judged:
         return value
 
 
-def predict(model: NetModel, recording: Recording) -> Float:
-    """(k, targets) for every label of ``recording``, causal, tared at its beginning."""
+def predict(model: NetModel, recording: Recording, label_clock: bool = True) -> Float:
+    """(k, targets) for every label of ``recording``, causal, tared at its beginning.
+
+    ``label_clock``: at the instant each label was true, not at its stamp less the mean lag.
+    """
     features = batch_features(model.features, recording.time_s, recording.change_ut())
-    at = causal(recording.time_s, features, recording.label_time_s, model.delay_s)
+    late = (
+        recording.lag_s if label_clock else np.full(len(recording.labels), recording.lag_s.mean())
+    )
+    at = causal(recording.time_s, features, recording.label_time_s, late + model.delay_s)
     return readout(model, at)
 
 

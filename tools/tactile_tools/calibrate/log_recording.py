@@ -22,7 +22,13 @@ from tactile_bus.log_reader import LogReader
 from tactile_bus.log_records import AttachmentRecord, Block, LogError
 from tactile_bus.messages import DecodeError, codec, stamp_ns
 from tactile_bus.topics import FIELD, REFERENCE, find_topic
-from tactile_tools.calibrate.recording import MIN_FRAMES, Recording, RecordingError, check
+from tactile_tools.calibrate.recording import (
+    MIN_FRAMES,
+    Recording,
+    RecordingError,
+    check,
+    with_clock,
+)
 
 Float = NDArray[np.float64]
 
@@ -79,7 +85,7 @@ def read_log(path: Path, name: str | None = None) -> Recording:
     force = np.array(board.force)
     targets = _targets(force)
     begin = board.field_ns[0]
-    return check(
+    whole = check(
         Recording(
             path=path,
             geometry=calibration.geometry,
@@ -94,6 +100,7 @@ def read_log(path: Path, name: str | None = None) -> Recording:
             calibration=calibration,
         )
     )
+    return with_clock(whole)
 
 
 def _collect(path: Path) -> tuple[dict[str, _Board], dict[str, BoardCalibration]]:

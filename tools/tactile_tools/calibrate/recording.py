@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tactile_bus.calibration import BoardCalibration
 from tactile_bus.geometry import SkinGeometry
+from tactile_tools.calibrate.label_clock import LabelClock, find_clock
 
 Float = NDArray[np.float64]
 
@@ -36,6 +37,7 @@ class Recording:
     (m, 3n) µT in taxel axes. ``rest_ut``: (m, 3n), the rest field of each frame where the
     recording has it (single touches, between which the rig let go), else None. ``labels``:
     (k, targets) in the targets' units. ``serial_number``: empty where the recording has none.
+    ``label_clock``: how late each label is, None where that was not found.
     ``calibration``: what the board ran with while it was recorded, None where unknown.
     """
 
@@ -49,6 +51,7 @@ class Recording:
     label_time_s: Float
     labels: Float
     targets: tuple[str, ...]
+    label_clock: LabelClock | None = None
     calibration: BoardCalibration | None = None
 
     @property
@@ -82,6 +85,12 @@ class Recording:
         count = max(MIN_TARE_FRAMES, int(np.searchsorted(time, time[0] + TARE_S)))
         return np.asarray(field - field[:count].mean(axis=0))
 
+    @property
+    def lag_s(self) -> Float:
+        """(k,) s by which each label was late when it was read."""
+        clock = self.label_clock
+        return np.zeros(len(self.label_time_s)) if clock is None else clock.lag_s
+
     def until(self, share: float) -> Recording:
         """The first ``share`` of its frames, and the labels up to the last of them."""
         frames = int(len(self.time_s) * share)
@@ -94,6 +103,9 @@ class Recording:
             rest_ut=None if self.rest_ut is None else self.rest_ut[:frames],
             label_time_s=self.label_time_s[:labels],
             labels=self.labels[:labels],
+            label_clock=None
+            if self.label_clock is None
+            else replace(self.label_clock, lag_s=self.label_clock.lag_s[:labels]),
         )
 
 
@@ -134,3 +146,11 @@ def check(recording: Recording) -> Recording:
                 "with the skin untouched, for that is when it is tared"
             )
     return recording
+
+
+def with_clock(recording: Recording) -> Recording:
+    """The same with the lag of its labels, where force shows one."""
+    if not recording.forces:
+        return recording
+    strongest = recording.labels[:, int(np.ptp(recording.labels, axis=0).argmax())]
+    return replace(recording, label_clock=find_clock(recording.label_time_s, strongest))

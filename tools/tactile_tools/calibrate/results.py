@@ -12,7 +12,7 @@ import numpy as np
 from rich.table import Table
 
 from tactile_bus.net_types import TARGET_UNITS
-from tactile_tools.calibrate.evaluate import Judged
+from tactile_tools.calibrate.evaluate import Judged, predict
 from tactile_tools.calibrate.limits import limits
 
 DEFINITIONS = {
@@ -93,13 +93,16 @@ def _overall(judged: Judged) -> float:
 
 
 def _one(judged: Judged) -> dict[str, Any]:
-    choice = judged.choice
+    choice, recording = judged.choice, judged.recording
+    guess = predict(judged.model, recording, label_clock=False)
+    stamped = np.sqrt(((guess - judged.measured)[judged.tested] ** 2).mean(axis=0))
     targets = {}
     for i, target in enumerate(judged.model.targets):
         error = judged.errors[:, i]
         measured = judged.measured[judged.tested, i]
         targets[target] = {
             "rmse": float(judged.rmse[i]),
+            "rmse_as_stamped": float(stamped[i]),
             "mean_absolute": float(np.abs(error).mean()),
             "bias": float(error.mean()),
             "worst": float(np.abs(error).max()),
@@ -117,6 +120,14 @@ def _one(judged: Judged) -> dict[str, Any]:
             "penalty": choice.penalty,
             "delay_s": choice.delay_s,
             "features": judged.model.features.size,
+        },
+        "label_clock": None
+        if recording.label_clock is None
+        else {
+            "beat_s": recording.label_clock.beat_s,
+            "reading_s": recording.label_clock.reading_s,
+            "jumps": recording.label_clock.jumps,
+            "concentration": recording.label_clock.concentration,
         },
         "cross_validation": {
             "candidates": [

@@ -85,13 +85,15 @@ def align(made: Sequence[Copy], recordings: Sequence[Recording], delay_s: float)
     for copy in made:
         recording = recordings[copy.recording]
         time = recording.label_time_s
-        inside = (time >= copy.time_s[0] + max(delay_s, 0.0)) & (time <= recording.time_s[-1])
+        inside = (time - recording.lag_s >= copy.time_s[0] + max(delay_s, 0.0)) & (
+            time <= recording.time_s[-1]
+        )
         if recording.rest_ut is not None or not recording.forces:
             inside = time >= copy.time_s[0]
         count = int(inside.sum())
         parts.append(
             (
-                causal(copy.time_s, copy.features, time[inside], delay_s),
+                causal(copy.time_s, copy.features, time[inside], recording.lag_s[inside] + delay_s),
                 recording.labels[inside],
                 time[inside],
                 np.full(count, copy.recording),
@@ -102,7 +104,7 @@ def align(made: Sequence[Copy], recordings: Sequence[Recording], delay_s: float)
     return Rows(columns[0], columns[1], columns[2], columns[3], columns[4])
 
 
-def causal(time_s: Float, values: Float, at_s: Float, delay_s: float) -> Float:
+def causal(time_s: Float, values: Float, at_s: Float, delay_s: Float | float) -> Float:
     """``values`` (m, F) between frames at ``at_s - delay_s``; frames after ``at_s`` stay unused."""
     if len(time_s) == 1:
         return np.repeat(values, len(at_s), axis=0)
