@@ -70,6 +70,7 @@ class ChannelInfo:
     clock_steps: list[tuple[int, int]] = field(default_factory=list)  # log time, change in ns
     _sequence: int | None = None
     _period: float = 0.0
+    _prior_ns: int = 0
     _least: int | None = None  # of log time less stamp, in this window
     _before: int | None = None  # and in the one before
 
@@ -101,9 +102,11 @@ class ChannelInfo:
             self.first_ns = self.last_ns = log_ns
         self._watch_clock(log_ns, message.publish_ns)
         pause = log_ns - self.last_ns
-        if pause < -BACK_LEAST_NS:
+        back = self._prior_ns - log_ns
+        if back > BACK_LEAST_NS:
             self.backwards += 1
-            self.furthest_back_ns = max(self.furthest_back_ns, -pause)
+            self.furthest_back_ns = max(self.furthest_back_ns, back)
+        self._prior_ns = log_ns
         self.longest_ns = max(self.longest_ns, pause)
         usual = max(SILENCE_PERIODS * self._period, SILENCE_LEAST_NS)
         if self.messages > SETTLED and pause > usual:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -99,18 +100,29 @@ class _Copy:
 
     def take(self, event: Block | MetadataRecord | AttachmentRecord) -> None:
         """Write one event over."""
-        if self._file is None:
-            reader = self._reader
-            self._file = McapFile(self._target, DiskStorage(), reader.library, reader.profile)
+        file = self._file or self._open()
         report = self._report
         if isinstance(event, MetadataRecord):
-            self._file.add_metadata(event.name, event.values)
+            file.add_metadata(event.name, event.values)
             report.metadata += 1
         elif isinstance(event, AttachmentRecord):
-            self._attachment(self._file, event)
+            self._attachment(file, event)
         else:
-            self._block(self._file, event)
-        self._file.commit()
+            self._block(file, event)
+        file.commit()
+
+    def _open(self) -> McapFile:
+        reader = self._reader
+        try:
+            file = McapFile(self._target, DiskStorage(), reader.library, reader.profile)
+        except FileExistsError:
+            raise
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.unlink(self._target)  # it was made, but not even its start could be written
+            raise
+        self._file = file
+        return file
 
     def finish(self) -> None:
         """Close the target; `LogError` when there is nothing in it."""

@@ -82,8 +82,9 @@ def recorded() -> Callable[..., Path]:
         recorder.metadata("board:finger", {"serial_number": "0011"})
         for i in range(round(seconds * 100)):
             at = BASE_NS + round((start + i / 100) * 1e9)
-            recorder.write(topics.FEATURES, "finger", features(at, i), at + 1_000_000, at)
-            twist = MSG.Twist(MSG.Vector3(i * 1e-3, 0.0, 0.0), MSG.Vector3(0.0, 0.0, 0.1))
+            number = i + round(start * 100)
+            recorder.write(topics.FEATURES, "finger", features(at, number), at + 1_000_000, at)
+            twist = MSG.Twist(MSG.Vector3(number * 1e-3, 0.0, 0.0), MSG.Vector3(0.0, 0.0, 0.1))
             command = MSG.TwistStamped(header(at, "cupboard"), twist)
             data = codec().encode(topics.COMMAND, command)
             recorder.write(topics.COMMAND, "arm", data, at + 2_000_000, at)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
+import os
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
 from tactile_bus.log_records import LogError
-from tactile_tools.logs.terminal import ToolError, complain, fail
+from tactile_tools.logs.terminal import REFUSED, ToolError, complain, fail
 
 COMMANDS = {
     "info": "channels, rates, losses, gaps, outcome, and whether the file is whole",
@@ -72,7 +72,12 @@ def _guarded(
             return complain(str(error), error.code)
         except LogError as error:
             return fail(error)
-        finally:
-            sys.stderr.flush()
+        except BrokenPipeError:
+            raise  # whoever read our output has gone; `tactile` ends quietly
+        except OSError as error:
+            # The output itself: what a tool writes to files it answers for. Nothing more can be
+            # said there, nor may the interpreter try when it ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            return complain(f"cannot write the output: {error.strerror or error}", REFUSED)
 
     return guarded

@@ -1,0 +1,129 @@
+"""Pictures: of every kind of log, also where something is missing; and bounded memory."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from tactile_tools.cli import main
+from tactile_tools.series import BoardSeries, Spread, Track, read_boards
+
+
+@pytest.fixture(scope="module")
+def skin_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated finger that is pressed on its left side."""
+    place = Path(__file__).with_name("virtual_daemon.py")
+    spec = importlib.util.spec_from_file_location("virtual_daemon", place)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["virtual_daemon"] = module
+    spec.loader.exec_module(module)
+    path = tmp_path_factory.mktemp("skin") / "run.mcap"
+    daemon: Any = module.VirtualDaemon(
+        path, [module.make_board(contacts=module.press, rate=50.0)], [module.calibration()]
+    )
+    daemon.run(2.2)
+    daemon.close()
+    return path
+
+
+def picture(path: Path) -> Any:
+    """Pixels; a picture with nothing drawn is white all over."""
+    pixels = matplotlib.image.imread(path)
+    assert pixels.shape[0] > 500
+    assert (pixels[..., :3].min(axis=2) < 0.9).mean() > 0.005
+    return pixels
+
+
+def test_every_picture_is_drawn_without_a_display(skin_log: Path, tmp_path: Path) -> None:
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "MPLBACKEND")}
+    done = subprocess.run(
+        [sys.executable, "-m", "tactile_tools.cli", "plot", str(skin_log), "--out",
+         str(tmp_path / "overview.png")],
+        env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    drawn = [picture(tmp_path / "overview.png")]
+    for what in ("taxels", "forces", "field", "timing"):
+        out = tmp_path / f"{what}.png"
+        assert main(["plot", str(skin_log), "--what", what, "--out", str(out)]) == 0
+        drawn.append(picture(out))
+    sizes = [pixels.shape for pixels in drawn]
+    assert len({(shape, float(p.mean())) for shape, p in zip(sizes, drawn, strict=True)}) == 5
+
+
+def test_the_strongest_moment_is_that_of_the_press(skin_log: Path) -> None:
+    from tactile_tools.plot_skin import strongest
+
+    board = read_boards(skin_log)["finger"]
+    (moment,) = strongest(board, 1)
+    force = np.nan_to_num(-board.force[moment][:, 2])
+    assert board.time[moment] > 1.0
+    assert 0 <= int(force.argmax()) < 32  # on the left array
+    assert force.sum() == pytest.approx(3.0, rel=0.5)
+
+
+def test_bad_arguments_are_refused(
+    skin_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    note = tmp_path / "x.mcap"
+    note.write_bytes(b"no log")
+    for words, code, text in (
+        ([skin_log, "--what", "reach"], 3, "holds no reach"),
+        ([skin_log, "--name", "thumb"], 2, "no board 'thumb' in the log; it holds finger"),
+        ([skin_log, "--at", "99", "--what", "taxels"], 2, "--at 99; the log of finger goes from"),
+        ([skin_log, "--out", tmp_path / "a.gif"], 2, "allowed: a file that ends in"),
+        ([skin_log, "--out", tmp_path / "no" / "a.png"], 2, "there is no folder"),
+        ([note], 3, "is no MCAP file"),
+        ([tmp_path / "none.mcap"], 2, "does not exist"),
+    ):
+        assert main(["plot", *map(str, words)]) == code, words
+        said = capsys.readouterr().err
+        assert text in said
+        assert "Traceback" not in said
+
+
+def test_a_long_log_keeps_its_peaks_in_bounded_memory() -> None:
+    track = Track(limit=1000)
+    for i in range(100_000):
+        track.add(i * 0.01, i, 50.0 if i == 31_415 else 1.0)
+    assert len(track) <= 1000
+    assert 31_415 in track.items
+    assert track.time == sorted(track.time)
+    assert track.items[0] < 200
+    assert track.items[-1] > 99_000
+
+
+def test_percentiles_are_right_to_six_per_cent() -> None:
+    spread = Spread()
+    rng = np.random.default_rng(3)
+    values = rng.lognormal(-6, 1, 20_000)
+    for value in values:
+        spread.add(float(value))
+    for share in (0.5, 0.99):
+        assert spread.percentile(share) == pytest.approx(np.quantile(values, share), rel=0.07)
+    assert spread.greatest == values.max()
+    assert spread.number == len(values)
+
+
+def test_a_board_without_compensation_or_clock_is_drawn(skin_log: Path, tmp_path: Path) -> None:
+    from tactile_tools.plot_curves import draw_field, draw_timing
+    from tactile_tools.plot_skin import draw
+
+    board = read_boards(skin_log)["finger"]
+    bare = BoardSeries(
+        "bare", geometry=board.geometry, cycles=board.cycles, first=board.first, last=board.last,
+        forces=board.forces, delays=board.delays,
+    )  # fmt: skip
+    for drawer in (draw, draw_field, draw_timing):
+        drawer(bare, tmp_path / "bare.png")
+        picture(tmp_path / "bare.png")
