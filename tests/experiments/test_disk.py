@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import subprocess
 import sys
@@ -12,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from tactile_tools.experiments import journal as journal_module
 from tactile_tools.experiments.journal import DiskError, FolderError, Journal, parse_lines
@@ -19,6 +22,12 @@ from tactile_tools.experiments.rows import Row, outcome_of, read_table
 from tactile_tools.experiments.studies import Study, strategies_study
 
 Run = Callable[..., dict[str, Any]]
+
+QUICK = settings(
+    max_examples=60,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
 
 
 @pytest.fixture
@@ -143,6 +152,40 @@ def test_a_folder_that_may_not_be_made_says_so(study: Study, tmp_path: Path) -> 
         Journal(tmp_path / "file" / "run", study.definition)
 
 
+def test_a_run_killed_before_it_had_a_definition_can_be_begun_again(
+    study: Study, tmp_path: Path
+) -> None:
+    (tmp_path / ".lock").touch()
+    (tmp_path / "experiment.json.part").write_text("{")
+    with Journal(tmp_path, study.definition) as journal:
+        assert journal.load() == {}
+
+
+@QUICK
+@given(data=st.data())
+def test_a_journal_cut_off_anywhere_keeps_its_whole_lines(rows: list[Row], data: Any) -> None:
+    whole = b"".join(json.dumps(row).encode() + b"\n" for row in rows)
+    cut = whole[: data.draw(st.integers(0, len(whole)))]
+    found, damaged = parse_lines(cut)
+    assert list(found.values()) == rows[: cut.count(b"\n")]
+    assert damaged == (not cut.endswith(b"\n") and bool(cut))
+
+
+@QUICK
+@given(data=st.data())
+def test_a_damaged_journal_never_makes_up_a_trial(rows: list[Row], data: Any) -> None:
+    lines = [json.dumps(row).encode() + b"\n" for row in rows]
+    hit = data.draw(st.integers(0, len(lines) - 1))
+    at = data.draw(st.integers(0, len(lines[hit]) - 1))
+    spoilt = bytearray(lines[hit])
+    spoilt[at] = data.draw(st.integers(0, 255).filter(lambda b: b not in b"0123456789."))
+    lines[hit] = bytes(spoilt)
+    found, damaged = parse_lines(b"".join(lines))
+    assert len(found) + damaged >= len(rows) - 1
+    kept = [row for i, row in enumerate(rows) if i not in (hit, hit + 1)]
+    assert all(row in found.values() for row in kept)
+
+
 def test_lines_that_are_no_trials_are_counted(rows: list[Row]) -> None:
     lines = [
         b"null\n",
@@ -156,8 +199,6 @@ def test_lines_that_are_no_trials_are_counted(rows: list[Row]) -> None:
 
 
 def test_a_row_of_the_wrong_kind_is_no_trial(rows: list[Row]) -> None:
-    import json
-
     wrong = {**rows[0], "distance_m": "near"}
     assert parse_lines(json.dumps(wrong).encode() + b"\n")[1] == 1
     wrong = {k: v for k, v in rows[0].items() if k != "ejected"}

@@ -210,7 +210,9 @@ def _compare(directory: Path, found: Mapping[str, Any], wanted: Mapping[str, Any
 
 def _refuse_strangers(directory: Path) -> None:
     """FolderError for a folder with files of somebody else's."""
-    others = sorted(p.name for p in directory.iterdir() if p.name != ".lock")
+    # What a run leaves that was killed in its first moment.
+    ours = {".lock", "experiment.json.part"}
+    others = sorted(p.name for p in directory.iterdir() if p.name not in ours)
     if others:
         shown: Sequence[str] = others[:3]
         raise FolderError(
