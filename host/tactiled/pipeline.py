@@ -16,6 +16,7 @@ from tactiled.grouping import CycleCounters, Group, Grouper, gather_temperature
 from tactiled.health import HealthMonitor
 from tactiled.layout import Layout
 from tactiled.methods import make_compensator
+from tactiled.net_stage import PAUSED, NetStage
 from tactiled.pipeline_settings import PipelineSettings
 from tactiled.rest import RestField
 from tactiled.tare import TareReport
@@ -44,6 +45,7 @@ class BoardPipeline:
         self._monitor = HealthMonitor(layout, settings.frozen_after_s, settings.range_limit_ut)
         self._compensator: Compensator = make_compensator(settings, layout, self._model)
         self._features = FeatureExtractor(geometry, settings)
+        self._net = NetStage(calibration.nets, layout)
         self._names = tuple(a.name for a in geometry.arrays)
         self._tip_arrays = [i for i, a in enumerate(geometry.arrays) if a.side.name == "TIP"]
         # a few taxels feel every contact all together: their fit cannot outlast one, see hold_s
@@ -62,7 +64,8 @@ class BoardPipeline:
         )
         self._unknown = Estimate(nothing.plane, nothing, np.zeros(layout.arrays, dtype=bool))
         automatic = settings.auto_tare
-        known = not (calibration.nominal if automatic is None else automatic)
+        unrested = calibration.nominal or self._net.fitted
+        known = not (unrested if automatic is None else automatic)
         self._rest = RestField(layout, self._model, settings, known)
         self._apply_noise(np.array(settings.noise_ut))
         if not known:
@@ -103,6 +106,7 @@ class BoardPipeline:
         self._monitor.reset()
         self._compensator.reset()
         self._features.reset()
+        self._net.pause()
         self._theta = np.zeros_like(self._theta)
         self._last_captured = None
         if self._rest.taring:
@@ -143,6 +147,8 @@ class BoardPipeline:
             self._theta = estimate.theta
             if self.settings.method != "off":
                 forces -= model.plane_forces(estimate.theta)
+            if self._net.fitted and not sick:
+                self._net.share(forces, self._net.update(field, captured))
             if sick:
                 np.copyto(forces, np.nan, where=~healthy[:, None])
         else:
@@ -213,6 +219,8 @@ class BoardPipeline:
             for a in np.flatnonzero((masked > self.settings.masked_limit) & present):
                 reasons.append(f"taxels masked: {self._names[a]} {masked[a]:.0%}")
                 valid = False
+            if self._net.fitted and known:
+                reasons.append(PAUSED)
         ambient = estimate.ambient
         if known and np.count_nonzero(ambient.valid) < len(present):
             for a in np.flatnonzero(~ambient.valid & present):
@@ -252,6 +260,7 @@ class BoardPipeline:
         field -= shift
         self._compensator.reset()
         self._features.reset()
+        self._net.reset()
         self._theta = np.zeros_like(self._theta)
         self._apply_noise(report.noise_ut)
 

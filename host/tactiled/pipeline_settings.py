@@ -25,7 +25,8 @@ class PipelineSettings:
     ``frozen_after_s``: s of unchanging counts after which a taxel is frozen; None: never.
     ``range_limit_ut``: µT beyond which a chip's reading is impossible. ``tare_s``: s averaged.
     ``tare_limit_n``: N on one taxel beyond which a tare is refused as a contact.
-    ``auto_tare``: tare at the start; None: when the calibration is nominal, its rest unknown.
+    ``auto_tare``: tare at the start; None: when the rest is unknown (the calibration is nominal) or
+    a fitted model must start from it.
     ``rest_tracking_s``: s, time constant at which untouched taxels' rest follows; None: never.
     ``hold_s``: s that features stay valid, degraded, on a held field after an array's fit lost its
     support; the default keeps its error below 0.25 N, half the paper's least threshold, at

@@ -73,7 +73,7 @@ def test_the_hash_changes_with_any_number(measured):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("format_version = 1", "format_version = 3", ["format_version is 3", "newer than 1"]),
+        ("format_version = 1", "format_version = 3", ["format_version is 3", "newer than 2"]),
         ('format = "tactile-calibration"', 'format = "mask"', ["format", "mask"]),
         ("nominal = false", 'nominal = "no"', ["nominal is 'no'", "true or false"]),
         ('side = "left"', 'side = "top"', ["array[0].side is top", "left, right, tip"]),

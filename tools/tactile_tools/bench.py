@@ -67,6 +67,17 @@ GROUPS = (
         ("rotation_consensus_rms_n_25", "rotation_contact_bias_pct_25"),
     ),
     Group(
+        "calibration",
+        "bench_calibration",
+        "bench_calibration",
+        "a fitted model, per board and frame",
+        (
+            "calibration_anyskin_ms_p50",
+            "calibration_finger_ms_p50",
+            "calibration_place_ms_p50",
+        ),
+    ),
+    Group(
         "latency",
         "bench_latency",
         "bench_latency",
@@ -127,6 +138,9 @@ AIMS: Mapping[str, Aim] = {
     "consensus_residual_ratio": Aim("≤", 1.0),
     "rotation_consensus_rms_n_25": Aim("≤", 0.05),
     "rotation_contact_bias_pct_25": Aim("≤", 5.0),
+    "calibration_anyskin_ms_p50": Aim("≤", 0.3),
+    "calibration_finger_ms_p50": Aim("≤", 0.3),
+    "calibration_place_ms_p50": Aim("≤", 0.3),
     "wire_to_feature_floor_ratio": Aim("≤", 2.0),
     "wire_to_feature_ms_p99": Aim("≤", 5.0),
     "reach_rtf_contacts": Aim("≥", 80),
