@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import shutil
@@ -21,6 +22,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tactile_bus.log_info import info
+from tactile_bus.messages import codec
 from tactile_bus.services import ServiceError, call
 from tactile_bus.session import BusConfig, close_session, open_session
 from tactile_bus.streams import Tap
@@ -28,6 +30,8 @@ from tactile_bus.topics import service_key
 from tactile_tools.processes import command, free_port, running, wait_for
 
 pytestmark = pytest.mark.timeout(240)
+
+ROOT = Path(__file__).parents[2]
 
 PRESS = """[[press]]
 array = "left"
@@ -235,3 +239,25 @@ def _no_thread_is_left() -> Iterator[None]:
     before = threading.active_count()
     yield
     until(lambda: threading.active_count() <= before + 2, 10)
+
+
+def test_the_layout_for_foxglove_names_what_is_in_a_log(trial: Path, lab: Path) -> None:
+    layout = json.loads((ROOT / "docs" / "foxglove-layout.json").read_text())
+    panels = layout["configById"]
+    placed = set(re.findall(r'"(?:first|second)": "([^"]+)"', json.dumps(panels)))
+    assert placed | {layout["layout"]} == set(panels)
+    topics: dict[str, str] = {}
+    for path in (trial, lab / "run.mcap"):
+        topics |= {channel.topic: channel.msgtype for channel in info(path).channels}
+    named = {t for panel in panels.values() for t in panel.get("topics", {})}
+    named |= {p["topicToRender"] for p in panels.values() if "topicToRender" in p}
+    assert named <= set(topics)
+    for panel in panels.values():
+        for each in panel.get("paths", []):
+            topic, _, field = each["value"].partition(".")
+            msgtype = topics[topic]
+            for part in re.sub(r"\[\d+\]", "", field).split("."):
+                fields = dict(codec().fields(msgtype))
+                assert part in fields, each
+                kind, arguments = fields[part]
+                msgtype = arguments if kind == 2 else ""  # rosbags: a field of another type
