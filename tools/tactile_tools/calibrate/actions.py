@@ -190,6 +190,13 @@ def _watching() -> Iterator[Callable[[str], None]]:
         yield lambda text: status.update(f"trying {text}")
 
 
+def _record(options: argparse.Namespace) -> None:
+    from tactile_tools.calibrate.record import record
+
+    record(options)
+
+
 info = guarded(_info)
 evaluate_command = guarded(_evaluate)
 fit_command = guarded(_fit)
+record_command = guarded(_record)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from tactile_bus.options import add_bus, finite_above_zero
 from tactile_tools.calibrate import actions
 
 
@@ -19,6 +20,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     _add_fit(commands)
     _add_evaluate(commands)
+    _add_record(commands)
     info = commands.add_parser("info", help="what a calibration file says of itself")
     info.add_argument("file", type=Path, metavar="FILE", help="a .cal.toml file")
     info.add_argument("--json", action="store_true", help="as JSON on standard output")
@@ -78,3 +80,33 @@ def _add_evaluate(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     parser.add_argument("--split", choices=("tail20", "leave-one-out"), default="tail20")
     parser.add_argument("--json", action="store_true", help="as JSON on standard output")
     parser.set_defaults(func=actions.evaluate_command)
+
+
+def _add_record(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "record",
+        help="ask for rest, presses and turns, and record them for `fit`",
+        description="Records one board of a running tactiled (or, with --port, of its own) while "
+        "you press it with known weights or a force gauge. Answers are read from standard input.",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="FILE.mcap, new")
+    parser.add_argument("--name", default="board0", help="board, as tactiled names it (board0)")
+    parser.add_argument("--port", help="serial port to run tactiled on (default: one that runs)")
+    parser.add_argument("--board", default="auto", help="kind of board on --port (auto)")
+    parser.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="what tactiled runs the board with"
+    )
+    for name, default, what in (
+        ("rest", 4.0, "recorded of the untouched skin, before and after each press"),
+        ("hold", 2.0, "recorded of each press"),
+        ("turn", 20.0, "recorded of the turning board"),
+    ):
+        parser.add_argument(
+            f"--{name}", type=_seconds, default=default, metavar="S", help=f"s {what} ({default:g})"
+        )
+    add_bus(parser, None)
+    parser.set_defaults(func=actions.record_command)
+
+
+def _seconds(text: str) -> float:
+    return finite_above_zero(text, "s")

@@ -83,7 +83,7 @@ def choose(
 ) -> Choice:
     """Delay, recipe and penalty with the least cross-validated error on ``recordings``."""
     recipes = recipes_for(recordings) if recipes is None else tuple(recipes)
-    delays: list[tuple[float, float]] = []
+    delays: list[tuple[float, Float]] = []
     delay = 0.0
     judge = next((r for r in recipes if r.knows_history), None)
     if judge is not None:
@@ -93,32 +93,59 @@ def choose(
         for each in DELAYS_S:
             rows = align(made, recordings, each)
             delays.append((each, cross_validate(rows, recordings, judge, penalty)))
-        delay = min(delays, key=lambda pair: pair[1])[0]
-    scores = []
+        nearest = sorted(delays, key=lambda pair: abs(pair[0]))
+        delay = nearest[simplest([errors for _, errors in nearest])][0]
+    scores: list[Score] = []
+    best: tuple[float, Score] | None = None
     for recipe in recipes:
         progress(recipe.name)
         made = copies(feature_map(recipe, recordings), recordings, recipe.restarts)
         rows = align(made, recordings, delay)
-        scores += [
-            Score(recipe, penalty, cross_validate(rows, recordings, recipe, penalty))
-            for penalty in recipe.penalties
-        ]
-    best = min(scores, key=lambda score: score.rmse)
-    return Choice(best.recipe, best.penalty, delay, tuple(scores), tuple(delays))
+        strict = sorted(recipe.penalties, reverse=True)
+        errors = [cross_validate(rows, recordings, recipe, penalty) for penalty in strict]
+        own = [Score(recipe, p, float(e.mean())) for p, e in zip(strict, errors, strict=True)]
+        scores += own
+        least = min(score.rmse for score in own)
+        if best is None or least < best[0]:
+            best = least, own[simplest(errors)]
+    if best is None:
+        raise ValueError("no recipe was given")
+    chosen = best[1]
+    means = tuple((d, float(e.mean())) for d, e in delays)
+    return Choice(chosen.recipe, chosen.penalty, delay, tuple(scores), means)
+
+
+def simplest(errors: Sequence[Float]) -> int:
+    """First of candidates, simplest first, whose fold errors are as good as the best's.
+
+    As good: worse by no more than one standard error of the difference, fold by fold (Breiman's
+    rule). What blocks of one recording cannot tell apart, another recording will: there the
+    stricter one wins.
+    """
+    best = min(errors, key=lambda e: float(e.mean()))
+    for i, each in enumerate(errors):
+        worse = each - best
+        if worse.mean() <= worse.std(ddof=1) / np.sqrt(len(worse)) or each is best:
+            return i
+    raise ValueError("no candidate was given")
 
 
 def cross_validate(
     rows: Rows, recordings: Sequence[Recording], recipe: Recipe, penalty: float
-) -> float:
-    """Root of the mean square error over all folds, in the targets' unit."""
-    squares = []
+) -> Float:
+    """(folds,) root mean square error of each, in the targets' unit.
+
+    Candidates are judged by the mean of these, not by the root of the mean square: one fold with
+    the first press of a fresh skin, which no other fold tells of, would choose for all the others.
+    """
+    errors = []
     for fit, test in folds(rows, recordings):
         model = pipeline(recipe, penalty, int(fit.sum()))
         model.fit(rows.features[fit], rows.labels[fit])
         guess = model.predict(rows.features[test]).reshape(-1, rows.labels.shape[1])
         guess = np.maximum(guess, floor(recordings))
-        squares.append(float(((guess - rows.labels[test]) ** 2).mean()))
-    return float(np.sqrt(np.mean(squares)))
+        errors.append(float(np.sqrt(((guess - rows.labels[test]) ** 2).mean())))
+    return np.array(errors)
 
 
 def folds(rows: Rows, recordings: Sequence[Recording]) -> Iterator[tuple[Bool, Bool]]:

@@ -61,6 +61,7 @@ def read_log(path: Path, name: str | None = None) -> Recording:
         raise RecordingError(f"{path}: {error.strerror}; name a log that can be read") from error
     name = _which(path, boards, name)
     board = boards[name]
+    _drop_early(board)
     calibration = attached.get(name)
     if calibration is None:
         raise RecordingError(
@@ -148,6 +149,13 @@ def _take_field(board: _Board, message: object, path: Path) -> None:
         raise RecordingError(f"{path}: over {MAX_FRAMES} frames; `tactile log split` it")
     board.field_ns.append(stamp_ns(message.header.stamp))  # type: ignore[attr-defined]
     board.field_ut.append(values)
+
+
+def _drop_early(board: _Board) -> None:
+    """Forget the frames before the first reading: the rest field may have been another then."""
+    first = min(board.reference_ns)
+    keep = next((i for i, at in enumerate(board.field_ns) if at >= first), len(board.field_ns))
+    del board.field_ns[:keep], board.field_ut[:keep]
 
 
 def _which(path: Path, boards: dict[str, _Board], name: str | None) -> str:

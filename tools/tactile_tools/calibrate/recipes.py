@@ -17,12 +17,12 @@ Float = NDArray[np.float64]
 NEAR_SHARE = 0.08
 """The rest is followed while the field is within this share of the strongest presses: twice the
 4 % by which rest fields creep in the eFlesh recordings."""
-STILL_SHARE = 0.008
+STILL_SHARE = 0.012
 """... and stays within this share of its one-second mean: the field of a released skin creeps by
-0.2 % of the strongest press in a second, a press that begins changes by 1 % in 0.2 s."""
+0.2 % of the strongest press in a second, a press that begins changes by that in 50 ms."""
 STILL_SIGMAS = 3.0
 """... or within this many times the noise of one frame, whichever is more."""
-REST_TAU_S = 2.0
+REST_TAU_S = 1.0
 """s with which the rest is followed."""
 STRONG_PERCENTILE = 95
 
@@ -72,7 +72,7 @@ _HISTORY = Recipe(
     lag_degree=2,
     tracked=True,
     restarts=True,
-    penalties=(0.3, 3.0, 30.0),
+    penalties=(0.3, 1.0, 3.0, 10.0),
 )
 
 FORCE_RECIPES = (

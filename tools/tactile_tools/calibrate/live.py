@@ -1,0 +1,148 @@
+"""The board of a running tactiled as the source of a recording."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from tactile_bus.calibration import BoardCalibration, load, nominal, saves
+from tactile_bus.calibration_file import SUFFIX
+from tactile_bus.instant import WallClock, monotonic_now
+from tactile_bus.messages import MSG, DecodeError, codec, header, stamp_ns
+from tactile_bus.nominal import NOMINAL_MODELS
+from tactile_bus.recorder import Recorder
+from tactile_bus.services import ServiceError, call
+from tactile_bus.streams import BusSample, Tap
+from tactile_bus.topics import FIELD, REFERENCE, service_key
+from tactile_tools.calibrate.wizard import Stamps, WizardError
+
+FIRST_FRAME_S = 10.0
+"""s for tactiled to be found on the bus, identify the board and send a first frame."""
+TARE_S = 8.0
+STATUS_S = 3.0
+
+
+class LiveBoard:
+    """Board ``name`` on the bus; writes every frame to ``recorder`` from the moment it is made."""
+
+    def __init__(self, session: zenoh.Session, recorder: Recorder, name: str) -> None:
+        self._session, self._recorder, self._name = session, recorder, name
+        self._lock = threading.Lock()
+        self._stamps: list[int] = []
+        self._frame = ""
+        self._taxels = 0
+        self._heard = threading.Event()
+        self._wall = WallClock.take()
+        self._tap = Tap(session, FIELD.key(name), self._take_field)
+
+    def wait(self) -> None:
+        """Until frames come; `WizardError` when none do."""
+        if not self._heard.wait(FIRST_FRAME_S):
+            raise WizardError(
+                f"no frames of board {self._name!r} on the bus in {FIRST_FRAME_S:g} s; start "
+                f"tactiled with --name {self._name}, or give --port"
+            )
+
+    def calibration(self, given: Path | None) -> BoardCalibration:
+        """What tactiled runs this board with: in ``given``, the file it names, or typical figures.
+
+        `WizardError` when that is another board's; `CalibrationError` when the file is bad.
+        """
+        try:
+            status = call(self._session, service_key(self._name, "status"), timeout=STATUS_S)
+        except ServiceError as error:
+            raise WizardError(str(error)) from error
+        used: dict[str, Any] = status.get("calibration", {})
+        if given is None and used.get("file"):
+            given = Path(str(used["file"]))
+        if given is None:
+            return self._typical(str(status.get("model", "")), str(used.get("serial_number", "")))
+        calibration = load(given)
+        if calibration.hash != used.get("hash"):
+            raise WizardError(
+                f"{given} (board {calibration.serial_number}) is not what tactiled runs this board "
+                f"with ({used.get('file') or 'typical figures'}); start both with the same file"
+            )
+        return calibration
+
+    def attach(self, calibration: BoardCalibration) -> None:
+        """Embed it in the log, for `fit` to find."""
+        text = saves(calibration).encode()
+        self._recorder.attach(f"{self._name}{SUFFIX}", "application/toml", text)
+
+    def tare(self) -> str:
+        """Tare by tactiled's own service."""
+        try:
+            report = call(self._session, service_key(self._name, "tare"), timeout=TARE_S)
+        except ServiceError as error:
+            raise WizardError(f"{error}; take everything off the skin and begin again") from error
+        return f"  {report['message']}"
+
+    def collect(self, seconds: float) -> Stamps:
+        """Frames captured in the next ``seconds`` s."""
+        begin = self._wall.wall_ns(monotonic_now())
+        time.sleep(seconds)
+        end = self._wall.wall_ns(monotonic_now())
+        with self._lock:
+            found = [stamp for stamp in self._stamps if begin <= stamp <= end]
+            self._stamps.clear()
+        return found
+
+    def label(self, stamps: Stamps, force: float) -> None:
+        """Write what was on the skin when these frames were captured; a `Sink`."""
+        encode = codec().encode
+        for stamp in stamps:
+            message = MSG.WrenchStamped(
+                header=header(stamp, self._frame),
+                wrench=MSG.Wrench(MSG.Vector3(0.0, 0.0, -force), MSG.Vector3(0.0, 0.0, 0.0)),
+            )
+            data = encode(REFERENCE, message)
+            self._recorder.write(REFERENCE, self._name, data, stamp, stamp)
+
+    def close(self) -> None:
+        """Hear no more."""
+        self._tap.close()
+
+    def _typical(self, model: str, serial_number: str) -> BoardCalibration:
+        if model not in NOMINAL_MODELS:
+            raise WizardError(
+                f"no typical figures for model {model!r}; start tactiled with a --calibration that "
+                "says where its taxels are"
+            )
+        found = nominal(
+            model, serial_number or "unknown", None if model == "finger" else self._taxels
+        )
+        if found.geometry.taxels != self._taxels:
+            raise WizardError(
+                f"a typical {model} has {found.geometry.taxels} taxels, this one {self._taxels}; "
+                "start tactiled with a --calibration that says where they are"
+            )
+        return found
+
+    def _take_field(self, sample: BusSample) -> None:
+        try:
+            message = codec().decode(FIELD, sample.data)
+        except DecodeError:
+            return  # not of a tactiled of this version; too few frames are reported as such
+        stamp = stamp_ns(message.header.stamp)
+        self._frame = str(message.header.frame_id)
+        self._taxels = int(message.array_taxels.sum())
+        self._recorder.write(FIELD, self._name, sample.data, stamp, stamp)
+        with self._lock:
+            self._stamps.append(stamp)
+        self._heard.set()
+
+
+def refuse_existing(out: Path) -> str | None:
+    """Why ``out`` cannot be a new log; None when it can."""
+    if out.suffix != ".mcap":
+        return f"--out {out}; allowed: a name that ends in .mcap"
+    if out.exists():
+        return f"--out {out} is there already; name a new file"
+    if not out.resolve().parent.is_dir():
+        return f"--out {out}: there is no folder {out.parent}; create it"
+    return None

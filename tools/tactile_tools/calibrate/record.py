@@ -1,0 +1,92 @@
+"""``tactile calibrate record``: the wizard on a running tactiled, or on a port of its own."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from tactile_bus.options import BusTable, bus_config
+from tactile_bus.recorder import Recorder, RecorderError, RecorderSettings
+from tactile_bus.session import BusConfig, BusError, close_session, open_session
+from tactile_tools.calibrate.actions import REFUSED, ActionError
+from tactile_tools.calibrate.live import LiveBoard, refuse_existing
+from tactile_tools.calibrate.wizard import Timing, Wizard, WizardError
+from tactile_tools.processes import command, free_port, running
+
+
+def record(options: argparse.Namespace) -> None:
+    """Ask, record, write; `ActionError` when nothing that `fit` could use was recorded."""
+    out: Path = options.out
+    trouble = refuse_existing(out)
+    if trouble is not None:
+        raise ActionError(trouble)
+    with contextlib.ExitStack() as stack:
+        bus = stack.enter_context(_bus(options))
+        try:
+            session = open_session(bus)
+        except BusError as error:
+            raise ActionError(str(error), REFUSED) from error
+        stack.callback(close_session, session)
+        try:
+            recorder = Recorder(out, RecorderSettings())
+        except RecorderError as error:
+            raise ActionError(str(error), REFUSED) from error
+        try:
+            presses = _record(options, LiveBoard(session, recorder, options.name))
+        except WizardError as error:
+            raise ActionError(str(error), REFUSED) from error
+        except EOFError as error:
+            raise ActionError("the answers ended before the recording did", REFUSED) from error
+        finally:
+            recorder.close(10.0)
+        if recorder.stats.dropped:
+            raise ActionError(f"the log is not whole: {recorder.stats.dropped}", REFUSED)
+    print(f"wrote {out}: {presses} presses; next: tactile calibrate fit {out} --out FILE.cal.toml")
+
+
+def _record(options: argparse.Namespace, board: LiveBoard) -> int:
+    try:
+        board.wait()
+        board.attach(board.calibration(options.calibration))
+        timing = Timing(options.rest, options.hold, options.turn)
+        wizard = Wizard(board, board.label, _ask, print, timing)
+        return wizard.run()
+    finally:
+        board.close()
+
+
+def _ask(question: str) -> str:
+    """What was typed. Questions are flushed, so that a program at the other end sees them."""
+    print(question, end="", flush=True)
+    line = sys.stdin.readline()
+    if not line:
+        print()
+        raise EOFError
+    return line.rstrip("\n")
+
+
+@contextlib.contextmanager
+def _bus(options: argparse.Namespace) -> Iterator[BusConfig]:
+    """The bus to listen on; with --port, that of a tactiled of our own."""
+    if options.port is None:
+        yield bus_config(options, BusTable(), "tool")
+        return
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    words = [command("tactiled"), "--port", options.port, "--name", options.name, "--no-log"]
+    words += ["--board", options.board, "--listen", endpoint]
+    if options.calibration is not None:
+        words += ["--calibration", str(options.calibration)]
+    with tempfile.TemporaryDirectory(prefix="tactile-record-") as folder:
+        said = Path(folder) / "tactiled"
+        with running(words, said) as process:
+            try:
+                yield BusConfig(role="tool", connect=(endpoint,))
+            except ActionError as error:
+                if process.poll() is None:
+                    raise
+                last = said.read_text(errors="replace").strip().rpartition("\n")[2]
+                raise ActionError(f"tactiled ended: {last}", REFUSED) from error
