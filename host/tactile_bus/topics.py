@@ -76,6 +76,7 @@ TOPICS = (
     REACH_STATE,
     REACH_EVENT,
     TF,
+    REFERENCE,
     WORLD,
 )
 
