@@ -20,9 +20,13 @@ BOARD = "finger"
 MAGIC = b"\x89MCAP"
 ORDERLY_S = 5.0  # for zero twist and the end of a log; both take a second at most
 
-SEED = 29
-"""A scene that is crowded from the front edge on, and that hybrid_event gets through nearly always:
-in five of five runs in real time and five of five in lockstep, with and without an excavation."""
+SEED = 35
+"""A scene in which hybrid_event needs all it has: it goes straight, burrows past objects at the
+front, stalls at a heavy disc before the target and excavates. It gets there in every run so far,
+in lockstep and in real time, also on a machine with four times the work it can do."""
+
+TIME_LIMIT_S = 30.0
+"""The authors' 20 s, and what a busy machine takes: whatever is stale there holds the arm."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -42,7 +46,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--seed",
         type=int,
         default=SEED,
-        help="of scene and trial (default %(default)s: thirty objects in the way)",
+        help="of scene and trial (default %(default)s)",
     )
     parser.set_defaults(func=run)
 
@@ -138,7 +142,7 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
         reaching = subprocess.Popen(
             [
                 *(reachd, "--strategy", options.strategy, "--target", goal),
-                *("--set", _set(options)),
+                *("--set", _set(options), "--time-limit", f"{TIME_LIMIT_S:g}"),
                 *("--board", BOARD, "--seed", str(options.seed), "--log", str(options.out)),
                 *("--listen", reach, "--connect", arm, "--connect", skin),
             ],
