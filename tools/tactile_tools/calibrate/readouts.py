@@ -33,7 +33,7 @@ def pipeline(recipe: Recipe, penalty: float, rows: int) -> Pipeline:
         basis = Nystroem(gamma=RBF_REACH, n_components=min(recipe.units, rows), random_state=SEED)
         return make_pipeline(StandardScaler(), basis, Ridge(penalty))
     network = MLPRegressor(
-        (recipe.units,),
+        hidden_layer_sizes=(recipe.units,),
         activation="tanh",
         alpha=penalty,
         max_iter=MLP_ITERATIONS,
