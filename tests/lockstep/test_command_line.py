@@ -67,11 +67,12 @@ def test_a_log_that_cannot_be_written_is_said_before_the_trial(
 
 
 def test_a_picture_that_cannot_be_written_is_said(
-    folder: Path, scene_file: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, trace: ModuleType, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    Path("free.json").write_text(trace.crowded(0).to_json())
     Path("x.png").mkdir()
     words = ["--strategy", "straight", "--log", "x.mcap", "--png", "x.png"]
-    assert code_of(["reach", "--scene", str(scene_file), *words]) == 3
+    assert code_of(["reach", "--scene", "free.json", *words]) == 3
     assert "x.png" in capsys.readouterr().err
 
 

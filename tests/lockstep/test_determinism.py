@@ -48,10 +48,8 @@ def test_whoever_watches_changes_nothing(trace: ModuleType, depth: str) -> None:
 
 def test_another_seed_is_another_board(trace: ModuleType) -> None:
     scene = trace.crowded()
-    assert (
-        trace.traced(scene, "burrow", 1, "taxels")[1]
-        != trace.traced(scene, "burrow", 2, "taxels")[1]
-    )
+    one, other = (trace.traced(scene, "burrow", k, "taxels", seconds=0.5)[1] for k in (1, 2))
+    assert one != other
 
 
 def test_another_seed_is_another_chance_of_the_strategy(trace: ModuleType) -> None:
@@ -65,6 +63,6 @@ def test_another_seed_is_another_chance_of_the_strategy(trace: ModuleType) -> No
 
 def test_trials_one_after_another_leave_nothing_behind(trace: ModuleType) -> None:
     scene = trace.crowded()
-    alone = trace.traced(scene, "hybrid_event", 3, "taxels")[1]
-    trace.traced(trace.crowded(4), "straight", 9, "taxels")
-    assert trace.traced(scene, "hybrid_event", 3, "taxels")[1] == alone
+    alone = trace.traced(scene, "hybrid_event", 3, "taxels", seconds=1.5)[1]
+    trace.traced(trace.crowded(4), "straight", 9, "taxels", seconds=1.0)
+    assert trace.traced(scene, "hybrid_event", 3, "taxels", seconds=1.5)[1] == alone

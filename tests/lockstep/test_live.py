@@ -20,6 +20,7 @@ from tactile_tools.reach_series import read_reach
 MS = 1_000_000
 
 
+@pytest.mark.timeout(400)  # three programs start, reach for up to half a minute, and draw
 def test_the_demo_reaches_says_so_and_leaves_log_and_picture(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -38,6 +39,7 @@ def test_the_demo_reaches_says_so_and_leaves_log_and_picture(
     assert imread(picture).std() > 0.1
 
 
+@pytest.mark.timeout(400)
 def test_each_of_the_three_may_stop_and_all_stands_still(tmp_path: Path, trace: ModuleType) -> None:
     """Rows 13 to 15 and 24 with the whole chain; the bounds are a loaded machine's."""
     shelf = dataclasses.replace(trace.crowded(0), goal=(0.3, 0.0))
