@@ -19,6 +19,7 @@ from tactile_bus.log_records import (
     MetadataRecord,
     SchemaRecord,
 )
+from tactile_bus.topics import find_topic
 
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 EVENT_TYPE = "tactile_msgs/msg/ReachEvent"
@@ -54,10 +55,14 @@ class Silence:
 
 @dataclass(slots=True)
 class ChannelInfo:
-    """One stream of a log. ``missing``: messages whose sequence numbers are not in the log."""
+    """One stream of a log. ``missing``: messages whose sequence numbers are not in the log.
+
+    ``steady``: it is meant to have a rate, so that a pause says something.
+    """
 
     topic: str
     msgtype: str
+    steady: bool = True
     messages: int = 0
     first_ns: int = 0
     last_ns: int = 0
@@ -109,7 +114,7 @@ class ChannelInfo:
         self._prior_ns = log_ns
         self.longest_ns = max(self.longest_ns, pause)
         usual = max(SILENCE_PERIODS * self._period, SILENCE_LEAST_NS)
-        if self.messages > SETTLED and pause > usual:
+        if self.steady and self.messages > SETTLED and pause > usual:
             self.silence_count += 1
             if len(self.silences) < MAX_LISTED:
                 self.silences.append(Silence(self.last_ns, log_ns))
@@ -246,7 +251,10 @@ def _take_file(
     def channel_of(record: ChannelRecord) -> ChannelInfo:
         schema = reader.schemas.get(record.schema)
         key = record.topic, schema.name if schema else ""
-        return channels.setdefault(key, ChannelInfo(*key))
+        if key not in channels:
+            known = find_topic(record.topic)
+            channels[key] = ChannelInfo(*key, steady=known is None or known[0].rate > 0)
+        return channels[key]
 
     for event in reader.events():
         if isinstance(event, MetadataRecord):

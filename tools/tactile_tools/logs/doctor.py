@@ -204,7 +204,8 @@ def _content_findings(found: LogInfo, watch: _Watch) -> list[Finding]:
         out.append(Finding("empty_channels", False, text))
     silences = sum(channel.silence_count for channel in found.channels)
     if silences:
-        longest = max(found.channels, key=lambda channel: channel.longest_ns)
+        pausing = [channel for channel in found.channels if channel.silence_count]
+        longest = max(pausing, key=lambda channel: channel.longest_ns)
         text = (
             f"{silences} silences in streams of a steady rate, the longest "
             f"{seconds_text(longest.longest_ns)} on {longest.topic}"
