@@ -16,6 +16,8 @@ import pytest
 from tactile_tools.cli import main
 from tactile_tools.series import BoardSeries, Spread, Track, read_boards
 
+pytestmark = pytest.mark.timeout(600)
+
 
 @pytest.fixture(scope="module")
 def skin_log(tmp_path_factory: pytest.TempPathFactory) -> Path:

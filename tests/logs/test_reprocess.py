@@ -21,6 +21,8 @@ from tactile_bus.recorder import RecorderSettings
 from tactile_bus.topics import FEATURES
 from tactiled.pipeline_settings import PipelineSettings
 
+pytestmark = pytest.mark.timeout(600)
+
 COUNTED = re.compile(r"^(\S+): (\d+) messages, (\d+) in the log; (\d+) the same to the bit$", re.M)
 
 

@@ -22,6 +22,8 @@ from tactile_bus.log_reader import read_messages
 from tactile_bus.mcap_file import DiskStorage
 from tactile_bus.recorder import RecorderSettings
 
+pytestmark = pytest.mark.timeout(600)
+
 FEATURES, COMMAND, EVENT = "/tactile/finger/features", "/arm/arm/cmd_vel", "/reach/reach/event"
 
 

@@ -13,8 +13,11 @@ from typing import Any
 import pytest
 
 from tactile_bus.log_records import LogError
+from tactile_bus.mcap_file import DiskStorage
 from tactile_tools.logs import cat, doctor, export, info, recover
 from tactile_tools.logs.terminal import ToolError, fail
+
+pytestmark = pytest.mark.timeout(600)
 
 READ = 6
 
@@ -37,8 +40,9 @@ def outcome(run: Callable[[argparse.Namespace], int], given: argparse.Namespace)
 
 
 @pytest.fixture
-def tools(tmp_path: Path) -> dict[str, Callable[[Path], int]]:
+def tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Callable[[Path], int]]:
     out = tmp_path / "out"
+    monkeypatch.setattr(DiskStorage, "sync", lambda *_: None)  # thousands of times is the disk's
 
     def fixed(module: Any, *words: str) -> Callable[[Path], int]:
         given = options(module, "x", *words)
