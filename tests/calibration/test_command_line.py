@@ -74,7 +74,7 @@ def lose_column(sensor, states):
         (put(5, "1,2,3"), ["sensor.csv, line 6", "3 columns, 16 before"]),
         (put(5, "a,b,c"), ["sensor.csv, line 6", "allowed: numbers"]),
         (put(4, "1700000000.4,315,-100,280,nan", of=1), ["not a finite number"]),
-        (swap, ["time does not increase", "10 to 11", "frames"]),
+        (swap, ["time does not increase", "11 to 12", "frames"]),
         (short, ["20 frames", "at least 50"]),
         (no_readings, ["0 labels", "at least 50"]),
         (pressed_at_start, ["first 1 s", "untouched"]),

@@ -74,9 +74,9 @@ def test_the_delay_of_the_labels_is_found(make_recording):
 
 def test_the_beat_of_a_load_cell_read_too_slowly_is_found(make_recording):
     """Readings 0.2 s apart, fetched every 0.205 s: one in forty is skipped."""
-    time = np.arange(0.0, 200.0, 0.205)
+    time = np.arange(0.0, 400.0, 0.205)
     true = np.floor(time / 0.2) * 0.2
-    dense = np.arange(0.0, 201.0, 0.01)
+    dense = np.arange(0.0, 401.0, 0.01)
     label = np.interp(true, dense, elastic(dense, np.clip(np.sin(2 * np.pi * dense / 20), 0, None)))
     clock = find_clock(time, label)
     assert clock is not None

@@ -23,10 +23,10 @@ JUMP_SHARE = (0.6, 1.5)
 """A jump adds between these shares of an ordinary step: one reading was skipped, not two."""
 BEAT_STEPS = (8.0, 400.0)
 """Beats sought, in readings: a shorter one is no beat, of a longer one no recording shows two."""
-MIN_JUMPS = 8
-MIN_CONCENTRATION = 0.8
-"""Mean resultant length of the jumps' phases; chance gives less than 0.6 for eight jumps, and with
-some thousand beats tried 0.8 is passed by chance once in thousands of recordings."""
+MIN_JUMPS = 15
+MIN_CONCENTRATION = 0.85
+"""Mean resultant length R of the jumps' phases: n jumps at random reach it at one beat with
+probability exp(-n R²), so at any of a few hundred beats once in two hundred recordings."""
 TOOTH_SEARCH = 4
 """Readings to each side of a tooth's expected place among which it is looked for."""
 

@@ -72,7 +72,7 @@ _HISTORY = Recipe(
     lag_degree=2,
     tracked=True,
     restarts=True,
-    penalties=(0.3, 1.0, 3.0, 10.0),
+    penalties=(3.0, 10.0),  # blocks of one recording ask for less, the next recording for this
 )
 
 FORCE_RECIPES = (
