@@ -2,7 +2,7 @@
 
 Unlike the matrices of the arrays, which are linear and know no past, it says what the contact as a
 whole is, from the field of all taxels now and before: creep, hysteresis and curvature included.
-`tactiled.net_force` runs it.
+`tactiled.sensing.net_force` runs it.
 """
 
 from __future__ import annotations

@@ -11,8 +11,8 @@ from typing import Any
 
 from tactile_bus.options import add_log_and_bus, finite_above_zero
 from tactile_bus.session import PORTS
-from tactiled.line import KINDS
-from tactiled.pipeline_settings import METHODS
+from tactiled.links.line import KINDS
+from tactiled.sensing.pipeline_settings import METHODS
 from tactiled.settings import DEFAULT_BAUD
 
 EPILOG = """\

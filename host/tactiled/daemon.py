@@ -26,16 +26,16 @@ from tactile_bus.session import BusError, close_session, open_session
 from tactile_bus.streams import declare_alive
 from tactile_bus.topics import DIAGNOSTICS, alive_key
 from tactiled import diagnostics
-from tactiled.events import Identity, Refusal
 from tactiled.inbox import MAX_AGE, Inbox, Wake
-from tactiled.journal import Journal
-from tactiled.line import SerialLine
-from tactiled.lines import bus_names, make_line
+from tactiled.links.events import Identity, Refusal
+from tactiled.links.line import SerialLine
+from tactiled.links.lines import bus_names, make_line
 from tactiled.memory import Collector, return_large_buffers
 from tactiled.outlet import Outlet
 from tactiled.port import Port, Trouble
 from tactiled.reader import PortReader
-from tactiled.recorded import describe
+from tactiled.replay.journal import Journal
+from tactiled.replay.recorded import describe
 from tactiled.services import BoardServices
 from tactiled.settings import REPLAY_PREFIX, PortSettings, Settings
 from tactiled.shelf import Shelf

@@ -11,7 +11,7 @@ from tactile_bus.instant import Instant, seconds_between
 from tactile_bus.messages import DROPS_PREFIX, MSG, diagnostic_status, header
 from tactile_bus.recorder import Recorder
 from tactiled.blocks import TaxelHealth
-from tactiled.link import BoardLink
+from tactiled.links.link import BoardLink
 from tactiled.port import Port
 from tactiled.station import Station
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from tactile_bus.instant import Instant
-from tactiled import journal as kinds
 from tactiled.blocks import Chunk
-from tactiled.events import Diagnosed, Found, Identity, Refusal
 from tactiled.inbox import Inbox, Item, PortLost, PortOpened
-from tactiled.journal import Journal
-from tactiled.line import Line, LineEvent
-from tactiled.link import BoardLink
+from tactiled.links.events import Diagnosed, Found, Identity, Refusal
+from tactiled.links.line import Line, LineEvent
+from tactiled.links.link import BoardLink
+from tactiled.replay import journal as kinds
+from tactiled.replay.journal import Journal
 from tactiled.station import Station
 from tactiled.transports.base import Transport
 

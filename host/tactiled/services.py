@@ -20,11 +20,11 @@ from tactile_bus.calibration import CalibrationError
 from tactile_bus.instant import monotonic_now
 from tactile_bus.services import Service, ServiceError, declare_service
 from tactile_bus.topics import service_key
-from tactiled import journal
 from tactiled.diagnostics import log_summary, summary
-from tactiled.events import Answered, Event
-from tactiled.link import BoardLink
+from tactiled.links.events import Answered, Event
+from tactiled.links.link import BoardLink
 from tactiled.port import Port
+from tactiled.replay import journal
 from tactiled.shelf import Shelf
 from tactiled.station import Station
 

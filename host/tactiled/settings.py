@@ -22,7 +22,7 @@ from tactile_bus.options import BusTable, LogTable, bus_config, log_destination
 from tactile_bus.recorder import RecorderSettings
 from tactile_bus.session import BusConfig
 from tactile_bus.topics import NAME
-from tactiled.pipeline_settings import PipelineSettings
+from tactiled.sensing.pipeline_settings import PipelineSettings
 from tactiled.transports import listing
 
 DEFAULT_BAUD = 115_200

@@ -17,7 +17,7 @@ from tactile_bus.calibration import (
 from tactile_bus.calibration_file import SUFFIX
 from tactile_bus.log_reader import LogReader
 from tactile_bus.log_records import AttachmentRecord
-from tactiled.events import Identity, Refusal
+from tactiled.links.events import Identity, Refusal
 
 UNNUMBERED = "unknown"
 """Serial number in the nominal calibration of a board that has none."""

@@ -15,7 +15,7 @@ from tactile_bus.instant import NS_PER_S, Instant, seconds_between
 from tactile_bus.recorder import Recorder
 from tactile_bus.topics import AMBIENT, CONTACTS, FEATURES, FIELD, FORCES, GEOMETRY
 from tactiled.blocks import Cycle, Features, SampleBlock
-from tactiled.events import (
+from tactiled.links.events import (
     Answered,
     BoardLog,
     Event,
@@ -32,7 +32,7 @@ from tactiled.events import (
 )
 from tactiled.outgoing import MessageMaker
 from tactiled.outlet import Sink
-from tactiled.pipeline import BoardPipeline, PipelineSettings
+from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 from tactiled.shelf import Choice, Shelf
 from tactiled.skin_picture import SkinPicture
 

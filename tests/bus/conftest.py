@@ -77,6 +77,7 @@ def example_messages() -> dict[topics.Topic, Any]:
             header(WALL_NS, "cupboard"), 1, 2, 0.1, -0.2, 0.3, twist, wrench,
             "moving", 0.05, 0.35, 10.0, 1.5,
         ),
+        topics.REFERENCE: MSG.WrenchStamped(head, wrench),
         topics.COMMAND: MSG.TwistStamped(header(WALL_NS, "cupboard"), twist),
         topics.REACH_STATE: MSG.ReachState(
             header(WALL_NS, "cupboard"), 1, 2, "reaching", "burrow", "hybrid_event",

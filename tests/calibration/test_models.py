@@ -20,8 +20,8 @@ from tactile_tools.calibrate.recipes import FORCE_RECIPES, PLACE_RECIPES, Recipe
 from tactile_tools.calibrate.rows import align, causal, copies
 from tactile_tools.calibrate.splits import block_edges, block_masks
 from tactiled.blocks import SampleBlock
-from tactiled.net_force import NetEstimator, batch_features, readout
-from tactiled.pipeline import BoardPipeline, PipelineSettings
+from tactiled.sensing.net_force import NetEstimator, batch_features, readout
+from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 
 LINEAR, CUBIC, CREEP, PLAY = FORCE_RECIPES
 

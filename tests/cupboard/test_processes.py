@@ -22,9 +22,9 @@ from tactile_bus.services import ServiceError
 from tactile_bus.streams import latest
 from tactile_bus.topics import WORLD, alive_key
 from tactiled.blocks import Cycle
-from tactiled.events import Sampled
-from tactiled.line import SerialLine
-from tactiled.pipeline import BoardPipeline
+from tactiled.links.events import Sampled
+from tactiled.links.line import SerialLine
+from tactiled.sensing.pipeline import BoardPipeline
 from tactiled.transports.serial_port import SerialTransport
 
 AHEAD, BACK = Twist(0.05, 0.0, 0.0), Twist(-0.05, 0.0, 0.0)

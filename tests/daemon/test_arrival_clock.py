@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tactile_bus.instant import NS_PER_S, Instant
-from tactiled.arrival_clock import Arrival, ArrivalClock
+from tactiled.links.arrival_clock import Arrival, ArrivalClock
 
 START = 7_200 * NS_PER_S
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sensor_proto.packets import ClockReply
 from tactile_bus.instant import NS_PER_S, Instant
-from tactiled.clock import CONTRADICTIONS, ClockMap, TickUnwrapper
+from tactiled.links.clock import CONTRADICTIONS, ClockMap, TickUnwrapper
 
 TICK_HZ = 1_000_000
 START = 3_600 * NS_PER_S

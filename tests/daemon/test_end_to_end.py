@@ -17,11 +17,11 @@ from sim_device.skin import Contact
 from tactile_bus.geometry import Side
 from tactile_bus.instant import NS_PER_S, Instant
 from tactiled.blocks import Chunk, Cycle
-from tactiled.can_line import CanLine
-from tactiled.events import Identity, Refusal, Sampled
-from tactiled.line import SerialLine
-from tactiled.link import BoardLink
-from tactiled.pipeline import BoardPipeline
+from tactiled.links.can_line import CanLine
+from tactiled.links.events import Identity, Refusal, Sampled
+from tactiled.links.line import SerialLine
+from tactiled.links.link import BoardLink
+from tactiled.sensing.pipeline import BoardPipeline
 
 SEED = 7
 TICK_NS = NS_PER_S // 500

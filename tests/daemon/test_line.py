@@ -15,11 +15,11 @@ from sensor_proto.framing import SerialDecoder, encode_serial
 from sensor_proto.packets import FloatSamples, Identify
 from tactile_bus.instant import Instant
 from tactiled.blocks import Chunk
-from tactiled.can_line import CanLine
-from tactiled.events import Diagnosed, Found, Identified, Identity, Refusal, Refused, Sampled
-from tactiled.float_link import FloatLink
-from tactiled.line import LineEvent, SerialLine
-from tactiled.link import BoardLink
+from tactiled.links.can_line import CanLine
+from tactiled.links.events import Diagnosed, Found, Identified, Identity, Refusal, Refused, Sampled
+from tactiled.links.float_link import FloatLink
+from tactiled.links.line import LineEvent, SerialLine
+from tactiled.links.link import BoardLink
 
 At = Callable[[float], Instant]
 

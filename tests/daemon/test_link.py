@@ -20,7 +20,7 @@ from sensor_proto.packets import (
     Stop,
 )
 from tactile_bus.instant import NS_PER_S, Instant
-from tactiled.events import (
+from tactiled.links.events import (
     Answered,
     BoardLog,
     FellSilent,
@@ -33,7 +33,7 @@ from tactiled.events import (
     Sampled,
     Streaming,
 )
-from tactiled.link import BoardLink, State
+from tactiled.links.link import BoardLink, State
 
 STEP = 0.001
 

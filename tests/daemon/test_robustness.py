@@ -24,11 +24,11 @@ from sensor_proto.packets import (
 )
 from tactile_bus.instant import NS_PER_S, Instant
 from tactiled.blocks import Chunk
-from tactiled.commands import COMMANDS
-from tactiled.events import Sampled
 from tactiled.inbox import Inbox, Wake
-from tactiled.line import SerialLine
-from tactiled.link import BoardLink
+from tactiled.links.commands import COMMANDS
+from tactiled.links.events import Sampled
+from tactiled.links.line import SerialLine
+from tactiled.links.link import BoardLink
 
 TICKS = st.integers(0, 2**32 - 1)
 

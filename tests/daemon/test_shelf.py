@@ -10,7 +10,7 @@ import pytest
 from sensor_proto.packets import Descriptor
 from tactile_bus.calibration import load, nominal, nominal_from_descriptor, save, saves
 from tactile_bus.recorder import Recorder
-from tactiled.events import Identity, Refusal
+from tactiled.links.events import Identity, Refusal
 from tactiled.shelf import Choice, Shelf
 
 

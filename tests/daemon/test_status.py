@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tactiled.cli import can_networks
-from tactiled.lines import bus_names
+from tactiled.links.lines import bus_names
 from tactiled.status import BAR, bar, drops_text
 
 

@@ -12,10 +12,10 @@ import pytest
 from matplotlib.image import imread
 
 from tactile_bus.topics import ARM_STATE, COMMAND, FEATURES
-from tactile_tools.bench_stop import SpoiltTrialError, rest_after, zero_after
+from tactile_tools.benches.stop import SpoiltTrialError, rest_after, zero_after
 from tactile_tools.cli import main
 from tactile_tools.live_reach import LiveReach
-from tactile_tools.reach_series import read_reach
+from tactile_tools.plots.reach_series import read_reach
 
 MS = 1_000_000
 

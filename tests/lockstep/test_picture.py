@@ -10,11 +10,11 @@ import pytest
 from matplotlib import colors
 from matplotlib.image import imread
 
-from tactile_tools import plot_reach
 from tactile_tools.cli import main
-from tactile_tools.plot_reach import draw_reach
-from tactile_tools.reach_series import read_reach
-from tactile_tools.series import LogUnreadableError
+from tactile_tools.plots import reach as plot_reach
+from tactile_tools.plots.reach import draw_reach
+from tactile_tools.plots.reach_series import read_reach
+from tactile_tools.plots.series import LogUnreadableError
 
 Recorded = Callable[..., tuple[int, Path]]
 

@@ -19,7 +19,7 @@ from tactile_bus.log_reader import read_messages
 from tactile_bus.messages import codec
 from tactile_bus.recorder import RecorderSettings
 from tactile_bus.topics import FEATURES
-from tactiled.pipeline_settings import PipelineSettings
+from tactiled.sensing.pipeline_settings import PipelineSettings
 
 pytestmark = pytest.mark.timeout(600)
 

@@ -18,18 +18,18 @@ from tactile_bus.instant import NS_PER_S, Instant, WallClock
 from tactile_bus.messages import codec
 from tactile_bus.recorder import Recorder, RecorderSettings
 from tactile_bus.topics import RAW, Topic
-from tactiled import journal as kinds
 from tactiled.blocks import Chunk
-from tactiled.events import Identity, Refusal
 from tactiled.inbox import Inbox, PortLost, PortOpened, Wake
-from tactiled.journal import Journal
-from tactiled.lines import bus_names, make_line
-from tactiled.link import BoardLink
+from tactiled.links.events import Identity, Refusal
+from tactiled.links.lines import bus_names, make_line
+from tactiled.links.link import BoardLink
 from tactiled.outgoing import split
-from tactiled.pipeline_settings import PipelineSettings
 from tactiled.port import Port
-from tactiled.recorded import PIPELINE, PORT_PREFIX
-from tactiled.rerun import RecordedSource
+from tactiled.replay import journal as kinds
+from tactiled.replay.journal import Journal
+from tactiled.replay.recorded import PIPELINE, PORT_PREFIX
+from tactiled.replay.rerun import RecordedSource
+from tactiled.sensing.pipeline_settings import PipelineSettings
 from tactiled.shelf import Shelf
 from tactiled.station import Station
 from tactiled.transports.base import Medium

@@ -12,7 +12,7 @@ from tactile_bus.calibration import ArrayCalibration, BoardCalibration
 from tactile_bus.geometry import Side, grid_on_plane
 from tactile_bus.instant import Instant
 from tactiled.blocks import Cycle, SampleBlock
-from tactiled.pipeline import BoardPipeline
+from tactiled.sensing.pipeline import BoardPipeline
 
 Float = NDArray[np.float64]
 

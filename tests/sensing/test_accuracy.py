@@ -10,9 +10,9 @@ import pytest
 
 from tactile_bus.calibration import nominal
 from tactile_bus.instant import Instant
-from tactile_tools.bench_sensing import bench_consensus, bench_pipeline, bench_rotation
+from tactile_tools.benches.sensing import bench_consensus, bench_pipeline, bench_rotation
 from tactiled.blocks import SampleBlock
-from tactiled.pipeline import BoardPipeline, PipelineSettings
+from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 
 RECORDINGS = Path(__file__).parents[2].parent / "shared" / "data" / "eflesh"
 

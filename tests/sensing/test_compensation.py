@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tactile_bus.calibration import nominal
-from tactiled.pipeline import BoardPipeline, PipelineSettings
+from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 
 AMBIENT = np.array([20.0, 10.0, -40.0])
 LATER = np.array([-15.0, 25.0, 35.0])

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tactile_bus.calibration import nominal
-from tactiled.candidates import design_candidates
-from tactiled.consensus import Consensus, Prior
-from tactiled.force_model import ForceModel
-from tactiled.layout import Layout
+from tactiled.sensing.candidates import design_candidates
+from tactiled.sensing.consensus import Consensus, Prior
+from tactiled.sensing.force_model import ForceModel
+from tactiled.sensing.layout import Layout
 
 
 class Fitter:

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from tactile_bus.calibration import nominal
 from tactile_bus.geometry import Side, finger
 from tactile_bus.instant import Instant
-from tactiled.features import FeatureExtractor
-from tactiled.patches import Adjacency
-from tactiled.pipeline import BoardPipeline, PipelineSettings
+from tactiled.sensing.features import FeatureExtractor
+from tactiled.sensing.patches import Adjacency
+from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 
 GEOMETRY = finger()
 POSITION = np.concatenate([a.position for a in GEOMETRY.arrays])

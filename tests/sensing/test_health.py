@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tactiled.blocks import TaxelHealth
-from tactiled.pipeline import BoardPipeline, PipelineSettings
+from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import pytest
 
 from tactile_bus.calibration import nominal
 from tactiled.blocks import TaxelHealth
-from tactiled.pipeline import BoardPipeline, PipelineSettings
+from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 
 
 class Bench:

@@ -11,9 +11,9 @@ import pytest
 
 from sensor_proto import packet
 from tactile_tools import fuzz
-from tactile_tools.fuzz_can import KINDS as CAN_KINDS
-from tactile_tools.fuzz_messages import random_messages
-from tactile_tools.fuzz_serial import KINDS as SERIAL_KINDS
+from tactile_tools.fuzzers.can import KINDS as CAN_KINDS
+from tactile_tools.fuzzers.messages import random_messages
+from tactile_tools.fuzzers.serial import KINDS as SERIAL_KINDS
 
 
 @pytest.fixture

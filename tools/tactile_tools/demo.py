@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from tactile_tools.plots.series import LogUnreadableError
 from tactile_tools.processes import command, free_port, running, wait_for
-from tactile_tools.series import LogUnreadableError
 
 BOARD = "finger"
 
@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> int:
             return 2
     from reachd.parameters import parameters
     from reachd.strategies import StrategyError, load_strategy
-    from tactile_tools.plot_reach import draw_reach
+    from tactile_tools.plots.reach import draw_reach
 
     try:
         # Before three processes are started in vain.

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from tactile_tools.fuzz_can import CanFuzzer
-from tactile_tools.fuzz_serial import SerialFuzzer
+from tactile_tools.fuzzers.can import CanFuzzer
+from tactile_tools.fuzzers.serial import SerialFuzzer
 
 BLOCK = 20_000
 """Frames under one seed: the same blocks whatever the number of processes."""

@@ -12,7 +12,7 @@ from tactile_tools.logs.sources import find_series
 from tactile_tools.logs.terminal import ToolError, progress
 
 if TYPE_CHECKING:
-    from tactile_tools.series import BoardSeries
+    from tactile_tools.plots.series import BoardSeries
 
 WHATS = ("reach", "taxels", "forces", "field", "timing")
 
@@ -55,7 +55,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(options: argparse.Namespace) -> int:
     """Draw; 0 when the picture was written, 2 for a bad argument, 3 for an unreadable log."""
     from tactile_bus.log_records import LogError
-    from tactile_tools.series import LogUnreadableError
+    from tactile_tools.plots.series import LogUnreadableError
 
     try:
         first = find_series(options.files)[0].paths[0]
@@ -94,9 +94,9 @@ def _check_output(out: Path, sources: list[Path]) -> None:
 def _draw(options: argparse.Namespace, out: Path) -> None:
     if options.what in (None, "reach") and _drew_reach(options.files, out, options.what == "reach"):
         return
-    from tactile_tools.plot_curves import draw_field, draw_forces, draw_timing
-    from tactile_tools.plot_skin import draw, draw_taxels
-    from tactile_tools.series import read_boards
+    from tactile_tools.plots.curves import draw_field, draw_forces, draw_timing
+    from tactile_tools.plots.series import read_boards
+    from tactile_tools.plots.skin import draw, draw_taxels
 
     with progress("reading") as report:
         boards = read_boards(options.files, report)
@@ -124,8 +124,8 @@ def _draw(options: argparse.Namespace, out: Path) -> None:
 
 def _drew_reach(paths: list[Path], out: Path, must: bool) -> bool:
     """Draw the reach in a log; False when it holds none, which is an error only if it must."""
-    from tactile_tools.plot_reach import draw_reach
-    from tactile_tools.series import LogUnreadableError
+    from tactile_tools.plots.reach import draw_reach
+    from tactile_tools.plots.series import LogUnreadableError
 
     try:
         draw_reach(paths, out)

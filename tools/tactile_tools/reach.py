@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from tactile_bus.recorder import RecorderError
-from tactile_tools.series import LogUnreadableError
+from tactile_tools.plots.series import LogUnreadableError
 
 MAX_SEED = 2**63 - 1
 
@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
     try:
         code = _run(options)
         if options.png is not None:
-            from tactile_tools.plot_reach import draw_reach
+            from tactile_tools.plots.reach import draw_reach
 
             draw_reach(options.log, options.png)
             print(f"wrote {options.png}")

@@ -18,9 +18,9 @@ from sim_device.world.touch import on_skin
 from tactile_bus.geometry import Side, finger
 from tactile_bus.instant import Instant, after
 from tactiled.blocks import Chunk, Cycle
-from tactiled.events import Event, Identity, Refusal, Refused, Sampled
-from tactiled.line import SerialLine
-from tactiled.pipeline import BoardPipeline, PipelineSettings
+from tactiled.links.events import Event, Identity, Refusal, Refused, Sampled
+from tactiled.links.line import SerialLine
+from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 
 Float = NDArray[np.float64]
 

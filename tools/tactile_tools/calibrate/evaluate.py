@@ -14,7 +14,7 @@ from tactile_tools.calibrate.recipes import Recipe
 from tactile_tools.calibrate.recording import Recording
 from tactile_tools.calibrate.rows import causal
 from tactile_tools.calibrate.splits import TAIL_SHARE
-from tactiled.net_force import batch_features, readout
+from tactiled.sensing.net_force import batch_features, readout
 
 Float = NDArray[np.float64]
 

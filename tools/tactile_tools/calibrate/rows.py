@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tactile_bus.net_types import FeatureMap
 from tactile_tools.calibrate.recording import TARE_S, UNTOUCHED_SHARE, Recording
-from tactiled.net_force import batch_features
+from tactiled.sensing.net_force import batch_features
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

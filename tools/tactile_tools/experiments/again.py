@@ -36,7 +36,7 @@ def run_again(options: argparse.Namespace) -> int:
     if options.log is not None:
         print(f"wrote {options.log}")
     if options.png is not None:
-        from tactile_tools.plot_reach import draw_reach
+        from tactile_tools.plots.reach import draw_reach
 
         draw_reach(options.log, options.png)
         print(f"wrote {options.png}")

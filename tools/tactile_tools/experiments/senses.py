@@ -20,7 +20,7 @@ from sim_device.world.scenes import Scene
 from tactile_bus.geometry import finger
 from tactile_bus.instant import Instant, after
 from tactile_tools.touch_senses import ContactSense, TaxelSense
-from tactiled.pipeline import PipelineSettings
+from tactiled.sensing.pipeline import PipelineSettings
 
 BOARD_RATE = 25.0
 """Hz of a board that nobody set up otherwise, as the paper's."""

@@ -17,7 +17,7 @@ from tactile_tools.logs.writing import LogOutput
 if TYPE_CHECKING:  # the daemon's rooms take a while to import: only where they are needed
     from tactile_bus.calibration import BoardCalibration
     from tactile_tools.logs.reprocessing import Known, Reprocessing
-    from tactiled.pipeline_settings import PipelineSettings
+    from tactiled.sensing.pipeline_settings import PipelineSettings
 
 METHODS = ("off", "ransac", "consensus")
 
@@ -52,7 +52,7 @@ def fill(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Reprocess; 0 when the new log was written."""
     from tactile_tools.logs.reprocessing import Reprocessing, survey
-    from tactiled.recorded import RecordedError
+    from tactiled.replay.recorded import RecordedError
 
     logs = find_series(options.files)
     if len(logs) != 1:

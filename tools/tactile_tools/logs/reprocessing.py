@@ -33,8 +33,7 @@ from tactile_tools.logs.sources import FILE, Series
 from tactile_tools.logs.stream import Attachment, Reading, Record, Stream, read_series
 from tactile_tools.logs.terminal import ToolError
 from tactile_tools.logs.writing import LogOutput
-from tactiled.pipeline_settings import PipelineSettings
-from tactiled.recorded import (
+from tactiled.replay.recorded import (
     PIPELINE,
     PORT_PREFIX,
     RecordedError,
@@ -42,7 +41,8 @@ from tactiled.recorded import (
     recorded_pipeline,
     recorded_port,
 )
-from tactiled.rerun import Rerun
+from tactiled.replay.rerun import Rerun
+from tactiled.sensing.pipeline_settings import PipelineSettings
 from tactiled.shelf import Shelf
 from tactiled.transports.raw_chunk import from_raw
 

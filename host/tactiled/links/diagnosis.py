@@ -1,0 +1,91 @@
+"""What a port carries that is no board: judged from counts over its first seconds."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tactile_bus.instant import Instant, seconds_between
+from tactiled.links.events import Diagnosed
+
+GARBAGE_AFTER = 3.0
+"""s of bytes without a frame before they are called garbage: slower boards send twenty in it."""
+
+NOTHING_AFTER = 5.0
+"""s without a byte before the port is called silent: boards that reset on opening boot in two."""
+
+SHOWN = 60
+"""Characters of a foreign device's text that a message quotes."""
+
+MOSTLY = 0.9
+"""Share of zeros, or of printable characters, that settles what it is."""
+
+_PRINTABLE = np.zeros(256, bool)
+_PRINTABLE[32:127] = True
+_PRINTABLE[[9, 10, 13]] = True
+
+
+class Diagnosis:
+    """Watches a serial port until a board has been found on it; pure."""
+
+    def __init__(self, port: str, baud: int, kind: str) -> None:
+        self._port = port
+        self._baud = baud
+        self._kind = kind
+        self.begin(Instant(0))
+
+    def begin(self, now: Instant) -> None:
+        """The port was opened."""
+        self._since = now
+        self._total = self._zeros = self._printable = 0
+        self._text = b""
+
+    def feed(self, data: bytes) -> None:
+        """Count what came."""
+        values = np.frombuffer(data, np.uint8)
+        self._total += len(data)
+        self._zeros += len(data) - int(np.count_nonzero(values))
+        self._printable += int(_PRINTABLE[values].sum())
+        if len(self._text) < 2 * SHOWN:
+            self._text = (self._text + data)[: 2 * SHOWN]
+
+    def judge(self, now: Instant, answered: bool) -> Diagnosed | None:
+        """What is wrong, once it is time to say so. ``answered``: frames of ours were decoded."""
+        waited = seconds_between(self._since, now)
+        if waited < (GARBAGE_AFTER if self._total else NOTHING_AFTER):
+            return None
+        port, asked = self._port, f"{waited:.0f} s"
+        if not self._total:
+            return Diagnosed(
+                f"{port} is silent: not one byte in {asked}, and no answer to Identify",
+                "check that this is the board's port (tactiled --list-ports), its power and its "
+                "firmware; on a UART check --baud and that TX and RX are crossed",
+            )
+        if answered:
+            return Diagnosed(
+                f"a board on {port} sends frames, but did not answer Identify in {asked}",
+                "check the line from host to board (TX), then power-cycle the board",
+            )
+        if self._zeros >= MOSTLY * self._total:
+            return Diagnosed(
+                f"{port} floods zeros ({self._total} bytes in {asked}, no frame among them)",
+                "the line is held low or the baud rate is far too high: check wiring, power and "
+                f"--baud (now {self._baud})",
+            )
+        if self._printable >= MOSTLY * self._total:
+            return Diagnosed(
+                f"{port} sends text, not taxel frames: {_first_line(self._text)!r}",
+                "this seems to be another device or another firmware; give the board's port "
+                "(tactiled --list-ports)",
+            )
+        other = "auto or tactile" if self._kind not in ("auto", "tactile") else "auto"
+        kind = f", or give --board {other}" if self._kind != "auto" else ""
+        return Diagnosed(
+            f"{port} sends {self._total} bytes in {asked} and no valid frame among them",
+            f"the baud rate may be wrong (--baud, now {self._baud}), or the device speaks "
+            f"something else than our protocol or AnySkin's{kind}",
+        )
+
+
+def _first_line(text: bytes) -> str:
+    lines = [line for line in text.decode("ascii", "replace").splitlines() if line.strip()]
+    return lines[0].strip()[:SHOWN] if lines else ""

@@ -1,0 +1,1 @@
+"""The sensing core: field to force to contact features. Pure."""

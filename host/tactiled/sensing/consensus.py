@@ -1,0 +1,329 @@
+"""Deterministic robust fit of the ambient field, all arrays and all components at once.
+
+A contact disturbs a taxel in all three components, the ambient field is a plane over the unrolled
+skin, nearly the same constant on every array when seen in ``ee`` axes. So: designed subsets
+propose planes, all taxels vote on them by their joint three-component distance, the winner (or
+the constant that the whole board agrees on, where that explains an array better) is refined by
+reweighted least squares, the last time on fields from which the neighbours' contacts were taken.
+Linear in the field wherever the choice of taxels is the same: a uniform field that is added comes
+out exactly, a plane to a fraction of the noise.
+Shapes as in `Layout`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactiled.sensing.candidates import PLANE_TAXELS, design_candidates
+from tactiled.sensing.force_model import ForceModel
+from tactiled.sensing.layout import Layout
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+INLIER_SIGMAS = 4.0
+"""A taxel supports a fit within this many sigma, components together: noise leaves 0.1 % out."""
+FIRST_REACH = 6.0
+LAST_REACH = 5.0
+"""Sigma at which Tukey's weight falls to zero, in the first and the last refinement: wide while
+the start carries noise of its own (a proposal's few taxels, the cycle before), then just beyond
+the inliers."""
+MODEL_ERROR_UT = 1.5
+"""µT rms by which chips differ in a uniform field: 3 % sensitivity in 50 µT."""
+MIN_SUPPORT = 0.5
+"""Least fraction of an array's healthy taxels that must agree on a plane by themselves. Of sixteen
+random presses of 1–3 N some plane has six or seven within its gate by chance."""
+LONE_SUPPORT = 0.65
+"""The same while nothing else tells, neither another array nor an earlier cycle."""
+CONFIRMED_SUPPORT = 0.3
+CONFIRMED_UT = 15.0
+"""The same for a plane within this many µT of where the rest of the board says it must be."""
+FOLLOW_SUPPORT = 0.65
+"""Support from which a plane has no rival on arrays of nine taxels and more."""
+MIN_INLIERS = 3
+"""Two taxels agree by chance."""
+MAX_RESIDUAL_RATIO = 1.5
+"""rms of the supporting taxels over the expected: contacts below the inlier gate raise it."""
+BOARD_REACH_UT = 15.0
+"""µT by which the ambient field of an array may differ from the board's constant within the
+board's own vote: 150 µT/m over 10 cm."""
+BOARD_BONUS = 0.8
+"""The board's constant is preferred to an array's own proposal that is not clearly better."""
+IMPOSTOR_UT = 50.0
+"""µT from what the board's arrays have in common, or saw in the cycle before, beyond which a plane
+is a uniform press (a third of a newton) and not the ambient field."""
+MAX_SLOPE_UT_PER_M = 1000.0
+"""Steeper planes are pressure that falls off evenly, as under a tilted wall: the field of the room
+is not that uneven until a magnet is closer than a hand's breadth."""
+MAX_LEVERAGE = 1.0
+"""Variance of the plane at its worst taxel over that of one sample, beyond which the free taxels
+are too few or too much to one side to tell its slope; shrinkage sets in."""
+AMPLE_WEIGHT = 0.6
+"""Mean weight of an array's taxels above which no lie of the free ones has that leverage."""
+SLOPE_UT_PER_M = 100.0
+"""Spread of ambient gradients, the scale of that shrinkage: steel at arm's length makes 30."""
+
+_NONE = (math.nan, math.nan, math.nan)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """One fit of all arrays.
+
+    ``theta``: (A, 3, 3) µT, [a, component in ``ee``, coefficient]. ``support``, ``residual_ut``,
+    ``valid``: (A,) as in `Ambient`. ``common``: (3,) µT in ``ee`` that the arrays with a valid fit
+    share; NaN when there is none. ``whole``: every array is valid.
+    """
+
+    theta: Float
+    support: Float
+    residual_ut: Float
+    valid: Bool
+    common: Float
+    whole: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """Where the board's ``constant`` (3,) µT in ``ee`` must be, to within ``reach`` µT."""
+
+    constant: list[float]
+    reach: float
+
+
+class Consensus:
+    """The fit; stateless between cycles but for the noise it was told."""
+
+    def __init__(self, layout: Layout, model: ForceModel) -> None:
+        self._layout, self._model = layout, model
+        arrays, n = layout.arrays, layout.width
+        self._design = layout.design
+        taxels_first = np.ascontiguousarray(layout.design.swapaxes(1, 2))
+        self._taxels_first = taxels_first
+        self._products = (taxels_first[..., None] * taxels_first[:, :, None]).reshape(arrays, n, 9)
+        sets = [design_candidates(taxels_first[a, : layout.counts[a]]) for a in range(arrays)]
+        self._count = count = max(len(operators) for operators, _ in sets)
+        operators_of = np.zeros((arrays, count, 3, n))
+        self._uses = np.zeros((arrays, count, n))
+        for a, (operators, uses) in enumerate(sets):
+            k = np.arange(count) % len(operators)  # arrays with fewer subsets repeat theirs
+            operators_of[a, :, :, : layout.counts[a]] = operators[k]
+            self._uses[a, :, : layout.counts[a]] = uses[k]
+        # the vote only ranks proposals: single precision halves its time
+        propose = operators_of.transpose(0, 3, 2, 1).reshape(arrays, n, 3 * count)
+        self._propose = np.ascontiguousarray(propose, np.float32)
+        self._places = taxels_first.astype(np.float32)
+        self._rows = np.arange(arrays)
+        self._counts: list[int] = layout.counts.tolist()
+        few = layout.counts < PLANE_TAXELS
+        self._stiff = np.zeros((arrays, 3, 3))
+        # the constant's 1e-9 keeps an array without any weight invertible; `_judge` refuses it
+        self._stiff[:, 0, 0] = 1e-9
+        self._stiff[:, 1, 1] = self._stiff[:, 2, 2] = np.where(few, 1e9, 1e-12) * layout.counts
+        self._few = few
+        self._steep: list[float] = (layout.scale * MAX_SLOPE_UT_PER_M).tolist()
+        self._ample = AMPLE_WEIGHT * layout.counts
+        self._shrink = 1.0 / (layout.scale * SLOPE_UT_PER_M) ** 2
+        self._variance = 1.0
+        self.set_noise(np.array([4.4, 4.4, 6.7]))
+
+    def set_noise(self, noise_ut: Float) -> None:
+        """Noise of one sample, (3,) µT rms in chip axes."""
+        self._variance = float((noise_ut**2).mean()) + MODEL_ERROR_UT**2
+        self._gate = INLIER_SIGMAS**2 * self._variance
+        # mean of a taxel's squared distance when a quarter of them are at the gate
+        self._doubtful = (0.25 * self._gate + 0.75 * 3.3 * self._variance) * self._layout.counts
+
+    def fit(self, field_ee: Float, forces: Float, healthy: Bool, prior: Prior | None = None) -> Fit:
+        """Fit of one cycle; see `Compensator.update` for the arguments.
+
+        ``prior``: what the board saw before; None when it has seen nothing yet.
+        """
+        weight = healthy.astype(np.float64)
+        theta, score = self._vote(field_ee, healthy)
+        if len(theta) > 1 and np.count_nonzero(score > self._doubtful):
+            self._prefer_common(theta, score, field_ee, weight)
+        theta = self._refine(theta, field_ee, weight, FIRST_REACH**2 * self._variance)
+        target = self._target(theta, field_ee, forces)
+        if self._model.decouples:
+            theta = self._refine(theta, target, weight, FIRST_REACH**2 * self._variance)
+            target = self._target(theta, field_ee, forces)
+        theta = self._refine(theta, target, weight, LAST_REACH**2 * self._variance, shrink=True)
+        return self._judge(theta, target, healthy, prior)
+
+    def follow(
+        self, theta: Float, field_ee: Float, forces: Float, healthy: Bool, prior: Prior | None
+    ) -> Fit | None:
+        """Fit of a cycle that continues the earlier fit ``theta``; None when a vote is needed.
+
+        Taken only where the vote could not come out otherwise: two planes share no more than
+        three taxels of an array, so one borne out by `FOLLOW_SUPPORT` of them has no rival.
+        """
+        target = self._target(theta, field_ee, forces)
+        weight = healthy.astype(np.float64)
+        theta = self._refine(theta, target, weight, FIRST_REACH**2 * self._variance, shrink=True)
+        fit = self._judge(theta, target, healthy, prior)
+        return fit if fit.whole and fit.support.min() >= FOLLOW_SUPPORT else None
+
+    def check(
+        self, theta: Float, field_ee: Float, forces: Float, healthy: Bool, prior: Prior | None
+    ) -> Fit:
+        """How far the present cycle bears out ``theta``, an earlier fit or another's."""
+        target = self._target(theta, field_ee, forces)
+        return self._judge(theta, target, healthy, prior)
+
+    def _all(self, healthy: Bool) -> bool:
+        return int(np.count_nonzero(healthy)) == self._layout.taxels
+
+    def _target(self, theta: Float, field_ee: Float, forces: Float) -> Float:
+        """Fields without neighbours' contacts, given about where the ambient field is."""
+        if not self._model.decouples:
+            return field_ee
+        target = self._model.decoupled_in_ee(field_ee, forces)
+        target -= self._model.plane_leak(theta)
+        return target
+
+    def _vote(self, field: Float, healthy: Bool) -> tuple[Float, Float]:
+        """Best proposal of each array, (A, 3, 3), and its score, (A,) µT²."""
+        # component first, so that every step below runs over contiguous numbers
+        single = field.swapaxes(0, 1).astype(np.float32, order="C")
+        proposed = single[:, :, None] @ self._propose
+        proposed = proposed.reshape(3, len(field), 3, self._count)
+        away = self._places @ proposed
+        away -= single[..., None]
+        np.square(away, out=away)
+        squared = away[0]
+        squared += away[1]
+        squared += away[2]
+        np.minimum(squared, np.float32(self._gate), out=squared)
+        score = (healthy.astype(np.float32)[:, None, :] @ squared)[:, 0]
+        if not self._all(healthy):
+            sick = self._layout.real & ~healthy
+            score += 1e12 * (self._uses @ sick[:, :, None])[..., 0]
+        best = score.argmin(axis=1)
+        theta = proposed[:, self._rows, :, best].astype(np.float64)
+        return theta, score[self._rows, best]
+
+    def _prefer_common(self, theta: Float, score: Float, field: Float, weight: Float) -> None:
+        """Put the board's constant into ``theta`` for arrays that it explains about as well."""
+        flat = field.swapaxes(0, 1).reshape(3, -1)
+        flat_weight = weight.reshape(-1)
+        gate = self._gate + BOARD_REACH_UT**2
+        proposals = theta[:, :, 0]
+        squared = np.square(flat - proposals[:, :, None]).sum(axis=1)
+        np.minimum(squared, gate, out=squared)
+        common = proposals[(squared @ flat_weight).argmin()]
+        inside = 1.0 - np.square(flat - common[:, None]).sum(axis=0) / gate
+        np.maximum(inside, 0.0, out=inside)
+        inside *= flat_weight
+        total = float(inside.sum())
+        if total > 0:
+            common = flat @ inside / total
+        squared_now = np.square(flat - common[:, None]).sum(axis=0)
+        np.minimum(squared_now, self._gate, out=squared_now)
+        explained = (squared_now * flat_weight).reshape(weight.shape).sum(axis=1)
+        for a in np.flatnonzero(explained * BOARD_BONUS <= score).tolist():
+            theta[a] = 0.0
+            theta[a, :, 0] = common
+
+    def _refine(
+        self, theta: Float, target: Float, weight: Float, reach: float, shrink: bool = False
+    ) -> Float:
+        """One step of reweighted least squares with Tukey's weights."""
+        away = target - theta @ self._design
+        inside = np.einsum("acn,acn->an", away, away)
+        inside *= -1.0 / reach
+        inside += 1.0
+        np.maximum(inside, 0.0, out=inside)
+        inside *= inside
+        inside *= weight
+        normal = (inside[:, None, :] @ self._products).reshape(-1, 3, 3)
+        normal += self._stiff
+        right = (target * inside[:, None, :]) @ self._taxels_first
+        inverse = np.linalg.inv(normal)
+        if shrink and np.count_nonzero(normal[:, 0, 0] < self._ample):
+            leverage = np.einsum("akn,akn->an", inverse @ self._design, self._design).max(axis=1)
+            over = leverage - MAX_LEVERAGE
+            over[self._few] = 0.0
+            if np.count_nonzero(over > 0):
+                ridge = np.minimum(np.maximum(over, 0.0), 1.0) * self._variance * self._shrink
+                normal[:, 1, 1] += ridge
+                normal[:, 2, 2] += ridge
+                inverse = np.linalg.inv(normal)
+        refined: Float = right @ inverse  # symmetric: each row is the solution of one component
+        return refined
+
+    def _judge(self, theta: Float, target: Float, healthy: Bool, prior: Prior | None) -> Fit:
+        """Whether the taxels bear out a fit."""
+        away = target - theta @ self._design
+        squared = np.einsum("acn,acn->an", away, away)
+        agree = np.empty((2, *squared.shape))
+        np.less_equal(squared, self._gate, out=agree[0], casting="unsafe")
+        agree[0] *= healthy
+        np.multiply(squared, agree[0], out=agree[1])
+        # there are few arrays: plain numbers are faster from here on
+        inliers, sums = agree.sum(axis=2).tolist()
+        sound = self._counts if self._all(healthy) else healthy.sum(axis=1).tolist()
+        middle = theta[:, :, 0].tolist()
+        limit = 3.0 * MAX_RESIDUAL_RATIO**2 * self._variance
+        support = [k / h if h else 0.0 for k, h in zip(inliers, sound, strict=True)]
+        steepest = np.abs(theta[:, :, 1:]).max(axis=(1, 2)).tolist()
+        fair = [
+            k >= MIN_INLIERS and q <= limit * k and slope <= most
+            for k, q, slope, most in zip(inliers, sums, steepest, self._steep, strict=True)
+        ]
+        valid = [ok and s >= MIN_SUPPORT for ok, s in zip(fair, support, strict=True)]
+        residual = [math.sqrt(q / (3 * max(k, 1))) for q, k in zip(sums, inliers, strict=True)]
+        agreed = _agreed(middle, inliers, valid, prior)
+        for a, centre in enumerate(middle):
+            if agreed is None:
+                valid[a] = valid[a] and support[a] >= LONE_SUPPORT
+            else:
+                off = math.dist(centre, agreed.constant)
+                confirmed = fair[a] and support[a] >= CONFIRMED_SUPPORT and off <= CONFIRMED_UT
+                valid[a] = confirmed or (valid[a] and off <= agreed.reach)
+        common = _shared(middle, inliers, valid)
+        return Fit(
+            theta,
+            np.array(support),
+            np.array(residual),
+            np.array(valid),
+            np.array(common or _NONE),
+            all(valid),
+        )
+
+
+def _agreed(
+    middle: list[list[float]], inliers: list[float], valid: list[bool], prior: Prior | None
+) -> Prior | None:
+    """Where the ambient field must be near; None when nothing tells.
+
+    The constant that two arrays or more have in common: presses on arrays that face different
+    ways cannot agree in ``ee``. Else what the board saw before.
+    """
+    most, agreed = 0.0, prior
+    for middling, sound in zip(middle, valid, strict=True):
+        if sound:
+            near = [
+                count
+                for other, count, ok in zip(middle, inliers, valid, strict=True)
+                if ok and math.dist(middling, other) <= IMPOSTOR_UT
+            ]
+            if len(near) > 1 and sum(near) > most:
+                most, agreed = sum(near), Prior(middling, IMPOSTOR_UT)
+    return agreed
+
+
+def _shared(
+    middle: list[list[float]], inliers: list[float], valid: list[bool]
+) -> list[float] | None:
+    """Mean of the valid arrays' constants, weighted by their supporting taxels; None without."""
+    weights = [k if ok else 0 for k, ok in zip(inliers, valid, strict=True)]
+    total = sum(weights)
+    if not total:
+        return None
+    return [sum(w * m[c] for w, m in zip(weights, middle, strict=True)) / total for c in range(3)]

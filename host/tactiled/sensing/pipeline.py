@@ -1,0 +1,301 @@
+"""The sensing core of one board: sample blocks in, cycles with forces and features out."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bus.calibration_types import BoardCalibration
+from tactile_bus.instant import NS_PER_S, Instant
+from tactiled.blocks import Ambient, Cycle, SampleBlock, TaxelHealth
+from tactiled.sensing.candidates import PLANE_TAXELS
+from tactiled.sensing.compensate import Compensator, Estimate
+from tactiled.sensing.features import FeatureExtractor
+from tactiled.sensing.force_model import ForceModel
+from tactiled.sensing.grouping import CycleCounters, Group, Grouper, gather_temperature
+from tactiled.sensing.health import HealthMonitor
+from tactiled.sensing.layout import Layout
+from tactiled.sensing.methods import make_compensator
+from tactiled.sensing.net_stage import PAUSED, NetStage
+from tactiled.sensing.pipeline_settings import PipelineSettings
+from tactiled.sensing.rest import RestField
+from tactiled.sensing.tare import TareReport
+
+__all__ = ["BoardPipeline", "CycleCounters", "PipelineSettings", "TareReport"]
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+
+class BoardPipeline:
+    """Pure and deterministic: the same blocks give the same cycles to the bit.
+
+    Memory and time of a cycle do not depend on how many came before.
+    """
+
+    def __init__(
+        self, calibration: BoardCalibration, settings: PipelineSettings | None = None
+    ) -> None:
+        self.calibration = calibration
+        self.settings = settings = settings or PipelineSettings()
+        geometry = calibration.geometry
+        self._layout = layout = Layout(geometry)
+        self._model = ForceModel(calibration, layout)
+        self._grouper = Grouper(tuple(a.taxels for a in geometry.arrays))
+        self._monitor = HealthMonitor(layout, settings.frozen_after_s, settings.range_limit_ut)
+        self._compensator: Compensator = make_compensator(settings, layout, self._model)
+        self._features = FeatureExtractor(geometry, settings)
+        self._net = NetStage(calibration.nets, layout)
+        self._names = tuple(a.name for a in geometry.arrays)
+        self._tip_arrays = [i for i, a in enumerate(geometry.arrays) if a.side.name == "TIP"]
+        # a few taxels feel every contact all together: their fit cannot outlast one, see hold_s
+        self._hold = np.where(layout.counts < PLANE_TAXELS, np.inf, settings.hold_s).tolist()
+        self._theta = np.zeros((layout.arrays, 3, 3))
+        self._feature_due: Instant | None = None
+        self._health: NDArray[np.uint8] = np.full(layout.taxels, TaxelHealth.MISSING, np.uint8)
+        self._last_captured: Instant | None = None
+        nothing = Ambient(
+            method=settings.method,
+            plane=np.zeros((layout.arrays, 3, 3)),
+            support=np.zeros(layout.arrays),
+            residual_ut=np.zeros(layout.arrays),
+            age=np.full(layout.arrays, np.inf),
+            valid=np.zeros(layout.arrays, dtype=bool),
+        )
+        self._unknown = Estimate(nothing.plane, nothing, np.zeros(layout.arrays, dtype=bool))
+        automatic = settings.auto_tare
+        unrested = calibration.nominal or self._net.fitted
+        known = not (unrested if automatic is None else automatic)
+        self._rest = RestField(layout, self._model, settings, known)
+        self._apply_noise(np.array(settings.noise_ut))
+        if not known:
+            self._rest.begin(self._noise)
+
+    @property
+    def counters(self) -> CycleCounters:
+        """What became of every block and cycle so far."""
+        return self._grouper.counters
+
+    @property
+    def health(self) -> NDArray[np.uint8]:
+        """(N,) uint8 of `TaxelHealth` in the last cycle; all missing before the first."""
+        return self._health
+
+    @property
+    def taring(self) -> bool:
+        """Whether a tare is under way."""
+        return self._rest.taring
+
+    @property
+    def tare_report(self) -> TareReport | None:
+        """What the last tare that ended did; None before the first."""
+        return self._rest.report
+
+    def tare(self) -> None:
+        """Begin a tare: the mean field of the next cycles becomes the rest field.
+
+        It ends by itself within ten times ``tare_s``; `tare_report` then says what it did. It is
+        refused, and nothing changed, when the field moves or a taxel bears more than
+        ``tare_limit_n``; less than that cannot be told from the drift that taring is there for.
+        """
+        self._rest.begin(self._noise)
+
+    def reset(self) -> None:
+        """The board began anew: forget sequence, contacts and fits, keep the rest field."""
+        self._grouper.reset()
+        self._monitor.reset()
+        self._compensator.reset()
+        self._features.reset()
+        self._net.pause()
+        self._theta = np.zeros_like(self._theta)
+        self._last_captured = None
+        if self._rest.taring:
+            self._rest.begin(self._noise)
+
+    def feed(self, block: SampleBlock) -> list[Cycle]:
+        """Cycles that ``block`` ends: none, one, or two when it also ends an incomplete one."""
+        return [self._cycle(group) for group in self._grouper.feed(block)]
+
+    def flush(self) -> list[Cycle]:
+        """The cycle under way, as it stands; for the end of a stream."""
+        return [self._cycle(group) for group in self._grouper.flush()]
+
+    def _cycle(self, group: Group) -> Cycle:
+        layout, model = self._layout, self._model
+        raw, temperature, status, present = self._collect(group)
+        blocks = [block for block in group.blocks if block is not None]
+        captured = min(block.captured for block in blocks)
+        health = self._monitor.update(raw, temperature, status, present, captured)
+        rest = self._rest
+        known = rest.known  # before: a first tare takes effect from the next cycle on
+        field = model.taxel_field(raw, temperature)
+        if rest.taring:
+            self._advance_tare(field, health, bool(present.all()), captured, group.sequence)
+        if known and np.count_nonzero(rest.unrested):
+            health[rest.unrested] |= np.uint8(TaxelHealth.OUT_OF_RANGE)
+        masked = int(np.count_nonzero(health))
+        sick = masked > 0
+        healthy = layout.real
+        if sick:
+            healthy = layout.real & (health == 0)
+            # what an unhealthy taxel reads must not leak into its neighbours' forces
+            np.copyto(field, model.plane_field(self._theta), where=~healthy[:, None])
+        forces = model.forces(field)
+        if known:
+            in_ee = model.field_in_ee(field)
+            estimate = self._compensator.update(in_ee, forces, healthy, captured)
+            self._theta = estimate.theta
+            if self.settings.method != "off":
+                forces -= model.plane_forces(estimate.theta)
+            if self._net.fitted and not sick:
+                self._net.share(forces, self._net.update(field, captured))
+            if sick:
+                np.copyto(forces, np.nan, where=~healthy[:, None])
+        else:
+            estimate = self._unknown
+            masked = layout.taxels
+            forces.fill(np.nan)
+        force = layout.flat_vectors(forces)
+        self._health = layout.flat(health)
+        reasons, valid = self._reasons(estimate, healthy, present, known)
+        tip_usable = valid or (known and self._tip_usable(estimate, present))
+        features = self._features.update(force, masked, reasons, valid, tip_usable, captured)
+        if rest.taring:
+            rest.note_peak(features.peak_force)
+        if self.settings.rest_tracking_s is not None and valid and not reasons:
+            self._follow_rest(field, estimate, healthy, captured)
+        self._last_captured = captured
+        if sick:
+            np.copyto(field, np.nan, where=~healthy[:, None])
+        return Cycle(
+            sequence=group.sequence,
+            captured=captured,
+            received=max(block.received for block in blocks),
+            uncertainty=max(block.uncertainty for block in blocks),
+            temperature_c=gather_temperature(group),
+            field_ut=layout.flat_vectors(field),
+            force=force,
+            health=self._health,
+            ambient=estimate.ambient,
+            features=features,
+            calibrated=not self.calibration.nominal,
+            features_due=self._due(captured),
+        )
+
+    def _collect(self, group: Group) -> tuple[Float, Float, NDArray[np.uint8], Bool]:
+        """Blocks of a cycle in padded arrays; missing ones are zero and marked by ``present``."""
+        shape = (self._layout.arrays, self._layout.width)
+        raw = np.zeros((shape[0], 3, shape[1]))
+        temperature = np.full(shape, 25.0)  # in the padding, so that it is never out of range
+        status = np.zeros(shape, np.uint8)
+        present = np.ones(shape[0], dtype=bool)
+        for a, block in enumerate(group.blocks):
+            if block is None:
+                present[a] = False
+                continue
+            n = len(block.status)
+            raw[a, :, :n] = block.field_ut.T
+            temperature[a, :n] = block.temperature_c
+            status[a, :n] = block.status
+        return raw, temperature, status, present
+
+    def _reasons(
+        self, estimate: Estimate, healthy: Bool, present: Bool, known: bool
+    ) -> tuple[tuple[str, ...], bool]:
+        """Why features are degraded, and whether they are valid all the same."""
+        reasons: list[str] = []
+        valid = True
+        if not known:
+            reasons.append("taring")
+            valid = False
+        elif self._rest.rough:
+            reasons.append("rest field uncertain: tare")
+            valid = False
+        if np.count_nonzero(present) < len(present):
+            reasons += [f"array {self._names[a]} missing" for a in np.flatnonzero(~present)]
+            valid = False
+        if healthy is not self._layout.real:
+            masked = 1.0 - healthy.sum(axis=1) / self._layout.counts
+            for a in np.flatnonzero((masked > self.settings.masked_limit) & present):
+                reasons.append(f"taxels masked: {self._names[a]} {masked[a]:.0%}")
+                valid = False
+            if self._net.fitted and known:
+                reasons.append(PAUSED)
+        ambient = estimate.ambient
+        if known and np.count_nonzero(ambient.valid) < len(present):
+            for a in np.flatnonzero(~ambient.valid & present):
+                name = self._names[a]
+                if estimate.borrowed[a]:
+                    reasons.append(f"compensation borrowed: {name}")
+                elif ambient.age[a] <= self._hold[a]:
+                    reasons.append(f"compensation held: {name}")
+                else:
+                    reasons.append(f"compensation invalid: {name}")
+                    valid = False
+        return tuple(reasons), valid
+
+    def _tip_usable(self, estimate: Estimate, present: Bool) -> bool:
+        ambient = estimate.ambient
+        return all(
+            present[a]
+            and (ambient.valid[a] or estimate.borrowed[a] or ambient.age[a] <= self._hold[a])
+            for a in self._tip_arrays
+        )
+
+    def _advance_tare(
+        self,
+        field: Float,
+        health: NDArray[np.uint8],
+        whole: bool,
+        captured: Instant,
+        sequence: int,
+    ) -> None:
+        """Take one cycle into the tare under way; its end begins contacts and fits anew."""
+        healthy = self._layout.real & (health == 0)
+        usable = np.where(healthy[:, None], field, 0.0)
+        shift = self._rest.advance(usable, healthy, whole, captured, sequence)
+        report = self._rest.report
+        if shift is None or report is None:
+            return
+        field -= shift
+        self._compensator.reset()
+        self._features.reset()
+        self._net.reset()
+        self._theta = np.zeros_like(self._theta)
+        self._apply_noise(report.noise_ut)
+
+    def _apply_noise(self, noise: Float) -> None:
+        """Noise of one sample, (3,) µT in chip axes, sets the thresholds of contact and fit."""
+        self._noise = np.maximum(noise, MIN_NOISE_UT)
+        self._features.set_noise(self._layout.flat(self._model.normal_sigma(self._noise)))
+        self._compensator.set_noise(self._noise)
+
+    def _follow_rest(
+        self, field: Float, estimate: Estimate, healthy: Bool, captured: Instant
+    ) -> None:
+        """Let the rest of untouched taxels follow what compensation left over."""
+        period = self.settings.rest_tracking_s
+        if period is None or self._last_captured is None:
+            return
+        share = min(1.0, (captured - self._last_captured) / NS_PER_S / period)
+        free = healthy & ~self._layout.padded(self._features.contact)
+        self._rest.follow(field - self._model.plane_field(estimate.theta), free, share)
+
+    def _due(self, captured: Instant) -> bool:
+        """Whether this cycle's features are to be sent, at ``feature_rate_hz``."""
+        rate = self.settings.feature_rate_hz
+        if rate is None:
+            return True
+        period = round(NS_PER_S / rate)
+        if self._feature_due is None or captured < self._feature_due - 2 * period:
+            self._feature_due = captured
+        if captured < self._feature_due:
+            return False
+        behind = (captured - self._feature_due) // period
+        self._feature_due = Instant(self._feature_due + (behind + 1) * period)
+        return True
+
+
+MIN_NOISE_UT = 0.3
+"""µT below which noise is not believed: an int16 of the finest scale alone makes 0.04, but chips
+differ by 3 % in a field of tens of µT and that looks like noise to a fit."""

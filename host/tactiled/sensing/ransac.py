@@ -1,0 +1,97 @@
+"""Compensation as in the paper: a RANSAC plane per component and array, at a period.
+
+scikit-learn draws and fits one surface at a time, some milliseconds each, so the surfaces of one
+period are fitted in the cycles of that period one after another instead of all in one cycle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bus.instant import NS_PER_S, Instant
+from tactiled.sensing.compensate import Estimate
+from tactiled.sensing.consensus import Consensus
+from tactiled.sensing.layout import Layout
+from tactiled.sensing.tracking import FieldTracker
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+MIN_TAXELS = 4
+"""Healthy taxels below which there is nothing to draw three from and check on another."""
+
+
+class RansacCompensator:
+    """The paper's method; see `Compensator`. Whether the planes in force are borne out is checked
+    in every cycle, by the same measure as for consensus.
+    """
+
+    def __init__(
+        self, layout: Layout, checker: Consensus, period_s: float, rng: np.random.Generator
+    ) -> None:
+        from tactiled.sensing.ransac_plane import (
+            fit_plane,  # scikit-learn: 1.1 s, only when asked for
+        )
+
+        self._fit_plane = fit_plane
+        self._layout = layout
+        self._checker = checker
+        self._rng = rng
+        self._period = round(period_s * NS_PER_S)
+        self._tracker = FieldTracker(layout, "ransac", borrows=False)
+        self.reset()
+
+    def set_noise(self, noise_ut: Float) -> None:
+        """Noise of one sample, (3,) µT rms in chip axes."""
+        self._checker.set_noise(noise_ut)
+
+    def reset(self) -> None:
+        """Forget every plane."""
+        self._tracker.reset()
+        self._begun: Instant | None = None
+        self._done = 0
+        self._theta = np.zeros((self._layout.arrays, 3, 3))
+        self._complete = np.zeros(self._layout.arrays, dtype=bool)
+
+    def update(self, field_ee: Float, forces: Float, healthy: Bool, captured: Instant) -> Estimate:
+        """Estimate for one cycle."""
+        surfaces = 3 * self._layout.arrays
+        due = 0
+        if self._begun is None:
+            self._begun, due = captured, surfaces  # all at once: there is nothing to go by yet
+        elif self._done == surfaces:
+            if captured - self._begun >= self._period:
+                self._begun, self._done, due = captured, 0, 1
+        else:
+            due = min(surfaces, 1 + (captured - self._begun) * surfaces // self._period)
+        prior = self._tracker.prior(captured)
+        if self._fit_surfaces(due, field_ee, healthy):
+            fit = self._checker.check(self._theta, field_ee, forces, healthy, prior)
+            return self._tracker.take(replace(fit, valid=fit.valid & self._complete), captured)
+        held = self._checker.check(self._tracker.theta, field_ee, forces, healthy, prior)
+        return self._tracker.take(held, captured, fresh=False)
+
+    def _fit_surfaces(self, upto: int, field: Float, healthy: Bool) -> bool:
+        """Fit surfaces until ``upto`` of them are done; True when that ends the period's round."""
+        surfaces = 3 * self._layout.arrays
+        if self._done >= upto:
+            return False
+        while self._done < upto:
+            a, component = divmod(self._done, 3)
+            use = healthy[a]
+            plane = None
+            if use.sum() >= MIN_TAXELS:
+                plane = self._fit_plane(
+                    self._layout.design[a, 1:, use], field[a, component, use], self._rng
+                )
+            if component == 0:
+                self._complete[a] = True
+            if plane is None:
+                self._complete[a] = False
+            else:
+                self._theta[a, component] = plane
+            self._done += 1
+        return self._done == surfaces

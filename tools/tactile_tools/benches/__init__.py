@@ -1,0 +1,1 @@
+"""What `tactile bench` measures, a module a group."""

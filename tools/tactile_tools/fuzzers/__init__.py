@@ -1,0 +1,1 @@
+"""What `tactile fuzz` spoils, a module a codec."""

@@ -1,0 +1,1 @@
+"""What `tactile plot` draws, and the series it draws from."""
