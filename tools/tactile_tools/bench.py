@@ -37,38 +37,38 @@ class Group:
 
 
 GROUPS = (
-    Group("decode", "bench_wire", "bench_decode", "serial frames of 250 bytes", ("decode_fps",)),
+    Group("decode", "wire", "bench_decode", "serial frames of 250 bytes", ("decode_fps",)),
     Group(
         "anyskin",
-        "bench_wire",
+        "wire",
         "bench_anyskin",
         "the AnySkin stream, beside its own host loop",
         ("anyskin_speedup",),
     ),
     Group(
         "pipeline",
-        "bench_sensing",
+        "sensing",
         "bench_pipeline",
         "bytes to features, 4 arrays × 16 taxels",
         ("pipeline_ms_p50", "pipeline_ms_p99"),
     ),
     Group(
         "consensus",
-        "bench_sensing",
+        "sensing",
         "bench_consensus",
         "consensus beside RANSAC",
         ("consensus_speedup", "consensus_residual_ratio"),
     ),
     Group(
         "rotation",
-        "bench_sensing",
+        "sensing",
         "bench_rotation",
         "a turn through 360° in a 50 µT field",
         ("rotation_consensus_rms_n_25", "rotation_contact_bias_pct_25"),
     ),
     Group(
         "calibration",
-        "bench_calibration",
+        "calibration",
         "bench_calibration",
         "a fitted model, per board and frame",
         (
@@ -79,36 +79,36 @@ GROUPS = (
     ),
     Group(
         "latency",
-        "bench_latency",
+        "latency",
         "bench_latency",
         "pty to features in another process",
         ("wire_to_feature_floor_ratio", "wire_to_feature_ms_p99"),
     ),
     Group(
         "reach",
-        "bench_reach",
+        "reach",
         "bench_reach_speed",
         "reaches in lockstep among 25 objects",
         ("reach_rtf_contacts", "reach_rtf_taxels"),
     ),
     Group(
         "live",
-        "bench_reach",
+        "reach",
         "bench_reach_live",
         "punctuality of a reach in three processes",
         ("loop_late_ms_p99", "loop_late_ms_p99.9", "wire_to_twist_ms_p99"),
     ),
     Group(
         "stop",
-        "bench_stop",
+        "stop",
         "bench_stop",
         "standing still after SIGSTOP and SIGKILL of each process",
         ("stop_ms_max_features", "stop_ms_max_arm_state", "stop_ms_max_commands"),
     ),
-    Group("soak", "bench_soak", "bench_soak", "memory over an hour of simulated frames"),
+    Group("soak", "soak", "bench_soak", "memory over an hour of simulated frames"),
     Group(
         "stress",
-        "bench_stress",
+        "stress",
         "bench_stress",
         "an hour of reaching on a loaded machine, only when named",
         ("stress_late_ms_p99.9", "stress_late_moving"),
@@ -221,7 +221,7 @@ def run(options: argparse.Namespace) -> int:
         for number, group in enumerate(chosen, 1):
             task = progress.add_task(f"[{number}/{len(chosen)}] {group.name}: {group.what}")
             function: Callable[..., Figures] = getattr(
-                import_module(f"tactile_tools.{group.module}"), group.function
+                import_module(f"tactile_tools.benches.{group.module}"), group.function
             )
             before = os.getloadavg()[0]
             try:
