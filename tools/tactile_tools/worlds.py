@@ -30,6 +30,8 @@ def load_scene(source: str, seed: int) -> Scene:
             return Scene.from_json(Path(source).read_text(encoding="utf-8"))
         except OSError as error:
             raise SceneError(f"cannot read the scene {source}: {error.strerror}") from error
+        except (SceneError, UnicodeDecodeError) as error:
+            raise SceneError(f"{source} is no scene: {error}") from error
     return generate(source, seed)
 
 
