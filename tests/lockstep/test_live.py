@@ -26,10 +26,13 @@ def test_the_demo_reaches_says_so_and_leaves_log_and_picture(
 ) -> None:
     """The first command that a newcomer runs; on a busy machine it may not reach."""
     log, picture = tmp_path / "demo.mcap", tmp_path / "demo.png"
-    code = main(["demo", "--seed", "13", "--out", str(log), "--png", str(picture)])
-    said = capfd.readouterr().out
+    for _ in range(3):
+        code = main(["demo", "--seed", "13", "--out", str(log), "--png", str(picture)])
+        said = capfd.readouterr()
+        if code != 3:
+            break  # 3: nothing was felt in time, for which a starved machine is enough
     assert code in (0, 1), said
-    assert ("\nREACHED: " if code == 0 else "\nNOT REACHED") in said
+    assert ("\nREACHED: " if code == 0 else "\nNOT REACHED") in said.out
     reach = read_reach(log)
     assert reach.outcome() is not None
     assert (reach.outcome().code == "reached") == (code == 0)

@@ -53,8 +53,9 @@ def test_a_step_of_the_system_clock_changes_nothing(
     program = lab.reachd(*NEAR, "--log", "trial.mcap")
     assert program.wait() == 0, program.said
     assert arm.travelled > 0.03
+    # A busy machine makes inputs old and cycles late; by a clock they would be so by an hour.
     assert set(lab.codes("intervention")) <= {"not_armed", "features_lost", "features_stale",
-                                              "arm_stale", "arm_lost", "arm_limits",
+                                              "arm_stale", "arm_lost", "arm_limits", "loop_late",
                                               "acceleration", "slow_down"}  # fmt: skip
     with (lab.folder / "trial.mcap").open("rb") as file:
         stamps = [
