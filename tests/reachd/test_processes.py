@@ -159,7 +159,8 @@ def test_stopped_and_continued_it_does_not_move_off_by_itself(lab: Any, wait_unt
     count = len(arm.heard)
     program.signal(signal.SIGCONT)
     assert program.wait() == 1, program.said
-    assert "stood still" in program.said
+    # Whichever was noticed first: that the loop stood still, or that its inputs are old.
+    assert "stood still" in program.said or "features_lost" in program.said, program.said
     # What was under way when it was stopped may still come; after that nothing but zero.
     assert sum(not h.still for h in arm.heard[count:]) <= 1
 
