@@ -10,7 +10,10 @@ import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 
 class SettingError(ValueError):
@@ -129,7 +132,7 @@ def check_known(names: Sequence[str], given: Mapping[str, object], what: str) ->
             raise SettingError(f"unknown {what} {key!r}; {hint}")
 
 
-S = TypeVar("S")
+S = TypeVar("S", bound="DataclassInstance")
 
 
 def plain(value: object) -> object:
@@ -139,4 +142,4 @@ def plain(value: object) -> object:
 
 def replaced(settings: S, given: Mapping[str, object]) -> S:
     """``settings`` with the values ``given`` by field name; checked anew by its own rules."""
-    return dataclasses.replace(settings, **{k: plain(v) for k, v in given.items()})  # type: ignore[type-var]
+    return dataclasses.replace(settings, **{k: plain(v) for k, v in given.items()})

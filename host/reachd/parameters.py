@@ -250,7 +250,7 @@ def _gate_value(key: str, value: object) -> object:
 
 def _check(code: object) -> Check:
     try:
-        return Check(code)  # type: ignore[arg-type]
+        return Check(str(code))
     except ValueError as error:
         raise SettingError(
             f"safety.disabled: no check is called {code!r}; there are: {', '.join(Check)}"

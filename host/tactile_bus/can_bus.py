@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sensor_proto.canseg import CanFrame
 
@@ -101,7 +101,7 @@ def open_bus(spec: CanSpec) -> can.BusABC:
             f"there is no CAN interface {spec.interface!r}",
             f"allowed: {', '.join(sorted(VALID_INTERFACES))}",
         )
-    options: dict[str, object] = {}
+    options: dict[str, Any] = {}
     if spec.interface == "socketcan":
         _check_link(spec.channel)
         if spec.bitrate is not None:
@@ -115,7 +115,7 @@ def open_bus(spec: CanSpec) -> can.BusABC:
         if spec.fd:
             options |= {"fd": True, "data_bitrate": spec.data_bitrate or DEFAULT_DATA_BITRATE}
     try:
-        return can.Bus(channel=spec.channel, interface=spec.interface, **options)  # type: ignore[arg-type]
+        return can.Bus(channel=spec.channel, interface=spec.interface, **options)
     except OSError as error:
         raise _explain(spec, error) from error
     except (can.CanError, ImportError, NameError, AttributeError, TypeError, ValueError) as error:

@@ -13,6 +13,7 @@ import tomllib
 from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
+from types import GenericAlias
 from typing import Annotated, Any, Literal, TypeVar, Union
 
 import msgspec
@@ -149,9 +150,9 @@ def _python_type(info: Any) -> Any:
         case types.UnionType():
             return Union[tuple(_python_type(t) for t in info.types)]  # noqa: UP007 - made at run time
         case types.DictType():
-            return dict[str, _python_type(info.value_type)]  # type: ignore[misc]
+            return GenericAlias(dict, (str, _python_type(info.value_type)))
         case types.ListType() | types.VarTupleType() | types.SetType():
-            return list[_python_type(info.item_type)]  # type: ignore[misc]
+            return GenericAlias(list, (_python_type(info.item_type),))
         case types.NoneType():
             return None
     base = SIMPLE.get(type(info), Any)
@@ -227,7 +228,7 @@ def _unknown(data: Any, info: types.Type | None, keys: KeyPath) -> tuple[KeyPath
     return None
 
 
-def _of_kind(info: Any, kind: Any) -> Any:
+def _of_kind(info: types.Type | None, kind: type[T]) -> T | None:
     """``info``, or the member of a union, that is of ``kind``; None when there is none."""
     if isinstance(info, types.Metadata):
         return _of_kind(info.type, kind)
@@ -243,11 +244,11 @@ def _step(info: types.Type | None, key: str | int) -> types.Type | None:
         return next((f.type for f in struct.fields if f.encode_name == key), None)
     table = _of_kind(info, types.DictType)
     if table is not None and isinstance(key, str):
-        return table.value_type  # type: ignore[no-any-return]
+        return table.value_type
     fixed = _of_kind(info, types.TupleType)
     if fixed is not None and isinstance(key, int) and key < len(fixed.item_types):
-        return fixed.item_types[key]  # type: ignore[no-any-return]
-    array = _of_kind(info, types.ListType | types.VarTupleType | types.SetType)
+        return fixed.item_types[key]
+    array = _of_kind(info, types.CollectionType)
     return array.item_type if array is not None else None
 
 

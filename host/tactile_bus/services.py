@@ -47,7 +47,7 @@ class Service:
 
     def close(self) -> None:
         """Take the service back."""
-        self._queryable.undeclare()  # type: ignore[no-untyped-call]
+        self._queryable.undeclare()
 
     def _serve(self, query: zenoh.Query) -> None:
         with query:

@@ -224,7 +224,7 @@ def close_session(session: zenoh.Session, timeout: float = CLOSE_TIMEOUT) -> boo
 
     def close() -> None:
         try:
-            session.close()  # type: ignore[no-untyped-call]  # zenoh gives it no types
+            session.close()
         except zenoh.ZError as error:
             log.debug("zenoh did not close cleanly: %s", _brief(error))
         done.set()

@@ -42,7 +42,7 @@ class Publisher:
 
     def close(self) -> None:
         """Take the stream back."""
-        self._publisher.undeclare()  # type: ignore[no-untyped-call]
+        self._publisher.undeclare()
 
 
 def declare_publisher(
@@ -119,7 +119,7 @@ class Latest:
 
     def close(self) -> None:
         """Take the subscription back."""
-        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self._subscriber.undeclare()
 
 
 class Tap:
@@ -145,7 +145,7 @@ class Tap:
 
     def close(self) -> None:
         """Take the subscription back."""
-        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self._subscriber.undeclare()
 
     def _hear(self, sample: zenoh.Sample) -> None:
         if len(sample.payload) > MAX_PAYLOAD:

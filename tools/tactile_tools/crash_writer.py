@@ -11,13 +11,14 @@ import struct
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from tactile_bus.instant import WallClock, monotonic_now
 from tactile_bus.messages import MSG, codec, header
 from tactile_bus.recorder import Recorder, RecorderSettings
-from tactile_bus.topics import FEATURES, FORCES, GEOMETRY, RAW
+from tactile_bus.topics import FEATURES, FORCES, GEOMETRY, RAW, Topic
 
 TRUTH = struct.Struct("<QQQ")
 """Messages handed over so far, wall-clock ns of the first and of the last."""
@@ -44,9 +45,9 @@ def run(directory: Path, truth: Path, seed: int, seconds: float) -> None:
     encode = codec().encode
     count, cycle, first_ns = 0, 0, clock.wall_ns(monotonic_now())
 
-    def hand_over(topic: object, message: object, now_ns: int) -> None:
+    def hand_over(topic: Topic, message: Any, now_ns: int) -> None:
         nonlocal count
-        recorder.write(topic, NAME, encode(topic, message), now_ns, now_ns)  # type: ignore[arg-type]
+        recorder.write(topic, NAME, encode(topic, message), now_ns, now_ns)
         count += 1
         shared[: TRUTH.size] = TRUTH.pack(count, first_ns, now_ns)
 

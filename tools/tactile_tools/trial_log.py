@@ -17,7 +17,7 @@ from sim_device.world.base import FingerContact
 from sim_device.world.scene_markers import scene_markers
 from sim_device.world.scenes import Scene
 from tactile_bus.geometry import Side
-from tactile_bus.instant import WallClock
+from tactile_bus.instant import Instant, WallClock
 from tactile_bus.markers import frame_transform, wipe
 from tactile_bus.messages import MSG, codec, header
 from tactile_bus.recorder import Recorder
@@ -67,7 +67,7 @@ class TrialLog:
         self._sequence = 0
         self._next_world = self._next_frame = 0
         self._felt = -1
-        self._last = 0
+        self._last = Instant(0)
         self._state = ""
 
     def __enter__(self) -> TrialLog:
@@ -218,8 +218,8 @@ class TrialLog:
             patches=patches,
         )
 
-    def _event(self, now: int, kind: str, code: str, text: str) -> None:
-        stamp = header(self._wall.wall_ns(now), "cupboard")  # type: ignore[arg-type]
+    def _event(self, now: Instant, kind: str, code: str, text: str) -> None:
+        stamp = header(self._wall.wall_ns(now), "cupboard")
         self._write(REACH_EVENT, REACH, MSG.ReachEvent(stamp, now, kind, str(code), text), now)
 
     def _write(self, topic: Topic, name: str, message: Any, now: int) -> None:

@@ -86,7 +86,7 @@ class BusArm:
             self._input.take(sample, now)
         return self._input.value
 
-    def command(self, twist: Twist, expiry: float, now: Instant) -> None:  # noqa: ARG002
+    def command(self, twist: Twist, expiry: float, now: Instant) -> None:  # noqa: ARG002 - `Arm` gives it
         """Publish ``twist``; its expiry is the arm's own. `ArmError` when the bus is closed."""
         if self._publisher is not None:
             wall_ns = self._wall.wall_ns(now)

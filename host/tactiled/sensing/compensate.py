@@ -66,7 +66,7 @@ class Off:
             borrowed=np.zeros(arrays, dtype=bool),
         )
 
-    def update(self, field_ee: Float, forces: Float, healthy: Bool, captured: Instant) -> Estimate:  # noqa: ARG002
+    def update(self, field_ee: Float, forces: Float, healthy: Bool, captured: Instant) -> Estimate:  # noqa: ARG002 - as every `Compensator`
         """The same estimate for every cycle."""
         return self._estimate
 

@@ -15,7 +15,7 @@ MAX_TRIALS = 100
 """scikit-learn's default."""
 
 
-class Plane(RegressorMixin, BaseEstimator):  # type: ignore[misc]
+class Plane(RegressorMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn has no types
     """Least-squares plane; what `LinearRegression` gives, without its checks: ten times faster."""
 
     def fit(self, surface: Float, values: Float) -> Plane:

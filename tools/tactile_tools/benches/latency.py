@@ -178,4 +178,4 @@ class _Run:
 
     def close(self) -> None:
         """Leave the bus; without it the process would hang at exit."""
-        self._session.close()  # type: ignore[no-untyped-call]
+        self._session.close()

@@ -11,6 +11,7 @@ from collections import defaultdict
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,22 +133,22 @@ def _collect(path: Path) -> tuple[dict[str, _Board], dict[str, BoardCalibration]
     return boards, attached
 
 
-def _take_reference(board: _Board, message: object) -> None:
-    force = message.wrench.force  # type: ignore[attr-defined]
+def _take_reference(board: _Board, message: Any) -> None:
+    force = message.wrench.force
     vector = (float(force.x), float(force.y), float(force.z))
     if np.isfinite(vector).all():
-        board.reference_ns.append(stamp_ns(message.header.stamp))  # type: ignore[attr-defined]
+        board.reference_ns.append(stamp_ns(message.header.stamp))
         board.force.append(vector)
 
 
-def _take_field(board: _Board, message: object, path: Path) -> None:
-    values = np.asarray(message.field_ut, np.float64)  # type: ignore[attr-defined]
+def _take_field(board: _Board, message: Any, path: Path) -> None:
+    values = np.asarray(message.field_ut, np.float64)
     if not np.isfinite(values).all():
         board.masked += 1
         return
     if len(board.field_ns) >= MAX_FRAMES:
         raise RecordingError(f"{path}: over {MAX_FRAMES} frames; `tactile log split` it")
-    board.field_ns.append(stamp_ns(message.header.stamp))  # type: ignore[attr-defined]
+    board.field_ns.append(stamp_ns(message.header.stamp))
     board.field_ut.append(values)
 
 
