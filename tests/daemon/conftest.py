@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -130,8 +131,8 @@ def board() -> ScriptedBoard:
 
 @pytest.fixture
 def make_board() -> Callable[..., ScriptedBoard]:
-    def make(serial: str = "00000000000000aa", **options: object) -> ScriptedBoard:
-        return ScriptedBoard(replace(DESCRIPTOR, unique_id=bytes.fromhex(serial)), **options)  # type: ignore[arg-type]
+    def make(serial: str = "00000000000000aa", **options: Any) -> ScriptedBoard:
+        return ScriptedBoard(replace(DESCRIPTOR, unique_id=bytes.fromhex(serial)), **options)
 
     return make
 

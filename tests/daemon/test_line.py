@@ -257,7 +257,9 @@ def test_a_bus_without_boards_is_diagnosed(instant: At) -> None:
     assert "no taxel board" in diagnosed.problem
 
 
-def test_a_recording_needs_no_answers(board: Any, instant: At) -> None:
+def test_a_recording_needs_no_answers(
+    board: Any, instant: At, monkeypatch: pytest.MonkeyPatch
+) -> None:
     live = SerialLine("p", welcome)
     live.connect(instant(0.0))
     tape: list[Chunk] = []
@@ -267,7 +269,7 @@ def test_a_recording_needs_no_answers(board: Any, instant: At) -> None:
         tape.append(chunk)
         return take(chunk)
 
-    live.receive = record  # type: ignore[method-assign]
+    monkeypatch.setattr(live, "receive", record)
     heard = of(serve(live, board, instant, 2.0), Sampled)
     again = SerialLine("p", welcome, listen_only=True)
     again.connect(instant(0.0))

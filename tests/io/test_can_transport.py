@@ -110,7 +110,9 @@ def test_bus_off_is_named_and_left_again(
     while seen is None and time.monotonic() < end:
         seen = transport.read(0.1)
     assert seen is not None
-    assert seen.payload[0].error  # type: ignore[union-attr]
+    first = seen.payload[0]
+    assert isinstance(first, CanFrame)
+    assert first.error
     assert transport.state is BusState.BUS_OFF
     assert transport.losses["can_bus-off"] == 1
     assert "bus state bus-off" in caplog.text
@@ -175,15 +177,15 @@ def test_a_port_without_an_adapter_is_told_from_one_with(pty: PtyPort, tmp_path:
 
 
 def test_python_cans_own_driver_opens_the_simulated_adapter(adapter: Any, eventually: Any) -> None:
-    bus = can.Bus(
+    bus: Any = can.Bus(
         interface="slcan",
         channel=str(adapter.port.pty.link),
         bitrate=500_000,
         sleep_after_open=0,
     )
     try:
-        assert bus.get_version(2) == (10, 13)  # type: ignore[attr-defined]
-        assert bus.get_serial_number(2) == "A123"  # type: ignore[attr-defined]
+        assert bus.get_version(2) == (10, 13)
+        assert bus.get_serial_number(2) == "A123"
         adapter.send(CanFrame(0x1234567, b"\x01\x02"))
         message = bus.recv(5)
         assert message is not None

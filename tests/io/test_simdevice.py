@@ -24,17 +24,25 @@ from tactiled.transports import PortGone, Transport
 from tactiled.transports.can_bus import CanTransport
 from tactiled.transports.serial_port import SerialTransport
 
-Launch = Callable[..., "subprocess.Popen[str]"]
 BOOT = 0.3
 """s a board needs from power-on until it answers, and more."""
 
 
+class Launched(subprocess.Popen[str]):
+    """The command, and the lines it said at its start."""
+
+    announced: list[str]
+
+
+Launch = Callable[..., Launched]
+
+
 @pytest.fixture
 def launch(tmp_path: Path) -> Iterator[Launch]:
-    started: list[subprocess.Popen[str]] = []
+    started: list[Launched] = []
 
-    def run(*arguments: str, lines: int = 1) -> subprocess.Popen[str]:
-        process = subprocess.Popen(
+    def run(*arguments: str, lines: int = 1) -> Launched:
+        process = Launched(
             [sys.executable, "-m", "sim_device", *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -43,7 +51,7 @@ def launch(tmp_path: Path) -> Iterator[Launch]:
         )
         started.append(process)
         assert process.stdout is not None
-        process.announced = [process.stdout.readline() for _ in range(lines)]  # type: ignore[attr-defined]
+        process.announced = [process.stdout.readline() for _ in range(lines)]
         return process
 
     yield run
@@ -83,8 +91,8 @@ def greeted(messages: list[Any]) -> bool:
 
 def test_a_serial_board_is_announced_answers_and_streams(launch: Launch, tmp_path: Path) -> None:
     process = launch("boards", "--pty", "./board0", "--serial", "ABC")
-    assert "tactiled --port board0" in process.announced[0]  # type: ignore[attr-defined]
-    assert "0000000000000abc" in process.announced[0]  # type: ignore[attr-defined]
+    assert "tactiled --port board0" in process.announced[0]
+    assert "0000000000000abc" in process.announced[0]
     host = SerialTransport(str(tmp_path / "board0"))
     host.open()
     received = hear(host, SerialDecoder(), greeted, hello)
@@ -130,7 +138,7 @@ def test_a_killed_run_can_be_started_again(launch: Launch, tmp_path: Path) -> No
 
 def test_several_boards_on_one_bus_keep_their_names(launch: Launch, tmp_path: Path) -> None:
     process = launch("boards", "--slcan", "can0", "--node", "5", "--node", "9", lines=2)
-    assert "node 5 → tactiled --can slcan:can0@1000000" in process.announced[0]  # type: ignore[attr-defined]
+    assert "node 5 → tactiled --can slcan:can0@1000000" in process.announced[0]
     host = CanTransport(f"slcan:{tmp_path / 'can0'}@1000000")
     host.open()
     encoders = [CanEncoder(node, False) for node in (5, 9)]
@@ -145,7 +153,7 @@ def test_several_boards_on_one_bus_keep_their_names(launch: Launch, tmp_path: Pa
     assert both(received)
     named = {r.board: r.message.serial_number for r in received if kinds([r], Descriptor)}
     assert named[5] != named[9]
-    assert all(named[node] in "".join(process.announced) for node in (5, 9))  # type: ignore[attr-defined]
+    assert all(named[node] in "".join(process.announced) for node in (5, 9))
     host.close()
 
 
@@ -197,7 +205,7 @@ def test_calibration_is_of_the_very_board_that_boards_simulates(
     assert main(make) == 0
     calibration = load(out)
     process = launch("boards", "--pty", "skin0", "--board", "anyskin", "--seed", "7")
-    assert calibration.serial_number in process.announced[0]  # type: ignore[attr-defined]
+    assert calibration.serial_number in process.announced[0]
     host = SerialTransport(str(tmp_path / "skin0"))
     host.open()
     received = hear(host, AnySkinDecoder(), lambda m: len(m) >= 20)

@@ -163,7 +163,7 @@ def test_what_cannot_be_used_is_refused_in_words(given: dict, words: list[str]) 
 
 def test_a_region_is_no_list_of_numbers() -> None:
     with pytest.raises(SettingError, match="pivot_region"):
-        replace(HARDWARE.safety, pivot_region=((0, 0), (1, 0), (0, 1)))  # type: ignore[arg-type]
+        replace(HARDWARE.safety, pivot_region=((0, 0), (1, 0), (0, 1)))  # type: ignore[arg-type]  # that is the mistake
 
 
 def test_unknown_set_lists_the_sets() -> None:
