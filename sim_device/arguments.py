@@ -9,12 +9,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sim_device.world.engines import ENGINES
+
 if TYPE_CHECKING:
     Commands = argparse._SubParsersAction[argparse.ArgumentParser]
 
 Handler = Callable[[argparse.Namespace], int]
-
-ENGINES = ("mujoco", "pymunk")
 
 DEFAULT_RECORDED = Path(__file__).resolve().parents[1] / (
     "../shared/data/authors_scenes/scenes_1_60.json.gz"

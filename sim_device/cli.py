@@ -92,8 +92,8 @@ def _request(arguments: argparse.Namespace) -> BoardsRequest:
 
 def _cupboard(arguments: argparse.Namespace) -> int:
     from sim_device.cupboard_plan import goal_text, plan_cupboard
-    from sim_device.cupboard_scene import EngineMissing
     from sim_device.world.base import WorldError
+    from sim_device.world.engines import EngineMissing
 
     try:
         request = _cupboard_request(arguments)
@@ -101,10 +101,10 @@ def _cupboard(arguments: argparse.Namespace) -> int:
             print(goal_text(request.source.load(request.seed)))
             return OK
         planned = plan_cupboard(request)
-    except ValueError as error:
-        raise _Refusal(BAD_ARGUMENT, error) from error
     except (EngineMissing, WorldError) as error:
         raise _Refusal(REFUSED, error) from error
+    except ValueError as error:
+        raise _Refusal(BAD_ARGUMENT, error) from error
     # Services answer on other threads: the world must get its turn within a tick.
     sys.setswitchinterval(SWITCH_INTERVAL)
     try:

@@ -8,9 +8,10 @@ import numpy as np
 
 from sim_device.arm_server import ArmServer
 from sim_device.cupboard import Cupboard, ScheduledFault
-from sim_device.cupboard_scene import SceneSource, world_maker
+from sim_device.cupboard_scene import SceneSource
 from sim_device.stations import BoardsRequest, Planned, plan_boards
 from sim_device.world.arm import ArmSettings
+from sim_device.world.engines import world_maker
 from sim_device.world.scenes import Scene
 from tactile_bus.session import BusConfig
 from tactile_bus.topics import NAME

@@ -1,12 +1,10 @@
-"""Scenes and engines as a user names them."""
+"""Scenes as a user names them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from sim_device.world.base import World
 from sim_device.world.generate import GENERATORS, generate
 from sim_device.world.recorded import load_recorded
 from sim_device.world.scenes import Scene, SceneError
@@ -15,10 +13,6 @@ RECORDED_PREFIX = "recorded:"
 
 MAX_SCENE_BYTES = 1 << 20
 """A scene of 200 objects, the most there may be, takes 50 kB of JSON."""
-
-
-class EngineMissing(Exception):  # noqa: N818 - names a state of the installation
-    """The engine asked for is not installed; the message says how to get it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,20 +72,3 @@ def _from_file(path: Path) -> Scene:
         raise SceneError(f"{path}: not UTF-8 text, so no scene") from None
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from None
-
-
-def world_maker(engine: str) -> Callable[[Scene], World]:
-    """How to build a world in ``engine``; `EngineMissing` when that is not installed."""
-    if engine == "mujoco":
-        from sim_device.world.mujoco_world import MujocoWorld
-
-        return MujocoWorld
-    try:
-        import pymunk  # noqa: F401 - is it there?
-    except ImportError as error:
-        raise EngineMissing(
-            f"engine {engine!r} is not installed: pip install 'tactile-reach[crosscheck]'"
-        ) from error
-    from sim_device.world.pymunk_world import PymunkWorld
-
-    return PymunkWorld

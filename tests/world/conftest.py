@@ -11,8 +11,7 @@ from typing import Protocol
 import pytest
 
 from sim_device.world.base import World
-from sim_device.world.mujoco_world import MujocoWorld
-from sim_device.world.pymunk_world import PymunkWorld
+from sim_device.world.engines import ENGINES, EngineMissing, world_maker
 from sim_device.world.scenes import Pose, Scene, SceneObject, Shape
 from tactile_bus.arm_types import Twist
 from tactile_bus.geometry import TIP_X
@@ -64,12 +63,12 @@ def build() -> Build:
     return Build(disc, box, cupboard)
 
 
-@pytest.fixture(params=["mujoco", "pymunk"])
+@pytest.fixture(params=ENGINES)
 def engine(request: pytest.FixtureRequest) -> Engine:
-    if request.param == "mujoco":
-        return MujocoWorld
-    pytest.importorskip("pymunk", reason="the extra `crosscheck` is not installed")
-    return PymunkWorld
+    try:
+        return world_maker(request.param)
+    except EngineMissing as missing:
+        pytest.skip(str(missing))
 
 
 @pytest.fixture(scope="session")

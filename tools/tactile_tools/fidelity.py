@@ -17,10 +17,10 @@ from rich.progress import track
 from rich.table import Table
 
 from reachd.parameters import parameters
+from sim_device.world.engines import ENGINES, make_world
 from sim_device.world.recorded import load_outcomes, load_recorded
 from sim_device.world.scenes import Pose, Scene, SceneError
 from tactile_tools.lockstep import run_trial
-from tactile_tools.worlds import make_world
 
 STRATEGIES = ("straight", "burrow", "excavate", "hybrid_clock", "hybrid_event")
 REFERENCE_RATES = {
@@ -74,7 +74,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         default=Path("../shared/data/authors_scenes/outcomes_1_60.csv"),
         help="what the reference did there (default %(default)s)",
     )
-    parser.add_argument("--engine", choices=("mujoco", "pymunk"), default="mujoco")
+    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
     parser.add_argument("--depth", choices=("contacts", "taxels"), default="contacts")
     parser.add_argument("--repeats", type=int, default=2, help="perturbed runs (default 2)")
     parser.add_argument("--most", type=int, help="scenes to use (default all)")

@@ -9,6 +9,7 @@ import time
 from functools import partial
 from pathlib import Path
 
+from sim_device.world.engines import ENGINES
 from tactile_bus.recorder import RecorderError
 from tactile_tools.plots.series import LogUnreadableError
 
@@ -43,7 +44,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         default="contacts",
         help="what is felt: the engine's contacts, or the whole chain of taxels (default contacts)",
     )
-    parser.add_argument("--engine", choices=("mujoco", "pymunk"), default="mujoco")
+    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
     parser.add_argument("--log", type=Path, metavar="FILE", help="MCAP file of the trial")
     parser.add_argument("--png", type=Path, metavar="FILE", help="picture of the trial")
     parser.add_argument(
@@ -100,9 +101,10 @@ def _run(options: argparse.Namespace) -> int:
 
     from reachd.parameters import parameters as parameter_set
     from reachd.strategies import load_strategy
+    from sim_device.world.engines import make_world
     from tactile_tools.lockstep import PERIOD, run_trial
     from tactile_tools.trial_log import TrialLog
-    from tactile_tools.worlds import load_scene, make_world
+    from tactile_tools.worlds import load_scene
 
     if ":" in options.strategy and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # one of the user's own may lie here

@@ -1,10 +1,9 @@
-"""Scenes and engines by the names a user gives."""
+"""Scenes by the names a user gives."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from sim_device.world.base import World
 from sim_device.world.generate import generate
 from sim_device.world.recorded import load_recorded
 from sim_device.world.scenes import Scene, SceneError
@@ -33,18 +32,3 @@ def load_scene(source: str, seed: int) -> Scene:
         except (SceneError, UnicodeDecodeError) as error:
             raise SceneError(f"{source} is no scene: {error}") from error
     return generate(source, seed)
-
-
-def make_world(engine: str, scene: Scene) -> World:
-    """Build ``scene`` in "mujoco" or "pymunk"; ValueError where the engine is not installed."""
-    if engine == "mujoco":
-        from sim_device.world.mujoco_world import MujocoWorld
-
-        return MujocoWorld(scene)
-    try:
-        from sim_device.world.pymunk_world import PymunkWorld
-    except ImportError as error:
-        raise ValueError(
-            "the engine pymunk is not installed: pip install 'tactile-reach[crosscheck]'"
-        ) from error
-    return PymunkWorld(scene)

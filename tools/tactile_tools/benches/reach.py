@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from reachd.parameters import parameters
+from sim_device.world.engines import Engine, make_world
 from sim_device.world.generate import generate
 from tactile_bus.instant import NS_PER_S
 from tactile_bus.topics import COMMAND, FEATURES, REACH_STATE
@@ -48,11 +49,44 @@ def bench_reach_speed(*, quick: bool = False) -> dict[str, float]:
     return figures
 
 
-def _trial(seed: int, depth: Depth) -> tuple[float, float]:
+def bench_reference(*, quick: bool = False) -> dict[str, float]:
+    """Return ``speedup_vs_reference_engine``: what a simulated second costs in the authors' engine
+    over what it costs in ours, processor time of whole trials of 25 objects, taken in turn.
+
+    Bullet makes the authors' 240 steps a second at their scale (`PybulletWorld`); all else is ours
+    in both. EngineMissing where the extra ``reference`` is not installed.
+    """
+    engines: tuple[Engine, ...] = ("mujoco", "pybullet")
+    totals = {engine: [0.0, 0.0] for engine in engines}
+    _trial(SCENES[0], "contacts", "straight")  # imports, caches
+    for seed in SCENES[:1] if quick else SCENES:
+        for strategy in ("straight", STRATEGY):
+            for engine, total in totals.items():
+                simulated, spent = _trial(seed, "contacts", strategy, engine)
+                total[0] += simulated
+                total[1] += spent
+    cost = {engine: spent / simulated for engine, (simulated, spent) in totals.items()}
+    return {
+        "reference_engine_cpu_s": cost["pybullet"],
+        "engine_cpu_s": cost["mujoco"],
+        "speedup_vs_reference_engine": cost["pybullet"] / cost["mujoco"],
+    }
+
+
+def _trial(
+    seed: int, depth: Depth, strategy: str = STRATEGY, engine: Engine = "mujoco"
+) -> tuple[float, float]:
     """Simulated and processor seconds of one trial."""
     began = time.process_time()
     scene = generate("authors_sim", seed)
-    result = run_trial(scene, STRATEGY, parameters(scene.parameters), seed, depth=depth)
+    result = run_trial(
+        scene,
+        strategy,
+        parameters(scene.parameters),
+        seed,
+        depth=depth,
+        world=make_world(engine, scene),
+    )
     spent = time.process_time() - began
     if seed in SCENES and len(scene.objects) != OBJECTS:
         raise RuntimeError(f"scene {seed} has {len(scene.objects)} objects, not {OBJECTS}")

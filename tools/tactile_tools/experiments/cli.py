@@ -7,6 +7,8 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+from sim_device.world.engines import ENGINES
+
 STRATEGY_NAMES = "straight burrow excavate hybrid_clock hybrid_event"
 AXIS_NAMES = (
     "density", "friction_objects", "friction_all", "force", "width", "time", "noise", "rate", "dead"
@@ -131,7 +133,7 @@ def _trial(words: Words[argparse.ArgumentParser]) -> None:
     parser.add_argument("--strategy", default="hybrid_event", help="name or module:Class")
     parser.add_argument("--set", default="authors_sim")
     parser.add_argument("--source", help="scenes (default: those of --set), or recorded:FILE")
-    parser.add_argument("--engine", choices=("mujoco", "pymunk"), default="mujoco")
+    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
     parser.add_argument("--depth", choices=("contacts", "taxels"), default="contacts")
     _param_option(parser)
     parser.add_argument(
@@ -163,9 +165,9 @@ def _study_options(parser: argparse.ArgumentParser, *, scenes: int) -> None:
     parser.add_argument(
         "--engine",
         nargs="+",
-        choices=("mujoco", "pymunk"),
-        default=["mujoco"],
-        help="physics (default mujoco)",
+        choices=ENGINES,
+        default=[ENGINES[0]],
+        help=f"physics (default {ENGINES[0]})",
     )
     parser.add_argument(
         "--depth",

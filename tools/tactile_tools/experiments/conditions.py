@@ -8,14 +8,14 @@ from functools import lru_cache
 from reachd.fields import SettingError
 from reachd.parameter_fields import Parameters
 from sim_device.world.base import World
+from sim_device.world.engines import make_world
 from sim_device.world.generate import GENERATORS, generate
-from sim_device.world.mujoco_world import MujocoWorld
 from sim_device.world.parameters import Friction, WorldParameters, world_parameters
 from sim_device.world.scenes import Scene
 from tactile_tools.experiments.senses import DegradedContacts, DegradedTaxels
 from tactile_tools.experiments.spec import Conditions, TrialSpec
 from tactile_tools.touch_senses import Sense
-from tactile_tools.worlds import load_scene, make_world
+from tactile_tools.worlds import load_scene
 
 CACHED_SCENES = 8
 """Scenes kept by a worker: trials come scene by scene, and a few scenes may be under way at once
@@ -46,16 +46,9 @@ def scene_of(spec: TrialSpec) -> Scene:
 
 def world_of(spec: TrialSpec, scene: Scene) -> World:
     """The world of ``spec``; SettingError, or ValueError where the engine is not installed."""
-    engine = spec.typed_engine
     figures = world_parameters(scene.parameters)
     changed = _figures(figures, spec.changed)
-    if changed == figures:
-        return make_world(engine, scene)
-    if engine == "mujoco":
-        return MujocoWorld(scene, changed)
-    from sim_device.world.pymunk_world import PymunkWorld
-
-    return PymunkWorld(scene, changed)
+    return make_world(spec.engine, scene, changed)
 
 
 def _figures(figures: WorldParameters, conditions: Conditions) -> WorldParameters:

@@ -8,8 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from sim_device.world.engines import world_maker
 from tactile_tools.experiments.backends import Backend
-from tactile_tools.experiments.conditions import build_scene, parameters_of, world_of
+from tactile_tools.experiments.conditions import build_scene, parameters_of
 from tactile_tools.experiments.journal import Journal, disk_error
 from tactile_tools.experiments.rows import Row, replace_file, sort_rows, write_tables
 from tactile_tools.experiments.spec import TrialSpec
@@ -48,7 +49,7 @@ def check(study: Study) -> None:
             ),
             (("depth", spec.depth), lambda s: s.typed_depth),
             (("source", spec.source), _check_source),
-            (("engine", spec.engine), _check_engine),
+            (("engine", spec.engine), lambda s: world_maker(s.engine)),
         )
         for key, examine in parts:
             if key not in seen:
@@ -62,17 +63,6 @@ def _check_source(spec: TrialSpec) -> None:
         build_scene(spec.source, spec.scene_seed, None)
     except RuntimeError:
         return
-
-
-def _check_engine(spec: TrialSpec) -> None:
-    from dataclasses import replace
-
-    spec.typed_engine  # noqa: B018 - raises where there is no such engine
-    try:
-        scene = build_scene(spec.source, spec.scene_seed, None)
-    except RuntimeError:
-        return
-    world_of(replace(spec, conditions="{}"), replace(scene, objects=()))
 
 
 def run_study(

@@ -11,10 +11,8 @@ from reachd.fields import SettingError, check_known
 from reachd.parameter_fields import Parameters
 from reachd.parameters import parameters
 
-Engine = Literal["mujoco", "pymunk"]
 Depth = Literal["contacts", "taxels"]
 
-ENGINES: tuple[Engine, ...] = ("mujoco", "pymunk")
 DEPTHS: tuple[Depth, ...] = ("contacts", "taxels")
 SETS = ("authors_sim", "hardware")
 STRATEGIES = ("straight", "burrow", "excavate", "hybrid_clock", "hybrid_event")
@@ -108,13 +106,6 @@ class TrialSpec:
     def changed(self) -> Conditions:
         """The conditions; SettingError."""
         return Conditions.from_json(self.conditions)
-
-    @property
-    def typed_engine(self) -> Engine:
-        """The engine; SettingError."""
-        if self.engine not in ENGINES:
-            raise SettingError(f"unknown engine {self.engine!r}; there are: {', '.join(ENGINES)}")
-        return self.engine
 
     @property
     def typed_depth(self) -> Depth:

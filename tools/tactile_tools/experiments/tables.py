@@ -19,6 +19,7 @@ GROUP = ("set", "engine", "depth")
 _WORDS = {
     "mujoco": "MuJoCo",
     "pymunk": "Chipmunk",
+    "pybullet": "Bullet",
     "contacts": "exact contacts",
     "taxels": "touch through taxels",
 }

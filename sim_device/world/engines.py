@@ -1,0 +1,54 @@
+"""Engines of physics by name."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, cast, get_args
+
+if TYPE_CHECKING:
+    from sim_device.world.base import World
+    from sim_device.world.parameters import WorldParameters
+    from sim_device.world.scenes import Scene
+
+Engine = Literal["mujoco", "pymunk", "pybullet"]
+
+ENGINES: Final[tuple[Engine, ...]] = get_args(Engine)
+"""The first is the one that published figures come from."""
+
+_CLASSES: Final[dict[str, str]] = {
+    "mujoco": "MujocoWorld",
+    "pymunk": "PymunkWorld",
+    "pybullet": "PybulletWorld",
+}
+_EXTRAS: Final[dict[str, str]] = {"pymunk": "crosscheck", "pybullet": "reference"}
+"""Optional extra that brings an engine."""
+
+
+class EngineMissing(ValueError):  # noqa: N818 - names a state of the installation
+    """The engine asked for is not installed; the message says how to get it."""
+
+
+class WorldMaker(Protocol):
+    """How to build a world; ``parameters``: None for those that the scene names."""
+
+    def __call__(self, scene: Scene, parameters: WorldParameters | None = None) -> World:
+        """Build ``scene``; WorldError where the engine gives up."""
+        ...
+
+
+def world_maker(engine: str) -> WorldMaker:
+    """How to build a world in ``engine``; `EngineMissing`, or ValueError: there is none such."""
+    if engine not in _CLASSES:
+        raise ValueError(f"unknown engine {engine!r}; there are: {', '.join(ENGINES)}")
+    if find_spec(engine) is None:
+        raise EngineMissing(
+            f"engine {engine!r} is not installed: pip install 'tactile-reach[{_EXTRAS[engine]}]'"
+        )
+    module: Any = import_module(f"sim_device.world.{engine}_world")
+    return cast("WorldMaker", getattr(module, _CLASSES[engine]))
+
+
+def make_world(engine: str, scene: Scene, parameters: WorldParameters | None = None) -> World:
+    """Build ``scene`` in ``engine``, see `world_maker`."""
+    return world_maker(engine)(scene, parameters)
