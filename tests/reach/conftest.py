@@ -5,18 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from reachd.parameters import SETS
-from reachd.safety import SafetyGate
-from reachd.safety_settings import SafetySettings
-from reachd.seam import ArmState, Goal, Strategy, Touch, Twist
+from reachd.safety import Decision, SafetyGate
+from reachd.safety_settings import Check, SafetySettings
+from reachd.seam import ZERO, ArmState, Goal, Strategy, Touch, Twist
 from tactile_bus.geometry import Side
 from tactile_bus.instant import Instant, after
 
 T0 = Instant(5_000_000_000)
+GOAL = Goal(0.358, 0.0, 0.0075, 40.0)
+SLOWLY = Twist(0.001, 0.0, 0.0)
+"""So slow that one cycle's acceleration reaches it."""
 
 
 @pytest.fixture(scope="session")
@@ -29,9 +33,9 @@ def t0() -> Instant:
 def make_touch() -> Callable[..., Touch]:
     """Valid touch of nothing at ``at``, values replaced as given."""
 
-    def make(at: Instant = T0, **values: object) -> Touch:
+    def make(at: Instant = T0, **values: Any) -> Touch:
         calm = Touch(at, at, True, 0.0, Side.NONE, 0.0, 0.0, 0.0, 0.0)
-        return replace(calm, **values)  # type: ignore[arg-type]
+        return replace(calm, **values)
 
     return make
 
@@ -40,7 +44,7 @@ def make_touch() -> Callable[..., Touch]:
 def make_arm() -> Callable[..., ArmState]:
     """Arm at rest in front of the cupboard at ``at``, as the hardware set wants it."""
 
-    def make(at: Instant = T0, **values: object) -> ArmState:
+    def make(at: Instant = T0, **values: Any) -> ArmState:
         limits = SETS["hardware"].safety.arm_limits
         calm = ArmState(
             captured=at,
@@ -58,7 +62,7 @@ def make_arm() -> Callable[..., ArmState]:
             f_max=limits.f_max,
             m_max=limits.m_max,
         )
-        return replace(calm, **values)  # type: ignore[arg-type]
+        return replace(calm, **values)
 
     return make
 
@@ -82,6 +86,106 @@ def make_gate(
         return gate
 
     return make
+
+
+class Rig:
+    """A gate with inputs in good health, each of which a test may spoil."""
+
+    def __init__(self, gate: SafetyGate, touch: Touch, arm: ArmState, period: float) -> None:
+        self.gate, self.touch, self.arm = gate, touch, arm
+        self.now = T0
+        self.period = round(period * 1e9)
+
+    def step(self, wanted: Twist | None = SLOWLY, **how: Any) -> Decision:
+        """One cycle later, with fresh inputs unless ``touch`` or ``arm`` say otherwise."""
+        self.now = Instant(self.now + int(how.pop("passed", self.period)))
+        touch = how.pop("touch", self.fresh_touch())
+        arm = how.pop("arm", self.fresh_arm())
+        return self.gate.step(wanted, touch, arm, GOAL, self.now, **how)
+
+    def fresh_touch(self, age: int = 0) -> Touch:
+        at = Instant(self.now - age)
+        return replace(self.touch, captured=at, received=at)
+
+    def fresh_arm(self, age: int = 0, **values: Any) -> ArmState:
+        at = Instant(self.now - age)
+        return replace(self.arm, captured=at, received=at, **values)
+
+    def request(self, **how: Any) -> set[str]:
+        """An operator's request now; returns the codes of the refusals."""
+        refusals = self.gate.arm(
+            how.pop("requested", self.now),
+            how.pop("touch", self.fresh_touch()),
+            how.pop("arm", self.fresh_arm()),
+            self.now,
+            **how,
+        )
+        assert all(r.effect == "refused" and r.text for r in refusals)
+        return {r.code.value for r in refusals}
+
+
+@pytest.fixture(scope="session")
+def rig(
+    make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
+) -> Callable[..., Rig]:
+    """Rig with an armed gate; ``off`` names disabled checks."""
+
+    def make(*off: Check, armed: bool = True, **values: Any) -> Rig:
+        chosen = replace(settings, disabled=frozenset(off), **values)
+        gate = make_gate(chosen) if armed else SafetyGate(chosen)
+        return Rig(gate, make_touch(), make_arm(), chosen.period)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def send(
+    make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
+) -> Callable[..., Decision]:
+    """One command through an armed gate; ACCELERATION is off unless named in ``on``."""
+
+    def go(
+        wanted: Twist,
+        *off: Check,
+        on: tuple[Check, ...] = (),
+        goal: Goal | None = None,
+        values: dict | None = None,
+        cycles: int = 1,
+        **arm: Any,
+    ) -> Decision:
+        disabled = frozenset({Check.ACCELERATION, *off}) - set(on)
+        gate: SafetyGate = make_gate(replace(settings, disabled=disabled, **(values or {})))
+        for k in range(1, cycles + 1):
+            now = Instant(T0 + k * 10_000_000)
+            decision = gate.step(wanted, make_touch(now), make_arm(now, **arm), goal, now)
+        assert decision.held is None
+        return decision
+
+    return go
+
+
+@pytest.fixture(scope="session")
+def codes() -> Callable[[Decision], list[str]]:
+    """Codes of what the gate did to a command, in order."""
+
+    def of(decision: Decision) -> list[str]:
+        return [i.code.value for i in decision.interventions]
+
+    return of
+
+
+@pytest.fixture(scope="session")
+def passes() -> Callable[[Decision], bool]:
+    """Whether motion came through; it is never stopped without a word."""
+
+    def judge(decision: Decision) -> bool:
+        if decision.twist == ZERO:
+            assert decision.interventions, "a stop without a reason"
+            return False
+        assert decision.held is None
+        return True
+
+    return judge
 
 
 @pytest.fixture(scope="session")

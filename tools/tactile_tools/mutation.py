@@ -30,8 +30,13 @@ PACKAGE = ROOT / "host" / "reachd"
 FILES = ("safety.py", "limits.py", "stillness.py")
 TESTS = (
     "test_gate_limits.py",
+    "test_gate_workspace.py",
+    "test_gate_wrench.py",
+    "test_gate_constraints.py",
     "test_gate_geometry.py",
     "test_gate_inputs.py",
+    "test_gate_ages.py",
+    "test_gate_arming.py",
     "test_gate_random.py",
 )
 RANDOM_INPUTS = "2000"
