@@ -56,6 +56,18 @@ def test_the_csv_is_the_same_table(alone: Path) -> None:
     assert all(t["error"] == "" for t in texts)
 
 
+def test_a_run_grows_by_scenes_and_strategies_and_keeps_what_is_finished(
+    study: Study, alone: Path, run_of: Run, options_of: Callable[..., Any], tmp_path: Path
+) -> None:
+    folder = tmp_path / "grown"
+    run_of(strategies_study(options_of(scenes=2), ("straight", "hybrid_event")), folder)
+    summary = run_of(study, folder)
+    assert summary["this_session"]["resumed"] == 4
+    assert summary["this_session"]["trials"] == 5
+    assert outcomes(folder) == outcomes(alone)
+    assert load_run(folder).missing == 0
+
+
 def test_a_run_killed_at_a_random_moment_and_resumed_gives_the_table_of_one_left_alone(
     alone: Path, run_of: Run, study: Study, tmp_path: Path
 ) -> None:

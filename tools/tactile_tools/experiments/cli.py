@@ -25,7 +25,8 @@ examples:
   tactile experiment trial --scene-seed 12 --strategy hybrid_event --log t.mcap --png t.png
   tactile experiment trial --row runs/strategies:17      # that row of trials.csv again, compared
 
-A run that was stopped or killed goes on where it was when the same command is given again.
+A run that was stopped or killed goes on where it was when the same command is given again;
+with more scenes, strategies and the like the same folder grows.
 Exit: 0 done, 1 some trials could not be run or a row came out different, 2 bad argument,
 3 refused by the system, 130 stopped by Ctrl-C.
 """

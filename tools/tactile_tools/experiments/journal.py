@@ -37,8 +37,9 @@ class DiskError(Exception):
 class Journal:
     """The folder of one run, held so that no other process writes to it. A context manager.
 
-    ``definition``: what the experiment is of, plain JSON values. Raises FolderError for a folder
-    of another experiment, or of none, or in use, and DiskError.
+    ``definition``: what the experiment is of, plain JSON values; it may be the folder's own or
+    one that has all of that one's trials and more. Raises FolderError for a folder of another
+    experiment, or of none, or in use, and DiskError.
     """
 
     def __init__(self, directory: Path, definition: Mapping[str, Any]) -> None:
@@ -53,11 +54,11 @@ class Journal:
             directory.mkdir(parents=True, exist_ok=True)
             self._hold()
             path = directory / "experiment.json"
-            if path.exists():
-                _compare(directory, read_definition(directory), wanted)
-            else:
+            if not path.exists():
                 _refuse_strangers(directory)
-                replace_file(path, (json.dumps(wanted, indent=1) + "\n").encode())
+            elif not _grows(directory, read_definition(directory), wanted):
+                return
+            replace_file(path, (json.dumps(wanted, indent=1) + "\n").encode())
         except OSError as error:
             self.close()
             raise disk_error(directory, error) from error
@@ -193,19 +194,32 @@ def _write_whole(stream: int, line: bytes) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def _compare(directory: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """FolderError that names what differs."""
+def _grows(directory: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
+    """Whether ``wanted`` is more of what was ``found``; FolderError naming what is neither."""
     # Through JSON, as a tuple comes back as a list.
     wanted = json.loads(json.dumps(wanted))
     names = [n for n in dict.fromkeys([*found, *wanted]) if found.get(n) != wanted.get(n)]
-    if names:
+    others = [n for n in names if not _more(n, found.get(n), wanted.get(n))]
+    if others:
         differences = "; ".join(
-            f"{n} is {_short(found.get(n))} there and {_short(wanted.get(n))} here" for n in names
+            f"{n} is {_short(found.get(n))} there and {_short(wanted.get(n))} here" for n in others
         )
         raise FolderError(
             f"{directory} holds another experiment ({differences}): choose another --out, "
-            "or give the same options to resume it"
+            "or give the same options to resume it, or more scenes, strategies and the like"
         )
+    return bool(names)
+
+
+def _more(name: str, found: object, wanted: object) -> bool:
+    """Whether a study with ``wanted`` has every trial of one with ``found``, and more."""
+    if name == "scenes":  # they are numbered from the same seed on
+        return isinstance(found, int) and isinstance(wanted, int) and found < wanted
+    return (
+        isinstance(found, list)
+        and isinstance(wanted, list)
+        and all(value in wanted for value in found)
+    )
 
 
 def _refuse_strangers(directory: Path) -> None:
