@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 import zstandard
 
 from tactile_bus import topics
+from tactile_bus.log_info import info
 from tactile_bus.mcap_file import ChunkBuffer, DiskStorage, McapFile
 from tactile_bus.messages import MSG, codec, header
 from tactile_bus.recorder import Recorder, RecorderSettings
@@ -107,3 +109,23 @@ def features(at: int, number: int) -> bytes:
         MSG.Wrench(zero, zero), 0.0, 0.0, 2, 0, [patch] * (number % 3),
     )  # fmt: skip
     return codec().encode(topics.FEATURES, message)
+
+
+@pytest.fixture(scope="session")
+def counts() -> Callable[[Path], dict[str, int]]:
+    """``counts(path)``: messages of each topic of a log."""
+
+    def of(path: Path) -> dict[str, int]:
+        return {channel.topic: channel.messages for channel in info(path).channels}
+
+    return of
+
+
+@pytest.fixture(scope="session")
+def rows_of() -> Callable[[str], list[Any]]:
+    """``rows_of(text)``: the JSON value of each line."""
+
+    def read(text: str) -> list[Any]:
+        return [json.loads(line) for line in text.splitlines()]
+
+    return read
