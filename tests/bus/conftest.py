@@ -7,6 +7,7 @@ import os
 import socket
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ import numpy as np
 import pytest
 
 from tactile_bus import topics
+from tactile_bus.log_info import LogInfo, info
+from tactile_bus.log_reader import read_messages
 from tactile_bus.markers import CYLINDER, SPHERE_LIST, frame_transform, marker, wipe
 from tactile_bus.mcap_file import DiskStorage
 from tactile_bus.messages import MSG, codec, diagnostic_status, header, log_message
@@ -207,3 +210,28 @@ def record(disk: FragileDisk) -> Iterator[Callable[..., Recorder]]:
     disk.moving.set()
     for recorder in recorders:
         recorder.close(5)
+
+
+@pytest.fixture(scope="session")
+def logs() -> Callable[[Path], list[LogInfo]]:
+    """``logs(directory)``: what is in each log of it, by name."""
+
+    def read(directory: Path) -> list[LogInfo]:
+        return [info(path) for path in sorted(directory.glob("*.mcap"))]
+
+    return read
+
+
+@pytest.fixture(scope="session")
+def sequences() -> Callable[[Path], dict[str, list[int]]]:
+    """Sequence numbers in all logs of a directory, by channel, repeats taken out."""
+
+    def read(directory: Path) -> dict[str, list[int]]:
+        found = defaultdict(list)
+        for path in sorted(directory.glob("*.mcap")):
+            for channel, message in read_messages(path):
+                if message.sequence not in found[channel.topic]:
+                    found[channel.topic].append(message.sequence)
+        return found
+
+    return read

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import logging
-import os
 import resource
 import subprocess
 import sys
@@ -19,26 +18,12 @@ import pytest
 
 from tactile_bus import topics
 from tactile_bus.instant import WallClock
-from tactile_bus.log_info import LogInfo, info
+from tactile_bus.log_info import info
 from tactile_bus.log_reader import read_messages
 from tactile_bus.messages import MAX_PAYLOAD
-from tactile_bus.recorder import Recorder, RecorderError, RecorderSettings
+from tactile_bus.recorder import RecorderSettings
 
 BASE_NS = 1_700_000_000_000_000_000
-
-
-def logs(directory: Path) -> list[LogInfo]:
-    return [info(path) for path in sorted(directory.glob("*.mcap"))]
-
-
-def sequences(directory: Path) -> dict[str, list[int]]:
-    """Sequence numbers in all logs of a directory, by channel, repeats taken out."""
-    found = defaultdict(list)
-    for path in sorted(directory.glob("*.mcap")):
-        for channel, message in read_messages(path):
-            if message.sequence not in found[channel.topic]:
-                found[channel.topic].append(message.sequence)
-    return found
 
 
 def holes(numbers: list[int], handed_over: int) -> int:
@@ -97,7 +82,7 @@ def test_what_comes_after_close_is_counted(tmp_path: Path, record: Any, payloads
 
 
 def test_a_full_queue_drops_the_oldest_and_the_log_shows_where(
-    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any
+    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any, sequences: Any
 ) -> None:
     recorder = record(tmp_path / "a.mcap", queue_messages=50)
     disk.moving.clear()  # a disk that hangs
@@ -167,7 +152,14 @@ def test_writing_never_waits_for_a_hanging_disk(
 
 
 def test_a_full_disk_is_loud_and_the_next_file_tells_of_it(
-    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any, caplog: Any
+    tmp_path: Path,
+    record: Any,
+    payloads: Any,
+    disk: Any,
+    until: Any,
+    caplog: Any,
+    logs: Any,
+    sequences: Any,
 ) -> None:
     recorder = record(tmp_path)
     data = payloads[topics.FORCES]
@@ -198,7 +190,7 @@ def test_a_full_disk_is_loud_and_the_next_file_tells_of_it(
 
 
 def test_what_a_full_disk_costs_is_counted(
-    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any
+    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any, logs: Any, sequences: Any
 ) -> None:
     recorder = record(tmp_path, queue_messages=20)
     data = payloads[topics.FORCES]
@@ -219,7 +211,7 @@ def test_what_a_full_disk_costs_is_counted(
 
 
 def test_an_io_error_ends_the_file_and_the_next_goes_on(
-    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any
+    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any, logs: Any
 ) -> None:
     recorder = record(tmp_path)
     disk.error = errno.EIO
@@ -247,7 +239,7 @@ def test_a_disk_that_stays_full_to_the_end_is_admitted(
 
 
 def test_logging_stops_while_there_is_still_room_and_resumes(
-    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any, caplog: Any
+    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any, caplog: Any, logs: Any
 ) -> None:
     recorder = record(tmp_path, min_free_bytes=1 << 30)
     recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
@@ -267,158 +259,6 @@ def test_logging_stops_while_there_is_still_room_and_resumes(
     assert [g.reason for g in logs(tmp_path)[-1].gaps] == ["low_space"]
 
 
-def test_files_split_by_size_and_each_stands_alone(
-    tmp_path: Path, record: Any, payloads: Any, until: Any
-) -> None:
-    recorder = record(tmp_path, split_bytes=6000, chunk_bytes=1000, flush_period=0.03)
-    recorder.attach("cal.toml", "application/toml", b"x = 1\n")
-    recorder.metadata("board:b0", {"serial_number": "0011"})
-    recorder.write(topics.GEOMETRY, "b0", payloads[topics.GEOMETRY], BASE_NS, BASE_NS)
-    count = 0
-    while recorder.stats.files < 4:
-        count += 1
-        data = os.urandom(300)
-        recorder.write(topics.RAW, "b0", data, BASE_NS + count, BASE_NS + count)
-        time.sleep(0.002)
-    assert recorder.close(10)
-    found = logs(tmp_path)
-    assert len(found) >= 4
-    for number, log in enumerate(found):
-        assert log.whole
-        assert log.size < 6000 + 4000  # split_bytes, and the summary
-        assert log.metadata["board:b0"] == {"serial_number": "0011"}
-        assert log.metadata["file"]["file"] == str(number)
-        assert log.attachments == {"cal.toml": ("application/toml", 6)}
-        if log.messages:
-            geometry = [c for c in log.channels if c.topic.endswith("geometry")]
-            assert [c.messages for c in geometry] == [1]
-        assert all(channel.missing == 0 for channel in log.channels)
-    assert len({log.metadata["file"]["set"] for log in found}) == 1
-    assert sequences(tmp_path)["/tactile/b0/raw"] == list(range(count))
-
-
-def test_files_split_by_time(tmp_path: Path, record: Any, payloads: Any, until: Any) -> None:
-    recorder = record(tmp_path, split_seconds=0.15)
-    deadline = time.monotonic() + 20
-    while recorder.stats.files < 3:
-        assert time.monotonic() < deadline
-        recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
-        time.sleep(0.01)
-    assert recorder.close(10)
-    assert all(log.whole for log in logs(tmp_path))
-
-
-def test_a_changed_geometry_is_the_one_repeated(
-    tmp_path: Path, record: Any, payloads: Any, until: Any
-) -> None:
-    recorder = record(tmp_path, split_seconds=0.1)
-    old, new = payloads[topics.GEOMETRY], payloads[topics.GEOMETRY] + b"\0"
-    recorder.write(topics.GEOMETRY, "b0", old, BASE_NS, BASE_NS)
-    recorder.write(topics.GEOMETRY, "b0", new, BASE_NS + 1, BASE_NS)
-    until(lambda: recorder.stats.written == 2)
-    time.sleep(0.15)
-    recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS + 5, BASE_NS)
-    until(lambda: recorder.stats.files == 2)
-    assert recorder.close(10)
-    rows = [(c.topic, m.data) for c, m in read_messages(sorted(tmp_path.glob("*.mcap"))[1])]
-    assert rows[0] == ("/tactile/b0/geometry", new)
-
-
-def test_retention_keeps_the_newest_and_the_current(
-    tmp_path: Path, record: Any, until: Any
-) -> None:
-    stranger = tmp_path / "holiday.mcap"
-    stranger.write_bytes(b"not ours")
-    recorder = record(tmp_path, split_bytes=3000, chunk_bytes=1000, max_files=3)
-    deadline = time.monotonic() + 30
-    count = 0
-    while recorder.stats.files < 7:
-        assert time.monotonic() < deadline
-        recorder.write(topics.RAW, "b0", os.urandom(300), BASE_NS + count, BASE_NS)
-        count += 1
-        time.sleep(0.002)
-        assert Path(recorder.stats.path).exists() or recorder.stats.queued
-    assert recorder.close(10)
-    kept = sorted(tmp_path.glob("tactile_*.mcap"))
-    assert len(kept) <= 3
-    assert kept[-1].stem[-4:] >= "0006"
-    assert all(info(path).whole for path in kept)
-    assert stranger.exists()
-
-
-def test_retention_starts_with_what_earlier_runs_left(
-    tmp_path: Path, record: Any, payloads: Any, disk: Any
-) -> None:
-    old = []
-    for year in (2001, 2002, 2003):
-        first = record(tmp_path / "x.mcap")
-        first.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
-        first.close(10)
-        old.append(tmp_path / f"tactile_{year}0101T000000Z_0000.mcap")
-        (tmp_path / "x.mcap").rename(old[-1])
-    # The last run was killed: its file has no summary, but it can be read.
-    data = old[-1].read_bytes()
-    old[-1].write_bytes(data[: len(data) - 100])
-    recorder = record(tmp_path, max_files=2)
-    assert not old[0].exists()
-    assert not old[1].exists()
-    assert old[2].exists()
-    assert Path(recorder.stats.path).exists()
-
-
-def test_nothing_is_deleted_when_the_newest_cannot_be_read(
-    tmp_path: Path, record: Any, caplog: Any
-) -> None:
-    old = [tmp_path / f"tactile_{year}0101T000000Z_0000.mcap" for year in (2001, 2002, 2003)]
-    for path in old:
-        path.write_bytes(bytes(1000))
-    record(tmp_path, max_files=1)
-    assert all(path.exists() for path in old)
-    assert "nothing is deleted" in caplog.text
-
-
-def test_a_file_that_another_process_writes_is_not_deleted(tmp_path: Path, record: Any) -> None:
-    other = record(tmp_path)
-    time.sleep(1.1)  # names have whole seconds
-    record(tmp_path, max_files=1)
-    assert Path(other.stats.path).exists()
-
-
-def test_two_daemons_may_log_to_one_directory(tmp_path: Path, record: Any, payloads: Any) -> None:
-    both = [record(tmp_path, split_seconds=0.1) for _ in range(2)]
-    for i in range(30):
-        for number, recorder in enumerate(both):
-            data = payloads[topics.LOG]
-            recorder.write(topics.LOG, f"b{number}", data, BASE_NS + i, BASE_NS)
-        time.sleep(0.01)
-    assert all(recorder.close(10) for recorder in both)
-    numbers = sequences(tmp_path)
-    assert numbers["/tactile/b0/log"] == numbers["/tactile/b1/log"] == list(range(30))
-    assert len({log.metadata["file"]["set"] for log in logs(tmp_path)}) == 2
-
-
-def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    path.write_bytes(b"precious")
-    with pytest.raises(RecorderError, match="exists and is not overwritten"):
-        Recorder(path, RecorderSettings(min_free_bytes=0))
-    assert path.read_bytes() == b"precious"
-
-
-def test_a_place_that_cannot_be_written_is_named_with_a_remedy(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    for place in (tmp_path / "file" / "logs", Path("/proc/logs")):
-        with pytest.raises(RecorderError, match="name a directory that this user may write to"):
-            Recorder(place, RecorderSettings(min_free_bytes=0))
-
-
-def test_a_disk_without_room_is_refused_at_the_start(tmp_path: Path, disk: Any) -> None:
-    disk.free_bytes = 5 << 20
-    with pytest.raises(RecorderError, match=r"0.01 GB free .* logs stop at 1.07"):
-        Recorder(tmp_path, storage=disk)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_wrong_use_is_refused(tmp_path: Path, record: Any) -> None:
     recorder = record(tmp_path / "a.mcap")
     with pytest.raises(ValueError, match="65536 allowed"):
@@ -434,7 +274,9 @@ def test_stamps_follow_the_offset_taken_once(tmp_path: Path, record: Any) -> Non
     assert abs(offset - WallClock.take().offset_ns) < 60e9
 
 
-def test_a_real_file_size_limit_is_met_like_a_full_disk(tmp_path: Path) -> None:
+def test_a_real_file_size_limit_is_met_like_a_full_disk(
+    tmp_path: Path, logs: Any, sequences: Any
+) -> None:
     """The kernel refuses bytes in the middle of a write: RLIMIT_FSIZE in a process of its own."""
     limit = 40_000
     code = textwrap.dedent("""
