@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -117,3 +118,13 @@ class Host:
 @pytest.fixture
 def host() -> type[Host]:
     return Host
+
+
+@pytest.fixture
+def serial(real_skin: Callable[..., SkinModel], identity: Identity) -> Callable[..., Host]:
+    """A host on a serial line, with its board."""
+
+    def make(**options: Any) -> Host:
+        return Host(SerialBoard(real_skin(), identity, **options))
+
+    return make

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -27,12 +25,10 @@ from sensor_proto.packets import (
     Start,
     Status,
     Stop,
-    TaxelStatus,
 )
 from sim_device.board_clock import ClockParameters
 from sim_device.elastomer import Contact
 from sim_device.environment import rotation_about
-from sim_device.faults import FaultPlan
 from sim_device.firmware import CanBoard, SerialBoard, frame_bits
 from sim_device.indenter import load_script
 from tactile_bus.instant import Instant
@@ -49,14 +45,6 @@ def talk(request, real_skin, identity, host):
             return host(SerialBoard(real_skin(), identity, **options))
         fd = request.param == "canfd"
         return host(CanBoard(real_skin(), identity, node=5, fd=fd, **options), fd)
-
-    return make
-
-
-@pytest.fixture
-def serial(real_skin, identity, host):
-    def make(**options):
-        return host(SerialBoard(real_skin(), identity, **options))
 
     return make
 
@@ -233,14 +221,6 @@ def test_reboot_answers_first_then_forgets_everything(talk) -> None:
     assert status.cycles < 40
 
 
-def test_planned_reset_is_a_watchdogs(serial) -> None:
-    host = serial(plan=FaultPlan.parse("reset@1s"))
-    host.run(2300, {200: [Start(1)]})
-    assert host.of(Status)[-1].reset_cause == 2
-    assert host.board.counters["reset"] == 1
-    assert host.sequences[-1] < 81
-
-
 def test_status_once_a_second(talk) -> None:
     host = talk()
     host.run(5200, {200: [Start(1)]})
@@ -253,31 +233,6 @@ def test_board_streams_on_when_the_host_falls_silent(serial) -> None:
     host = serial()
     host.run(8000, {200: [Start(1)]})
     assert host.sequences == list(range(780))
-
-
-def test_nobody_reading_makes_overruns_that_are_counted_exactly(serial) -> None:
-    host = serial()
-    host.run(1000, {200: [Start(1)]})
-    before = len(host.sequences)
-    host.now_ms = 3000
-    host.run(3500)
-    missing = [b - a - 1 for a, b in pairwise(host.sequences)]
-    assert sum(missing) == host.board.counters["overruns"] > 150
-    assert host.board.counters["cycles"] == len(host.sequences) + sum(missing)
-    assert len([m for m in missing if m]) == 1
-    assert before < len(host.sequences)
-
-
-def test_a_slow_line_drops_the_oldest_samples(serial) -> None:
-    # 16 taxels make about 145 bytes a sample: 100 Hz need 14.5 kB/s, and there are 5.
-    host = serial(line_rate=5000.0)
-    host.run(3000, {200: [Start(1)]})
-    sent = sum(len(piece) for piece in host.raw)
-    assert 4000 * 3 < sent < 5500 * 3
-    assert host.sequences == sorted(host.sequences)
-    lost = host.sequences[-1] + 1 - len(host.sequences)
-    assert lost > 100
-    assert host.board.counters["overruns"] >= lost
 
 
 def test_two_boards_on_a_bus_hear_what_is_theirs(real_skin, identity, host) -> None:
@@ -326,77 +281,12 @@ def test_contacts_and_attitude_may_be_set_by_whoever_moves_the_board(serial) -> 
     assert turned == pytest.approx(np.full(8, 86.6), abs=8)
 
 
-def test_broken_taxels(serial) -> None:
-    host = serial(
-        plan=FaultPlan.parse("stuck=pad:3@0.5s,saturated=pad:0@0.5s+0.2s,failed=pad:15@0.5s+0.1s")
-    )
-    host.run(1000, {200: [Start(1)]})
-    samples = host.of(Samples)
-    early, late = samples[:29], samples[31:]
-    assert not any(m.status.any() for m in early)
-    assert len({m.field[3].tobytes() for m in early}) > 20
-    assert len({m.field[3].tobytes() for m in late}) == 1
-    saturated = [m for m in samples if m.status[0] == TaxelStatus.SATURATED]
-    failed = [m for m in samples if m.status[15] == TaxelStatus.READ_FAILED]
-    assert all(m.field[0, 2] == 32767 for m in saturated)
-    counters = host.board.counters
-    assert counters["saturated"] == len(saturated) == pytest.approx(20, abs=1)
-    assert counters["failed"] == len(failed) == counters["chip_errors"] == pytest.approx(10, abs=1)
-    assert counters["stuck"] == pytest.approx(50, abs=1)
-
-
-@pytest.mark.parametrize(
-    ("spec", "message"),
-    [
-        ("stuck=left:0", "no array 'left'; allowed: 'pad'"),
-        ("stuck=pad:16", "taxels 0 to 15"),
-        ("busoff@1s+1s", "busoff is a fault of CAN"),
-    ],
-)
-def test_plans_that_do_not_fit_the_board_are_refused(serial, spec: str, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        serial(plan=FaultPlan.parse(spec))
-
-
 def test_rates_and_nodes_that_cannot_be_are_refused(real_skin, identity) -> None:
     for rate in (0.0, -5.0, 400.0, float("nan")):
         with pytest.raises(ValueError, match="rate"):
             SerialBoard(real_skin(), identity, rate=rate)
     with pytest.raises(ValueError, match="node 127"):
         CanBoard(real_skin(), identity, node=127)
-
-
-def test_every_lost_sample_is_in_the_account(serial) -> None:
-    spec = "seed=3,flip=2e-5,loss=0.02,duplicate=0.02,splice=0.01,byteloss=1e-5,silence@3s+0.5s"
-    host = serial(plan=FaultPlan.parse(spec))
-    host.run(6000, {200: [Start(1)]})
-    counters = host.board.counters
-    assert counters["intact"] == host.decoder.counters["accepted"]
-    assert counters["sent"] + counters["duplicated"] == sum(
-        counters[name] for name in ("intact", "damaged", "lost", "silenced", "held")
-    )
-    assert counters["silenced"] >= 50
-    assert host.decoder.counters["crc"] > 0
-
-
-@pytest.mark.parametrize("fd", [False, True])
-def test_same_seed_same_bytes(real_skin, identity, host, fd: bool) -> None:
-    plan = FaultPlan.parse("seed=5,flip=1e-5,loss=0.01,duplicate=0.01")
-    commands = {200: [Start(1)], 300: [ClockPoll(2)]}
-
-    def stream(seed: int) -> list[object]:
-        one = host(CanBoard(real_skin(seed), identity, fd=fd, plan=plan), fd)
-        one.run(600, commands)
-        return one.raw
-
-    def octets(seed: int) -> bytes:
-        one = host(SerialBoard(real_skin(seed), identity, plan=plan))
-        one.run(600, commands)
-        return b"".join(one.raw)
-
-    assert stream(1) == stream(1)
-    assert octets(1) == octets(1)
-    assert octets(1) != octets(2)
 
 
 def test_time_does_not_go_back(serial) -> None:
