@@ -3,12 +3,81 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from typing import Final, Self
 
 from rich.console import Console
+from rich.live import Live
 from rich.logging import RichHandler
+from rich.table import Table
+from rich.text import Text
 
+from tactile_bus.instant import monotonic_now, seconds_between
 from tactile_bus.recorder import Recorder
+
+log = logging.getLogger(__name__)
+
+PLAIN_EVERY: Final = 5.0
+"""s between plain lines where there is no terminal."""
+
+
+class LiveLines(ABC):
+    """What people see while a daemon runs: live lines on a terminal, else plain ones now and then.
+
+    A context manager, used from the main thread. Below the lines stands the log of ``recorder``.
+    """
+
+    def __init__(self, console: Console, recorder: Recorder | None) -> None:
+        self._recorder = recorder
+        self._plain_at = monotonic_now()
+        self._live = (
+            Live(console=console, auto_refresh=False, transient=True)
+            if console.is_terminal
+            else None
+        )
+
+    def __enter__(self) -> Self:
+        """Begin."""
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the terminal as it was."""
+        if self._live is not None:
+            self._live.stop()
+
+    def show(self) -> None:
+        """Refresh the live lines, or log plain ones when it is time; to be called often."""
+        if self._live is not None:
+            table = self.table()
+            if table is not None:
+                self._live.update(self._above_the_log(table), refresh=True)
+        elif seconds_between(self._plain_at, monotonic_now()) >= PLAIN_EVERY:
+            self._plain_at = monotonic_now()
+            for line in self.lines():
+                log.info("%s", line)
+            if self._recorder is not None:
+                log.info("log %s", describe_log(self._recorder))
+
+    @abstractmethod
+    def table(self) -> Table | None:
+        """The live lines; None while there is nothing to show."""
+
+    @abstractmethod
+    def lines(self) -> Iterable[str]:
+        """The plain lines."""
+
+    def _above_the_log(self, table: Table) -> Table:
+        if self._recorder is None:
+            return table
+        good = self._recorder.stats.state == "recording"
+        grid = Table.grid()
+        grid.add_row(table)
+        row = Text(describe_log(self._recorder), "" if good else "red")
+        grid.add_row(Text.assemble(("log ", "dim"), row))
+        return grid
 
 
 def set_up_logging(console: Console, *, verbose: bool) -> None:

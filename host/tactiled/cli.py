@@ -18,7 +18,7 @@ from tactile_bus.terminal import set_up_logging
 from tactiled.arguments import make_parser
 from tactiled.daemon import Daemon, StartError
 from tactiled.settings import Settings, SettingsError, make_settings
-from tactiled.status import REFRESH, Status
+from tactiled.status import REFRESH, StatusLines
 from tactiled.transports import list_ports
 
 log = logging.getLogger(__name__)
@@ -63,7 +63,7 @@ def _run(settings: Settings, console: Console, stopping: threading.Event) -> int
         print(f"tactiled: {error}", file=sys.stderr)
         return REFUSED
     try:
-        with Status(console, daemon.ports, daemon.recorder) as status:
+        with StatusLines(console, daemon.ports, daemon.recorder) as status:
             trouble = _watch(daemon, status, stopping)
     finally:
         clean = daemon.stop()
@@ -89,7 +89,7 @@ def _conclude(daemon: Daemon, trouble: str | None) -> int:
     return DONE
 
 
-def _watch(daemon: Daemon, status: Status, stopping: threading.Event) -> str | None:
+def _watch(daemon: Daemon, status: StatusLines, stopping: threading.Event) -> str | None:
     """Wait for the end; what kept the job from being done, None when it was."""
     settings = daemon.settings
     start = monotonic_now()

@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
 from tactile_bus.geometry import Side
 from tactile_bus.instant import monotonic_now, seconds_between
 from tactile_bus.recorder import Recorder
-from tactile_bus.terminal import describe_log, drops_text
+from tactile_bus.terminal import LiveLines, drops_text
 from tactiled.port import Port
 from tactiled.station import Station
 
-log = logging.getLogger(__name__)
-
 REFRESH = 0.2
 """s between refreshes of the live lines."""
-
-PLAIN_EVERY = 5.0
-"""s between plain lines."""
 
 FULL_BAR_N = 10.0
 """N at which a force bar is full: the paper's thresholds lie below."""
@@ -37,44 +30,18 @@ STALE_AFTER = 0.5
 SIDES = ((Side.LEFT, "L"), (Side.RIGHT, "R"), (Side.TIP, "T"))
 
 
-class Status:
-    """Shows the boards of ``ports``; `show` is called often, from the main thread."""
+class StatusLines(LiveLines):
+    """Shows the boards of ``ports``."""
 
     def __init__(self, console: Console, ports: list[Port], recorder: Recorder | None) -> None:
+        super().__init__(console, recorder)
         self._ports = ports
-        self._recorder = recorder
-        self._live: Live | None = None
-        self._plain_at = monotonic_now()
-        if console.is_terminal:
-            self._live = Live(console=console, auto_refresh=False, transient=True)
-
-    def __enter__(self) -> Status:
-        """Begin."""
-        if self._live is not None:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Leave the terminal as it was."""
-        if self._live is not None:
-            self._live.stop()
-
-    def show(self) -> None:
-        """Refresh the live lines, or log plain ones when it is time."""
-        if self._live is not None:
-            self._live.update(self._table(), refresh=True)
-        elif seconds_between(self._plain_at, monotonic_now()) >= PLAIN_EVERY:
-            self._plain_at = monotonic_now()
-            for station in self._boards():
-                cells = [f"{k} {v}" for k, v in describe(station).items() if v]
-                log.info("%s: %s", station.name, ", ".join(cells))
-            if self._recorder is not None:
-                log.info("log %s", describe_log(self._recorder))
 
     def _boards(self) -> list[Station]:
         return [station for port in self._ports for station in list(port.stations.values())]
 
-    def _table(self) -> Table:
+    def table(self) -> Table:
+        """A row for each board."""
         table = Table.grid(padding=(0, 2))
         for station in self._boards():
             cells = describe(station)
@@ -84,14 +51,14 @@ class Status:
                 Text(cells.pop("state"), style),
                 *(Text(f"{k} {v}" if v else "", no_wrap=True) for k, v in cells.items()),
             )
-        if self._recorder is not None:
-            good = self._recorder.stats.state == "recording"
-            row = Text(describe_log(self._recorder), "" if good else "red")
-            grid = Table.grid()
-            grid.add_row(table)
-            grid.add_row(Text.assemble(("log ", "dim"), row))
-            return grid
         return table
+
+    def lines(self) -> list[str]:
+        """A line for each board."""
+        return [
+            f"{station.name}: " + ", ".join(f"{k} {v}" for k, v in describe(station).items() if v)
+            for station in self._boards()
+        ]
 
 
 def describe(station: Station) -> dict[str, str]:

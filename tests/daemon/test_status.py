@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from tactile_bus.terminal import drops_text
 from tactiled.cli import can_networks
 from tactiled.links.lines import bus_names
-from tactiled.status import BAR, bar, drops_text
+from tactiled.status import BAR, bar
 
 
 def test_a_force_bar_fills_up_and_stays_full() -> None:

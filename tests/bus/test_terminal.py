@@ -1,0 +1,73 @@
+"""What people see while a daemon runs."""
+
+from __future__ import annotations
+
+import io
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+from tactile_bus.recorder import Recorder
+from tactile_bus.terminal import LiveLines
+
+
+class Lines(LiveLines):
+    ready = False
+
+    def table(self) -> Table | None:
+        if not self.ready:
+            return None
+        table = Table.grid()
+        table.add_row("finger streaming")
+        return table
+
+    def lines(self) -> list[str]:
+        return ["finger: streaming"]
+
+
+@pytest.fixture
+def recorder() -> Recorder:
+    stats = SimpleNamespace(
+        path="run.mcap",
+        bytes_written=2_500_000,
+        state="no_space",
+        last_error="disk full",
+        dropped={"queue": 3},
+    )
+    return cast(Recorder, SimpleNamespace(stats=stats))
+
+
+def test_a_terminal_shows_the_rows_and_below_them_the_log(recorder: Recorder) -> None:
+    out = io.StringIO()
+    with Lines(Console(file=out, force_terminal=True, width=100), recorder) as lines:
+        lines.show()
+        assert "streaming" not in out.getvalue()  # there was nothing to show yet
+        lines.ready = True
+        lines.show()
+    text = out.getvalue()
+    shown = text.index("finger streaming")
+    assert "run.mcap  2.5 MB  NO_SPACE disk full  dropped queue=3" in text[shown:]
+
+
+def test_elsewhere_there_are_plain_lines_now_and_then(
+    recorder: Recorder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    now: list[Any] = [0]
+    monkeypatch.setattr("tactile_bus.terminal.monotonic_now", lambda: now[0])
+    out = io.StringIO()
+    caplog.set_level("INFO")
+    with Lines(Console(file=out), recorder) as lines:
+        for now[0] in range(0, 12_000_000_000, 200_000_000):
+            lines.show()
+    assert (
+        caplog.messages
+        == [
+            "finger: streaming",
+            "log run.mcap  2.5 MB  NO_SPACE disk full  dropped queue=3",
+        ]
+        * 2
+    )
+    assert out.getvalue().strip() == ""
