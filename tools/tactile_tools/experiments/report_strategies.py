@@ -23,8 +23,6 @@ from tactile_tools.experiments.document import (
 from tactile_tools.experiments.findings import ByStrategy, means_of, rate_of
 from tactile_tools.experiments.plots import Bracket, boxes, rates
 from tactile_tools.experiments.reference import (
-    AUTHORS_DISTANCE,
-    AUTHORS_TIME,
     REFERENCES,
     Reference,
 )
@@ -126,7 +124,7 @@ def _section(name: str, by: ByStrategy, references: Sequence[Reference], prefix:
         tables=[
             _success_table(by, references, prefix),
             _entered_table(by, references, prefix),
-            _measures_table(by, bool(references), prefix),
+            _measures_table(by, references, prefix),
             _pairs_table("Normalised distance, all pairs", distance, prefix + "pairs-distance"),
             _pairs_table("Normalised time, all pairs", time, prefix + "pairs-time"),
             _mcnemar_table(by, prefix),
@@ -201,27 +199,28 @@ def _beside(
     )
 
 
-def _measures_table(by: ByStrategy, references: bool, prefix: str) -> TableData:
-    head = ["strategy", "distance: mean [95 %]", "median", "time: mean [95 %]", "median"]
-    if references:
-        head[3:3] = ["authors' simulator, mean"]
-        head.append("authors' simulator, mean")
+def _measures_table(by: ByStrategy, references: Sequence[Reference], prefix: str) -> TableData:
+    others = [r for r in references if r.distance and r.time]
+    theirs = [f"{r.label}, mean" for r in others]
     body = []
     for name, rows in by.items():
         cells = [spoken(name)]
-        for column, theirs in (
-            ("normalized_distance", AUTHORS_DISTANCE),
-            ("normalized_time", AUTHORS_TIME),
+        for column, means in (
+            ("normalized_distance", [r.distance for r in others]),
+            ("normalized_time", [r.time for r in others]),
         ):
             values = [r[column] for r in rows]
             low, high = mean_interval(values)
             cells += [f"{fmean(values):.3f} [{low:.3f}, {high:.3f}]", f"{median(values):.3f}"]
-            if references:
-                cells.append(f"{theirs[name]:.3f}" if name in theirs else "–")
+            cells += [f"{of[name]:.3f}" if name in of else "–" for of in means]
         body.append(cells)
     return TableData(
         "Distance to the goal at the end and time, normalised",
-        head,
+        [
+            "strategy",
+            *("distance: mean [95 %]", "median", *theirs),
+            *("time: mean [95 %]", "median", *theirs),
+        ],
         body,
         note="A trial that does not reach the goal takes all the time there is.",
         name=prefix + "measures",
