@@ -8,6 +8,7 @@ from types import MappingProxyType
 
 from tactile_tools.experiments.statistics import Rate
 
+
 @dataclass(frozen=True, slots=True)
 class Reference:
     """What others found, by strategy; empty where they do not say.
