@@ -87,6 +87,11 @@ class World(Protocol):
         ...
 
     @property
+    def outline(self) -> tuple[tuple[float, float], ...]:
+        """Corners of the finger, x, y in ``ee``, m."""
+        ...
+
+    @property
     def time(self) -> float:
         """Simulated s since it was built."""
         ...

@@ -45,6 +45,7 @@ class MujocoWorld:
     def __init__(self, scene: Scene, parameters: WorldParameters | None = None) -> None:
         parameters = parameters or world_parameters(scene.parameters)
         self._scene = scene
+        self._outline = parameters.outline
         start = replace(scene, objects=settled(scene, parameters))
         self._model = model = cupboard_model(start, parameters)
         self._data = data = mujoco.MjData(model)
@@ -81,6 +82,11 @@ class MujocoWorld:
     def scene(self) -> Scene:
         """What it was built from."""
         return self._scene
+
+    @property
+    def outline(self) -> tuple[tuple[float, float], ...]:
+        """Corners of the finger, x, y in ``ee``, m."""
+        return self._outline
 
     @property
     def time(self) -> float:

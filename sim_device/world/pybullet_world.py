@@ -179,6 +179,11 @@ class PybulletWorld:
         return self._scene
 
     @property
+    def outline(self) -> tuple[tuple[float, float], ...]:
+        """Corners of the finger, x, y in ``ee``, m."""
+        return self._parameters.outline
+
+    @property
     def time(self) -> float:
         """Simulated s since it was built: what was asked for."""
         return self._asked

@@ -115,6 +115,11 @@ class PymunkWorld:
         return self._scene
 
     @property
+    def outline(self) -> tuple[tuple[float, float], ...]:
+        """Corners of the finger, x, y in ``ee``, m."""
+        return self._parameters.outline
+
+    @property
     def time(self) -> float:
         """Simulated s since it was built."""
         return self._steps * PHYSICS_STEP

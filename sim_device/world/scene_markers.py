@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
 from sim_device.world.base import World
 from sim_device.world.scenes import Shape
 from sim_device.world.touch import SHELF_CLEARANCE
-from tactile_bus.geometry import FINGER_HEIGHT, FINGER_OUTLINE
+from tactile_bus.geometry import FINGER_HEIGHT
 from tactile_bus.markers import CUBE, CYLINDER, DELETE, SPHERE, marker
 from tactile_bus.messages import MSG
 
@@ -59,9 +60,15 @@ def scene_markers(world: World, wall_ns: int) -> Any:
     add(CUPBOARD, 1, CUBE, (depth / 2, (width + WALL) / 2, height / 2, 0), across, wood)
     add(CUPBOARD, 2, CUBE, (depth / 2, -(width + WALL) / 2, height / 2, 0), across, wood)
     finger = world.finger()
-    xs, ys = zip(*FINGER_OUTLINE, strict=True)
+    xs, ys = zip(*world.outline, strict=True)
     size = (max(xs) - min(xs), max(ys) - min(ys), FINGER_HEIGHT)
     middle = SHELF_CLEARANCE + FINGER_HEIGHT / 2
-    add(FINGER, 0, CUBE, (finger.x, finger.y, middle, finger.heading), size, (0.1, 0.4, 0.8, 0.9))
+    # A cube stands on its centre, the finger on its pivot.
+    ahead = (max(xs) + min(xs)) / 2
+    x, y = (
+        finger.x + ahead * math.cos(finger.heading),
+        finger.y + ahead * math.sin(finger.heading),
+    )
+    add(FINGER, 0, CUBE, (x, y, middle, finger.heading), size, (0.1, 0.4, 0.8, 0.9))
     add(GOAL, 0, SPHERE, (*scene.goal, middle, 0.0), (0.015, 0.015, 0.015), (0.0, 0.6, 0.3, 1.0))
     return MSG.MarkerArray(made)

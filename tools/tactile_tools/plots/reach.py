@@ -110,7 +110,7 @@ def _cupboard(axes: Axes, reach: ReachSeries, moments: Sequence[int]) -> None:
         axes.plot(line[:, 0], line[:, 1], lw=2.6, color=colour, zorder=5, solid_capstyle="round")
     for index, style in ((0, {"ls": ":", "lw": 1.3}), (len(tip) - 1, {"lw": 2.0})):
         arm = reach.arm[index]
-        outline = _flip(turned(FINGER_OUTLINE, arm.x, arm.y, arm.heading))
+        outline = _flip(turned(_outline(reach), arm.x, arm.y, arm.heading))
         closed = np.vstack([outline, outline[:1]])
         axes.plot(closed[:, 0], closed[:, 1], color=FINGER, zorder=4, **style)
         pointed = _flip(turned([(0.15185, 0.0), (TIP_X, 0.0)], arm.x, arm.y, arm.heading))
@@ -125,6 +125,14 @@ def _cupboard(axes: Axes, reach: ReachSeries, moments: Sequence[int]) -> None:
     axes.set_ylabel("into the cupboard, m  (0: front edge of the shelf)")
     axes.set_title("the cupboard from above", fontsize=12)
     _legends(axes, list(dict.fromkeys(doing.tolist())))
+
+
+def _outline(reach: ReachSeries) -> list[tuple[float, float]]:
+    """Corners of the finger in ``ee``, m, as wide as the log says it was."""
+    width = max(y for _, y in FINGER_OUTLINE) - min(y for _, y in FINGER_OUTLINE)
+    shown = [] if reach.last_world is None else _shown(reach.last_world)
+    told = next((m.scale.y for m in shown if m.ns == "finger"), width)
+    return [(x, y * told / width) for x, y in FINGER_OUTLINE]
 
 
 def _objects(axes: Axes, reach: ReachSeries) -> None:
