@@ -17,6 +17,7 @@ from tactile_tools.calibrate.fit import Choice, choose, fit, folds
 from tactile_tools.calibrate.label_clock import find_clock
 from tactile_tools.calibrate.readouts import export, pipeline
 from tactile_tools.calibrate.recipes import FORCE_RECIPES, PLACE_RECIPES, Recipe, feature_map
+from tactile_tools.calibrate.recording import RecordingError
 from tactile_tools.calibrate.rows import align, causal, copies
 from tactile_tools.calibrate.splits import block_edges, block_masks
 from tactiled.blocks import SampleBlock
@@ -62,6 +63,11 @@ def test_the_kind_that_the_skin_needs_is_chosen(make_recording):
     choice = choose([make_recording(creeping, seconds=80)], [LINEAR, CUBIC, CREEP])
     assert choice.recipe is CREEP
     assert {s.recipe.name for s in choice.scores} == {"linear", "cubic", "creep"}
+
+
+def test_a_recording_too_short_to_choose_by_is_refused_with_what_to_do(make_recording):
+    with pytest.raises(RecordingError, match=r"labels over 5 s.*record more presses"):
+        choose([make_recording(elastic, seconds=6, period=3)], [LINEAR])
 
 
 def test_the_delay_of_the_labels_is_found(make_recording):

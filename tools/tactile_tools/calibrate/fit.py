@@ -19,7 +19,7 @@ from tactile_tools.calibrate.recipes import (
 )
 from tactile_tools.calibrate.recording import Recording, RecordingError
 from tactile_tools.calibrate.rows import Rows, align, copies
-from tactile_tools.calibrate.splits import block_edges, block_masks
+from tactile_tools.calibrate.splits import GAP_S, block_edges, block_masks
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -149,17 +149,33 @@ def cross_validate(
 
 
 def folds(rows: Rows, recordings: Sequence[Recording]) -> Iterator[tuple[Bool, Bool]]:
-    """Rows to fit on and to test on: blocks of time of every recording, and whole recordings."""
+    """Rows to fit on and to test on: blocks of time of every recording, and whole recordings.
+
+    `RecordingError` for a recording so short that nothing is left beside one of its blocks.
+    """
     numbers = range(len(recordings))
     for number in numbers:
         own = rows.recording == number
         for edges in block_edges(recordings[number].label_time_s):
             fit, test = block_masks(rows.time_s, edges)
-            yield fit | ~own, test & own
+            fit, test = fit | ~own, test & own
+            if not fit.any() or not test.any():
+                raise too_short(recordings[number])
+            yield fit, test
     if len(recordings) > 1:
         for number in numbers:
             own = rows.recording == number
             yield ~own, own & rows.whole
+
+
+def too_short(recording: Recording) -> RecordingError:
+    """What to say of a recording with too little in it to choose a model by."""
+    time = recording.label_time_s
+    return RecordingError(
+        f"{recording.path} has labels over {time[-1] - time[0]:.0f} s; to choose a model, a fifth "
+        f"of them and {GAP_S:g} s on both sides are left out in turn, and nothing is left to fit: "
+        "record more presses, a minute of them or more"
+    )
 
 
 def fit(recordings: Sequence[Recording], choice: Choice) -> NetModel:

@@ -1,0 +1,123 @@
+"""A board calibrated as its owner does it: real processes, and a person who does what is asked."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactile_bus.messages import codec
+from tactile_bus.session import BusConfig, close_session, open_session
+from tactile_bus.streams import Latest, latest
+from tactile_bus.topics import FEATURES
+from tactile_tools.processes import command, free_port, running, wait_for
+
+FORCE_N = 4.0
+PRESSES = f"""
+[[press]]
+array = "skin"
+normal_n = {FORCE_N}
+start_s = 7.0
+ramp_s = 0.1
+hold_s = 2.9
+repeat = 1000
+every_s = 6.0
+"""
+"""The first is late, so that tactiled is up by then and tares an untouched skin."""
+
+SLOW_S = 60.0
+CALIBRATE = (sys.executable, "-m", "tactile_tools.cli", "calibrate")
+
+
+class Person:
+    """Watches the skin through the features, and acts when a press has just begun or ended."""
+
+    def __init__(self, features: Latest) -> None:
+        self._features = features
+
+    def force(self) -> float:
+        sample = self._features.wait(SLOW_S)
+        assert sample is not None, "no features came"
+        return float(codec().decode(FEATURES, sample.data).normal_force)
+
+    def wait_for(self, *, pressed: bool) -> None:
+        """Until the skin, after it was otherwise, is pressed or free, and steadily so."""
+        deadline = time.monotonic() + SLOW_S
+        for wanted in (not pressed, pressed):
+            while (self.force() > 0.5) is not wanted:
+                assert time.monotonic() < deadline, f"pressed={wanted} did not come"
+        time.sleep(0.3)
+
+
+@contextmanager
+def served(folder: Path, *words: str) -> Iterator[tuple[str, Person]]:
+    """The board and a tactiled on it, its endpoint, and a person who sees what it says."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    port, press = folder / "skin", folder / "press.toml"
+    press.write_text(PRESSES)
+    simulator = [command("simdevice"), "boards", "--board", "anyskin", "--pty", str(port)]
+    daemon = [command("tactiled"), "--port", str(port), "--board", "anyskin", "--no-log"]
+    with running([*simulator, "--press", str(press)], folder / "simdevice") as board:
+        wait_for(port, board, folder / "simdevice")
+        with running([*daemon, "--listen", endpoint, *words], folder / "tactiled"):
+            session = open_session(BusConfig(role="tool", connect=(endpoint,)))
+            try:
+                yield endpoint, Person(latest(session, FEATURES.key("board0")))
+            finally:
+                close_session(session)
+
+
+def prompt(process: subprocess.Popen[str]) -> str:
+    """What is asked next; "" when nothing more is."""
+    assert process.stdout is not None
+    text = ""
+    while not text.endswith(("tare: ", "end: ", "Enter: ", "[y/N] ")):
+        letter = process.stdout.read(1)
+        if not letter:
+            return ""
+        text += letter
+    return text.rpartition("\n")[2]
+
+
+@pytest.mark.timeout(300)
+def test_an_owner_records_fits_and_then_reads_the_force_that_is_there(tmp_path: Path) -> None:
+    with served(tmp_path) as (endpoint, person):
+        words = ["record", "--out", str(tmp_path / "rec.mcap"), "--connect", endpoint]
+        process = subprocess.Popen(
+            [*CALIBRATE, *words, "--rest", "1.8", "--hold", "1.8"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdin is not None
+        forces = [f"{FORCE_N}", f"{FORCE_N / 9.80665 * 1000:.1f} g", "4N", ""]
+        while asked := prompt(process):
+            answer = ""
+            if "Take it off" in asked:
+                person.wait_for(pressed=False)
+            elif "hold it steady" in asked:
+                assert "Put 4 N" in asked
+                person.wait_for(pressed=True)
+            elif "Next press" in asked:
+                answer = forces.pop(0)
+            process.stdin.write(answer + "\n")
+            process.stdin.flush()
+        assert process.wait(SLOW_S) == 0
+    fitted = subprocess.run(
+        [*CALIBRATE, "fit", str(tmp_path / "rec.mcap"), "--out", str(tmp_path / "skin.cal.toml")],
+        capture_output=True,
+        text=True,
+        timeout=2 * SLOW_S,
+        check=False,
+    )
+    assert fitted.returncode == 0, fitted.stderr
+    with served(tmp_path, "--calibration", str(tmp_path / "skin.cal.toml")) as (_, person):
+        person.wait_for(pressed=True)
+        felt = float(np.median([person.force() for _ in range(50)]))
+    assert felt == pytest.approx(FORCE_N, abs=0.5)
