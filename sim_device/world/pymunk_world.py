@@ -83,7 +83,7 @@ class PymunkWorld:
         space.add(finger, skin)
         self._steps = 0
         self._work = 0.0
-        self._push = np.zeros(3)
+        self._push = [0.0, 0.0, 0.0]
         self._wrench = (0.0, 0.0, 0.0)
         self._contacts: tuple[FingerContact, ...] = ()
 
@@ -130,27 +130,37 @@ class PymunkWorld:
         if not (math.isfinite(twist.vx) and math.isfinite(twist.vy) and math.isfinite(twist.omega)):
             raise ValueError(f"{twist} is not finite")
         finger, p = self._finger, self._parameters
+        inertia = (p.finger_mass, p.finger_mass, p.finger_inertia)
+        bounds = (self._f_max, self._f_max, self._m_max)
+        wanted = (twist.vx, twist.vy, twist.omega)
         touches: list[Touch] = []
-        wrench = np.zeros(3)
+        wrench = [0.0, 0.0, 0.0]
+        push, before = self._push, (*finger.velocity, finger.angular_velocity)
         for _ in range(count):
-            v0 = np.array([*finger.velocity, finger.angular_velocity])
-            wanted = np.array([twist.vx, twist.vy, twist.omega])
-            inertia = np.array([p.finger_mass, p.finger_mass, p.finger_inertia])
-            bound = np.array([self._f_max, self._f_max, self._m_max])
             # A motor that answers to speed alone gives way under load: make up for the last one.
-            motor = np.clip(inertia / MOTOR_TIME * (wanted - v0) - self._push, -bound, bound)
+            motor = [
+                min(max(m / MOTOR_TIME * (want - speed) - load, -bound), bound)
+                for m, want, speed, load, bound in zip(
+                    inertia, wanted, before, push, bounds, strict=True
+                )
+            ]
             finger.apply_force_at_world_point((motor[0], motor[1]), finger.position)
             finger.torque += motor[2]
             self._space.step(PHYSICS_STEP)
-            v1 = np.array([*finger.velocity, finger.angular_velocity])
-            push = inertia * (v1 - v0) / PHYSICS_STEP - motor
-            self._push = push
-            wrench += push
-            self._work += float(motor @ (v0 + v1)) / 2 * PHYSICS_STEP
+            after = (*finger.velocity, finger.angular_velocity)
+            push = [
+                m * (new - old) / PHYSICS_STEP - drive
+                for m, new, old, drive in zip(inertia, after, before, motor, strict=True)
+            ]
+            for axis in range(3):
+                wrench[axis] += push[axis]
+                self._work += motor[axis] * (before[axis] + after[axis]) / 2 * PHYSICS_STEP
+            before = after
             self._read(touches)
-            self._drop()
+        self._push = push
+        self._drop()
         self._steps += count
-        self._wrench = tuple((wrench / count).tolist())
+        self._wrench = (wrench[0] / count, wrench[1] / count, wrench[2] / count)
         self._contacts = merge_touches(touches, count)
 
     def _read(self, touches: list[Touch]) -> None:
