@@ -74,7 +74,7 @@ class PybulletWorld:
             fixedTimeStep=BULLET_STEP, deterministicOverlappingPairs=1, physicsClientId=client
         )
         friction = parameters.friction
-        # Bullet multiplies the coefficients of two surfaces.
+        # Bullet multiplies the coefficients of two surfaces; finger on wall comes out of the others.
         self._of_object = math.sqrt(friction.objects)
         self._add_cupboard()
         self._objects = [self._add_object(item) for item in scene.objects]
@@ -97,25 +97,27 @@ class PybulletWorld:
         bullet.changeDynamics(body, -1, lateralFriction=friction, physicsClientId=client)
         return body
 
-    def _block(self, low: tuple[float, float, float], high: tuple[float, float, float]) -> None:
-        """Fixed box between two corners, units."""
+    def _block(
+        self, low: tuple[float, float, float], high: tuple[float, float, float], friction: float
+    ) -> None:
+        """Fixed box between two corners, units; ``friction`` of objects on it."""
         a, b = np.array(low), np.array(high)
         bullet = self._bullet
         shape = bullet.createCollisionShape(
             bullet.GEOM_BOX, halfExtents=((b - a) / 2).tolist(), physicsClientId=self._client
         )
-        friction = self._parameters.friction.object_shelf / self._of_object
-        self._body(0.0, shape, (a + b) / 2, 0.0, friction)
+        self._body(0.0, shape, (a + b) / 2, 0.0, friction / self._of_object)
 
     def _add_cupboard(self) -> None:
         """Shelf with its upper face at 0, and three walls."""
         depth, half = self._scene.depth * UNITS, self._scene.width / 2 * UNITS
         lip, far = -self._parameters.lip * UNITS, depth + _THICK
         wide = half + 2 * _THICK
-        self._block((lip, -wide, -2 * _THICK), (far, wide, 0.0))
-        self._block((depth, -wide, 0.0), (depth + 2 * _THICK, wide, 2 * _TALL))
-        self._block((lip, half, 0.0), (far, half + 2 * _THICK, 2 * _TALL))
-        self._block((lip, -half - 2 * _THICK, 0.0), (far, -half, 2 * _TALL))
+        shelf, wall = self._parameters.friction.object_shelf, self._parameters.friction.object_wall
+        self._block((lip, -wide, -2 * _THICK), (far, wide, 0.0), shelf)
+        self._block((depth, -wide, 0.0), (depth + 2 * _THICK, wide, 2 * _TALL), wall)
+        self._block((lip, half, 0.0), (far, half + 2 * _THICK, 2 * _TALL), wall)
+        self._block((lip, -half - 2 * _THICK, 0.0), (far, -half, 2 * _TALL), wall)
 
     def _add_object(self, item: SceneObject) -> int:
         bullet, height = self._bullet, item.height * UNITS
