@@ -74,7 +74,7 @@ class PybulletWorld:
             fixedTimeStep=BULLET_STEP, deterministicOverlappingPairs=1, physicsClientId=client
         )
         friction = parameters.friction
-        # Bullet multiplies the coefficients of two surfaces; finger on wall comes out of the others.
+        # Bullet multiplies two surfaces: finger on wall comes out of the others.
         self._of_object = math.sqrt(friction.objects)
         self._add_cupboard()
         self._objects = [self._add_object(item) for item in scene.objects]
