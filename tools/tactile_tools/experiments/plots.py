@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
@@ -173,7 +174,7 @@ class Surface:
 
 
 def contours(surfaces: Sequence[Surface], bar_label: str) -> bytes:
-    """Contour plots of ratios, two a row; 1 is white, less is better and blue."""
+    """Contour plots of ratios, two a row; darker is worse."""
     rows = (len(surfaces) + 1) // 2
     figure = Figure(figsize=(8.6, 3.55 * rows), layout="constrained")
     FigureCanvasAgg(figure)
@@ -193,12 +194,20 @@ def _contour(figure: Figure, axes: Axes, surface: Surface, bar_label: str) -> No
     if values.count() < 4:
         axes.text(0.5, 0.5, "too few cells are finished", ha="center", transform=axes.transAxes)
         return
-    low, high = float(values.min()), float(values.max())
+    low, high = max(float(values.min()), 1e-3), float(values.max())
     if high - low < 1e-9:
-        low, high = low - 0.01, high + 0.01
-    levels = np.linspace(low, high, 11)
-    # The scale is this plot's own, so that its shape shows.
-    filled = axes.contourf(surface.x, surface.y, values, levels=levels, cmap="viridis_r")
+        low, high = low / 1.01, low * 1.01
+    # The scale is this plot's own, so that its shape shows, and even in the ratio: where a few
+    # cells are many times worse, the others would all be of one colour.
+    levels = np.geomspace(low, high, 11)
+    filled = axes.contourf(
+        surface.x,
+        surface.y,
+        values.clip(low, high),
+        levels=levels,
+        cmap="viridis_r",
+        norm=BoundaryNorm(levels, 256),
+    )
     lines = axes.contour(
         surface.x, surface.y, values, levels=levels[1:-1:2], colors="black", linewidths=0.7
     )
