@@ -13,33 +13,46 @@ import numpy as np
 import pytest
 
 from tactile_bus.messages import codec
+from tactile_bus.services import call
 from tactile_bus.session import BusConfig, close_session, open_session
 from tactile_bus.streams import Latest, latest
-from tactile_bus.topics import FEATURES
+from tactile_bus.topics import FEATURES, service_key
 from tactile_tools.processes import command, free_port, running, wait_for
 
 FORCE_N = 4.0
+FIRST_S, EVERY_S = 3.0, 8.0
+FREE_S = (3.7, 4.8)  # since a press began: it is over, and nothing comes for 3 s
 PRESSES = f"""
 [[press]]
 array = "skin"
 normal_n = {FORCE_N}
-start_s = 7.0
+start_s = {FIRST_S}
 ramp_s = 0.1
 hold_s = 2.9
 repeat = 1000
-every_s = 6.0
+every_s = {EVERY_S}
 """
-"""The first is late, so that tactiled is up by then and tares an untouched skin."""
 
 SLOW_S = 60.0
 CALIBRATE = (sys.executable, "-m", "tactile_tools.cli", "calibrate")
 
 
 class Person:
-    """Watches the skin through the features, and acts when a press has just begun or ended."""
+    """Acts when a press has just begun or ended, as the features tell, and tares when it is over.
 
-    def __init__(self, features: Latest) -> None:
+    What the features say before the first tare is worth nothing, so then the clock tells: the board
+    had power from ``began`` (s, monotonic) on, and the script runs from there.
+    """
+
+    def __init__(self, features: Latest, began: float) -> None:
         self._features = features
+        self._began = began
+
+    def wait_untouched(self) -> None:
+        """Until nothing is on the skin, and nothing will be for some time."""
+        low, high = FREE_S
+        while not low <= (time.monotonic() - self._began - FIRST_S) % EVERY_S <= high:
+            time.sleep(0.05)
 
     def force(self) -> float:
         sample = self._features.wait(SLOW_S)
@@ -65,10 +78,15 @@ def served(folder: Path, *words: str) -> Iterator[tuple[str, Person]]:
     daemon = [command("tactiled"), "--port", str(port), "--board", "anyskin", "--no-log"]
     with running([*simulator, "--press", str(press)], folder / "simdevice") as board:
         wait_for(port, board, folder / "simdevice")
+        began = time.monotonic()
         with running([*daemon, "--listen", endpoint, *words], folder / "tactiled"):
             session = open_session(BusConfig(role="tool", connect=(endpoint,)))
             try:
-                yield endpoint, Person(latest(session, FEATURES.key("board0")))
+                person = Person(latest(session, FEATURES.key("board0")), began)
+                person.force()
+                person.wait_untouched()
+                call(session, service_key("board0", "tare"), timeout=SLOW_S)
+                yield endpoint, person
             finally:
                 close_session(session)
 
@@ -99,7 +117,9 @@ def test_an_owner_records_fits_and_then_reads_the_force_that_is_there(tmp_path: 
         forces = [f"{FORCE_N}", f"{FORCE_N / 9.80665 * 1000:.1f} g", "4N", ""]
         while asked := prompt(process):
             answer = ""
-            if "Take it off" in asked:
+            if "tare" in asked:
+                person.wait_untouched()
+            elif "Take it off" in asked:
                 person.wait_for(pressed=False)
             elif "hold it steady" in asked:
                 assert "Put 4 N" in asked
