@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
@@ -98,7 +98,10 @@ def _section(run: Run, name: str, rows: Sequence[Row], prefix: str) -> Section |
             "sweep's numbers into the sine as they are, so that they are rad/s. The reading makes "
             "a factor of 2π.",
         ],
-        tables=[_worst_table(grids, prefix), *(_grid_table(grid, prefix) for grid in grids)],
+        tables=[
+            _worst_table(grids, prefix),
+            *(table for grid in grids for table in _grid_tables(grid, prefix)),
+        ],
         pictures=_pictures(grids, prefix),
     )
 
@@ -151,7 +154,12 @@ def _finding(grid: Grid) -> str:
         verdict = "neither claim holds here"
     paper = PAPER_SWEEP.worst_success[grid.key[0]]
     least = f"The least success of a setting is {whole(worst)} % (paper {whole(paper)} %)."
-    return f"{text}{verdict}. {least} {_where(grid)}"
+    better = [int((grid.ratio[metric] < 1).sum()) for metric in METRICS]
+    count = (
+        f"Of {int(np.isfinite(grid.success).sum())} settings {better[0]} leave less distance than "
+        f"straight and {better[1]} take less time."
+    )
+    return f"{text}{verdict}. {count} {least} {_where(grid)}"
 
 
 def _where(grid: Grid) -> str:
@@ -208,21 +216,35 @@ def _setting(grid: Grid, row: int, column: int) -> str:
     return f"t_excv {SWEEP_TIMES[row]:g} s, t_trig {SWEEP_TIMES[column]:g} s"
 
 
-def _grid_table(grid: Grid, prefix: str) -> TableData:
+def _grid_tables(grid: Grid, prefix: str) -> list[TableData]:
+    """Success, and the ratios of each cell as they are, unsmoothed."""
     burrow = grid.key[0] == "burrow"
     across = SWEEP_FREQUENCIES if burrow else SWEEP_TIMES
     down = SWEEP_AMPLITUDES if burrow else SWEEP_TIMES
     corner = "A_bur \\ f_bur" if burrow else "t_excv \\ t_trig, s"
-    body = [
-        [f"{value:g}", *(whole(float(v)) for v in row)]
-        for value, row in zip(down, grid.success, strict=True)
+    shown: list[tuple[str, str, Float, Callable[[float], str]]] = [
+        ("success", "Success in %", grid.success, whole),
+        *(
+            (metric, f"Mean {metric} over that of straight", grid.ratio[metric], _two_places)
+            for metric in METRICS
+        ),
     ]
-    return TableData(
-        f"Success in %: {NAMES[grid.key]}",
-        [corner, *(f"{value:g}" for value in across)],
-        body,
-        name=prefix + "success-" + slug(NAMES[grid.key]),
-    )
+    return [
+        TableData(
+            f"{caption}: {NAMES[grid.key]}",
+            [corner, *(f"{value:g}" for value in across)],
+            [
+                [f"{value:g}", *(text(float(v)) for v in row)]
+                for value, row in zip(down, values, strict=True)
+            ],
+            name=f"{prefix}{what}-{slug(NAMES[grid.key])}",
+        )
+        for what, caption, values, text in shown
+    ]
+
+
+def _two_places(value: float) -> str:
+    return "–" if np.isnan(value) else f"{value:.2f}"
 
 
 def _pictures(grids: Sequence[Grid], prefix: str) -> list[Picture]:
