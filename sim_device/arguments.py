@@ -16,11 +16,6 @@ if TYPE_CHECKING:
 
 Handler = Callable[[argparse.Namespace], int]
 
-DEFAULT_RECORDED = Path(__file__).resolve().parents[1] / (
-    "../shared/data/authors_scenes/scenes_1_60.json.gz"
-)
-"""Where the recorded scenes lie beside a checkout."""
-
 ARM_HELP = """\
 faults of the arm, parted by commas: silent, frozen, stale, biased, refuses_limits, fault, estop;
 each from the start, @Ts or @Ts+Ds (T s after the start, for D s), such as silent@5s+1s,estop@8s.
@@ -138,19 +133,17 @@ def _add_cupboard(commands: Commands) -> argparse.ArgumentParser:
     add = cupboard.add_argument_group("world").add_argument
     add(
         "--scene", default="authors_sim", metavar="SCENE",
-        help="authors_sim, hardware, FILE.json or recorded:N (default authors_sim)",
+        help="authors_sim, hardware, authors_sim_recorded, recorded:FILE.json.gz, or FILE.json "
+        "(default authors_sim)",
     )  # fmt: skip
     add(
         "--seed", type=_whole, default=0, metavar="N",
-        help="of scene, boards and noise (default 0); board number k has N + k",
+        help="of scene (its number, of recorded ones), boards and noise (default 0); board number "
+        "k has N + k",
     )  # fmt: skip
     add(
         "--engine", choices=ENGINES, default=ENGINES[0],
         help=f"physics engine (default {ENGINES[0]})",
-    )  # fmt: skip
-    add(
-        "--recorded", type=Path, default=DEFAULT_RECORDED, metavar="FILE.json.gz",
-        help="file of the recorded scenes (default: in ../shared beside the checkout)",
     )  # fmt: skip
     add(
         "--world", default="world", metavar="WORLD",

@@ -91,14 +91,14 @@ def _request(arguments: argparse.Namespace) -> BoardsRequest:
 
 
 def _cupboard(arguments: argparse.Namespace) -> int:
-    from sim_device.cupboard_plan import goal_text, plan_cupboard
+    from sim_device.cupboard_plan import goal_text, plan_cupboard, scene_of
     from sim_device.world.base import WorldError
     from sim_device.world.engines import EngineMissing
 
     try:
         request = _cupboard_request(arguments)
         if arguments.print_goal:
-            print(goal_text(request.source.load(request.seed)))
+            print(goal_text(scene_of(request)))
             return OK
         planned = plan_cupboard(request)
     except (EngineMissing, WorldError) as error:
@@ -116,12 +116,11 @@ def _cupboard(arguments: argparse.Namespace) -> int:
 def _cupboard_request(arguments: argparse.Namespace) -> CupboardRequest:
     from sim_device.arm_options import arm_settings, parse_arm_faults
     from sim_device.cupboard_plan import CupboardRequest
-    from sim_device.cupboard_scene import SceneSource
     from sim_device.stations import BoardsRequest
     from tactile_bus.options import BusTable, bus_config
 
     return CupboardRequest(
-        source=SceneSource(arguments.scene, arguments.recorded),
+        scene=arguments.scene,
         seed=arguments.seed,
         engine=arguments.engine,
         arm=arguments.arm,

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from sim_device.arm_server import ArmServer
 from sim_device.cupboard import Cupboard, ScheduledFault
-from sim_device.cupboard_scene import SceneSource
 from sim_device.stations import BoardsRequest, Planned, plan_boards
 from sim_device.world.arm import ArmSettings
 from sim_device.world.engines import world_maker
-from sim_device.world.scenes import Scene
+from sim_device.world.scenes import Scene, SceneError
+from sim_device.world.sources import load_scene
 from tactile_bus.session import BusConfig
 from tactile_bus.topics import NAME
 
@@ -21,7 +22,7 @@ from tactile_bus.topics import NAME
 class CupboardRequest:
     """What `simdevice cupboard` was asked for; units as in its help."""
 
-    source: SceneSource
+    scene: str
     seed: int
     engine: str
     arm: str
@@ -30,6 +31,21 @@ class CupboardRequest:
     arm_faults: tuple[ScheduledFault, ...]
     boards: BoardsRequest
     bus: BusConfig
+
+
+def scene_of(request: CupboardRequest) -> Scene:
+    """The scene asked for; SceneError or ValueError where it cannot be had."""
+    try:
+        return load_scene(request.scene, request.seed)
+    except RuntimeError as error:
+        raise SceneError(f"{request.scene}: {error}; take another seed") from error
+
+
+def _another(request: CupboardRequest, seed: int) -> Scene:
+    """Scene ``seed`` of those asked for; SceneError or ValueError where there is none."""
+    if request.scene.endswith(".json"):
+        raise SceneError(f"{request.scene} is one scene: leave the seed out to begin it again")
+    return scene_of(replace(request, seed=seed))
 
 
 def plan_cupboard(request: CupboardRequest) -> list[Planned]:
@@ -41,7 +57,7 @@ def plan_cupboard(request: CupboardRequest) -> list[Planned]:
         if not NAME.fullmatch(name):
             raise ValueError(f"{name!r} is no name; allowed: letters, digits, _ and -, at most 64")
     make_world = world_maker(request.engine)
-    scene = request.source.load(request.seed)
+    scene = scene_of(request)
     cupboard = Cupboard(
         make_world(scene),
         request.settings,
@@ -49,7 +65,7 @@ def plan_cupboard(request: CupboardRequest) -> list[Planned]:
         np.random.default_rng([request.seed, 2]),
     )
     server = ArmServer(
-        cupboard, request.arm, request.world, request.bus, request.source.reseeded, make_world
+        cupboard, request.arm, request.world, request.bus, partial(_another, request), make_world
     )
     boards: list[Planned] = []
     if request.boards.ptys or request.boards.slcans:  # an arm without touch is an arm, too

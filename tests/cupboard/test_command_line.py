@@ -13,11 +13,14 @@ from reachd.parameters import SETS
 from sim_device.cli import main
 
 BAD = [
-    (["--scene", "attic"], "allowed: authors_sim, hardware, FILE.json, or recorded:N"),
+    (
+        ["--scene", "attic"],
+        "authors_sim_recorded, recorded:FILE.json.gz, FILE.json",
+    ),
     (["--scene", "none.json"], "none.json: cannot be read (No such file or directory)"),
     (["--scene", "bad.json"], "bad.json: no JSON"),
     (["--scene", "wrong.json"], "wrong.json: scene format is None; this version reads 1"),
-    (["--scene", "recorded:1", "--recorded", "none.gz"], "cannot read none.gz"),
+    (["--scene", "recorded:none.gz"], "cannot read none.gz"),
     (["--seed", "-1"], "allowed: a whole number from 0"),
     (["--engine", "bullet"], "bullet"),
     (["--arm", "a/b"], "'a/b' is no name"),
@@ -94,7 +97,11 @@ def test_recorded_scenes_are_found_by_their_number(capsys: pytest.CaptureFixture
     folder = Path(__file__).parents[3] / "shared/data/authors_scenes"
     if not folder.is_dir():
         pytest.skip("the recorded scenes are not here (../shared/data/authors_scenes)")
-    assert main(["cupboard", "--scene", "recorded:7", "--print-goal"]) == 0
-    assert capsys.readouterr().out.startswith("0.3580,")
-    assert main(["cupboard", "--scene", "recorded:99", "--print-goal"]) == 2
-    assert "scenes_1_60.json.gz has 1 to 60" in capsys.readouterr().err
+    goals = []
+    for name in ("authors_sim_recorded", f"recorded:{folder}/scenes_1_60.json.gz"):
+        assert main(["cupboard", "--scene", name, "--seed", "7", "--print-goal"]) == 0
+        goals.append(capsys.readouterr().out)
+        assert main(["cupboard", "--scene", name, "--seed", "99", "--print-goal"]) == 2
+        assert "scenes_1_60.json.gz has 1 to 60" in capsys.readouterr().err
+    assert goals[0] == goals[1]
+    assert goals[0].startswith("0.3580,")

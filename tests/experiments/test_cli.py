@@ -44,7 +44,7 @@ def test_names_in_the_arguments_are_those_there_are() -> None:
         (("strategies", "--seed", "-1"), "seeds are 0 or above"),
         (("strategies", "--set", "kitchen"), "unknown parameter set 'kitchen'; there are:"),
         (("strategies", "--strategies", "teleport"), "unknown strategy 'teleport'; there are:"),
-        (("strategies", "--source", "attic"), "no scene generator 'attic'"),
+        (("strategies", "--source", "attic"), "no scenes are called 'attic'"),
         (("strategies", "--source", "recorded:none.gz"), "cannot read none.gz"),
         (("strategies", "--param", "time_limit"), "'time_limit' is not NAME=VALUE"),
         (("strategies", "--param", "time_limt=3"), "did you mean 'time_limit'?"),

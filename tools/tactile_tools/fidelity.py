@@ -20,6 +20,7 @@ from reachd.parameters import parameters
 from sim_device.world.engines import ENGINES, make_world
 from sim_device.world.recorded import load_outcomes, load_recorded
 from sim_device.world.scenes import Pose, Scene, SceneError
+from sim_device.world.sources import RECORDED_FILE, RECORDED_OUTCOMES
 from tactile_tools.lockstep import run_trial
 
 STRATEGIES = ("straight", "burrow", "excavate", "hybrid_clock", "hybrid_event")
@@ -65,13 +66,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--scenes",
         type=Path,
-        default=Path("../shared/data/authors_scenes/scenes_1_60.json.gz"),
+        default=RECORDED_FILE,
         help="recorded scenes (default %(default)s)",
     )
     parser.add_argument(
         "--outcomes",
         type=Path,
-        default=Path("../shared/data/authors_scenes/outcomes_1_60.csv"),
+        default=RECORDED_OUTCOMES,
         help="what the reference did there (default %(default)s)",
     )
     parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])

@@ -35,7 +35,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--scene",
         default="authors_sim",
-        help="authors_sim, hardware, recorded:FILE.json.gz (scene --seed of it), or FILE.json",
+        help="authors_sim, hardware, authors_sim_recorded or recorded:FILE.json.gz (scene --seed "
+        "of it), or FILE.json",
     )
     parser.add_argument("--set", help="parameter set (default: that of the scene)")
     parser.add_argument(
@@ -102,9 +103,9 @@ def _run(options: argparse.Namespace) -> int:
     from reachd.parameters import parameters as parameter_set
     from reachd.strategies import load_strategy
     from sim_device.world.engines import make_world
+    from sim_device.world.sources import load_scene
     from tactile_tools.lockstep import PERIOD, run_trial
     from tactile_tools.trial_log import TrialLog
-    from tactile_tools.worlds import load_scene
 
     if ":" in options.strategy and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # one of the user's own may lie here

@@ -133,7 +133,9 @@ def _trial(words: Words[argparse.ArgumentParser]) -> None:
     parser.add_argument("--trial-seed", type=int, help="(default: --scene-seed)")
     parser.add_argument("--strategy", default="hybrid_event", help="name or module:Class")
     parser.add_argument("--set", default="authors_sim")
-    parser.add_argument("--source", help="scenes (default: those of --set), or recorded:FILE")
+    parser.add_argument(
+        "--source", help="scenes (default: those of --set): authors_sim_recorded, recorded:FILE"
+    )
     parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
     parser.add_argument("--depth", choices=("contacts", "taxels"), default="contacts")
     _param_option(parser)
@@ -178,7 +180,9 @@ def _study_options(parser: argparse.ArgumentParser, *, scenes: int) -> None:
         help="what is felt: the engine's contacts (default), or the whole chain of taxels",
     )
     parser.add_argument(
-        "--source", help="scenes of another generator, or recorded:FILE (default: the set's)"
+        "--source",
+        help="scenes of another generator, authors_sim_recorded or recorded:FILE "
+        "(default: the set's)",
     )
     _param_option(parser)
     where = parser.add_mutually_exclusive_group()

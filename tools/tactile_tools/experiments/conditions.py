@@ -12,10 +12,10 @@ from sim_device.world.engines import make_world
 from sim_device.world.generate import GENERATORS, generate
 from sim_device.world.parameters import Friction, WorldParameters, world_parameters
 from sim_device.world.scenes import Scene
+from sim_device.world.sources import load_scene
 from tactile_tools.experiments.senses import DegradedContacts, DegradedTaxels
 from tactile_tools.experiments.spec import Conditions, TrialSpec
 from tactile_tools.touch_senses import Sense
-from tactile_tools.worlds import load_scene
 
 CACHED_SCENES = 8
 """Scenes kept by a worker: trials come scene by scene, and a few scenes may be under way at once
