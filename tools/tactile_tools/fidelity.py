@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import multiprocessing
 import sys
 from collections.abc import Sequence
@@ -77,7 +78,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
     parser.add_argument("--depth", choices=("contacts", "taxels"), default="contacts")
-    parser.add_argument("--repeats", type=int, default=2, help="perturbed runs (default 2)")
+    parser.add_argument(
+        "--repeats", type=int, default=2, help="perturbed runs (default 2; 0: no ceiling)"
+    )
     parser.add_argument("--most", type=int, help="scenes to use (default all)")
     parser.add_argument("--jobs", type=int, default=multiprocessing.cpu_count())
     parser.add_argument("--json", type=Path, metavar="FILE")
@@ -93,8 +96,8 @@ def run(options: argparse.Namespace) -> int:
     except (SceneError, OSError) as error:
         print(f"tactile fidelity: {error}", file=sys.stderr)
         return 3
-    if options.repeats < 1 or options.jobs < 1:
-        print("tactile fidelity: --repeats and --jobs are at least 1", file=sys.stderr)
+    if options.repeats < 0 or options.jobs < 1:
+        print("tactile fidelity: --repeats is at least 0, --jobs at least 1", file=sys.stderr)
         return 2
     reference = {(o.seed, REFERENCE_NAMES.get(o.strategy, o.strategy)): o for o in outcomes}
     tasks = [
@@ -179,7 +182,7 @@ def summarise(trials: Sequence[Trial], reference: dict[int, bool]) -> dict[str, 
         "success_all_repeats": float(np.mean([t.success for t in trials])),
         "reference_success": float(np.mean(of_reference)) if of_reference else float("nan"),
         "agreement": float(np.mean(same)) if same else float("nan"),
-        "own_agreement": float(np.mean(own)),
+        "own_agreement": float(np.mean(own)) if own else float("nan"),
         "ejected": float(np.mean([t.ejected for t in trials])),
     }
 
@@ -198,6 +201,6 @@ def _table(summary: dict[str, dict[str, float]], scenes: int) -> Table:
             f"{low:.0%}–{high:.0%}",
             f"{row['entered']:.0%}",
             f"{row['agreement']:.0%}",
-            f"{row['own_agreement']:.0%}",
+            "–" if math.isnan(row["own_agreement"]) else f"{row['own_agreement']:.0%}",
         )
     return table
