@@ -30,4 +30,4 @@ def test_a_scene_is_compared_outcome_by_outcome(
     assert {t["strategy"] for t in written["trials"]} == set(written["summary"])
     for one in written["summary"].values():
         assert 0.0 <= one["agreement"] <= 1.0
-    assert main([*words, "--repeats", "0"]) == 2
+    assert main([*words, "--repeats", "-1"]) == 2

@@ -125,7 +125,11 @@ def run(options: argparse.Namespace) -> int:
             "depth": options.depth,
             "scenes": len(scenes),
             "perturbation_m": PERTURBATION_M,
-            "summary": summary,
+            # What was not measured is left out: JSON has no NaN.
+            "summary": {
+                name: {key: value for key, value in row.items() if not math.isnan(value)}
+                for name, row in summary.items()
+            },
             "trials": [asdict(t) for t in trials],
         }
         options.json.write_text(json.dumps(report) + "\n", encoding="utf-8")
