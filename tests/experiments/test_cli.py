@@ -163,6 +163,8 @@ def test_ctrl_c_keeps_what_is_finished(command: Command, tmp_path: Path) -> None
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        # A shell gives its background jobs an ignored SIGINT, and so would the tests be.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     deadline = time.monotonic() + 90
     journal = folder / "trials.jsonl"
