@@ -33,6 +33,10 @@ ON_THE_WAY = 0.003
 """s from a cycle's deadline to the arm: what the loop is late and what the bus takes. An input is
 too old by so much and a period before its age is reached, so that zero is there in time."""
 
+FEATURES_ON_THE_WAY = 0.008
+"""s, likewise of features, whose age leaves room for more: on a busy machine 3 ms were not enough
+in one of forty kills."""
+
 CONFIRMED_WITHIN = 1e-3
 """Part by which a limit read back may differ from the one sent: arms round theirs. A lower one is
 refused too, for the arm would clip what the strategy wants without a word."""
@@ -246,7 +250,7 @@ class SafetyGate:
                 oldest = min(touch.captured, touch.received)
                 self._felt = oldest if self._felt is None else max(self._felt, oldest)
         age = math.inf if self._felt is None else seconds_between(self._felt, now)
-        if age <= s.features_age - s.period - ON_THE_WAY:
+        if age <= s.features_age - s.period - FEATURES_ON_THE_WAY:
             return
         text = f"no valid features for {age:.3f} s"
         if age > s.features_latch and self._on(Check.FEATURES_LOST):

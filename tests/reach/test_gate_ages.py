@@ -23,9 +23,9 @@ T0 = Instant(5_000_000_000)
 FEATURE_AGES = [
     (1 * MS, True),
     (100 * MS, True),
-    (187 * MS - 1, True),
-    (187 * MS, True),
-    (187 * MS + 1, False),
+    (182 * MS - 1, True),
+    (182 * MS, True),
+    (182 * MS + 1, False),
     (200 * MS, False),
     (990 * MS, False),
 ]
@@ -35,7 +35,7 @@ FEATURE_AGES = [
 def test_motion_ends_before_features_are_200_ms_old(
     age: int, moves: bool, rig: Callable, passes: Callable
 ) -> None:
-    """A period and 3 ms early: the next command would otherwise still move beyond 200 ms."""
+    """A period and 8 ms early: the next command would otherwise still move beyond 200 ms."""
     r = rig()
     decision = aged(r, r.fresh_touch(), age)
     assert passes(decision) == moves
