@@ -32,10 +32,7 @@ Effect = Literal["ignored", "limited", "stopped", "latched", "refused"]
 ON_THE_WAY = 0.003
 """s from a cycle's deadline to the arm: what the loop is late and what the bus takes. An input is
 too old by so much and a period before its age is reached, so that zero is there in time."""
-
-FEATURES_ON_THE_WAY = 0.008
-"""s, likewise of features, whose age leaves room for more: on a busy machine 3 ms were not enough
-in one of forty kills."""
+FEATURES_ON_THE_WAY = 0.008  # on a busy machine 3 ms were not enough in one of forty kills
 
 CONFIRMED_WITHIN = 1e-3
 """Part by which a limit read back may differ from the one sent: arms round theirs. A lower one is
