@@ -274,9 +274,7 @@ def test_an_arm_that_is_not_fit_is_not_armed(lab: Any, trouble: str) -> None:
     assert all(h.still for h in arm.heard)
 
 
-def test_a_strategy_that_fails_or_hangs_ends_in_standing_still(
-    lab: Any, wait_until: Until
-) -> None:
+def test_a_strategy_that_fails_or_hangs_ends_in_standing_still(lab: Any, wait_until: Until) -> None:
     """Row 18, and a strategy that never returns."""
     (lab.folder / "own.py").write_text(
         "import time\n"
