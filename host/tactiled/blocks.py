@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import IntFlag
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +74,17 @@ class Ambient:
     valid: NDArray[np.bool_]
 
 
+class Reason(NamedTuple):
+    """Why features are degraded or not valid.
+
+    ``code``: stable word for programs, with ``:name`` of the array where it concerns one. ``text``:
+    for people, with the remedy.
+    """
+
+    code: str
+    text: str
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Patch:
     """Neighbouring taxels in contact; see ``ContactPatch.msg``. Vectors (3,) in ``ee``."""
@@ -89,11 +102,12 @@ class Patch:
 class Features:
     """Contact features; see ``ContactFeatures.msg``. Positions (3,) m and forces (3,) N in ``ee``.
 
-    ``wrench``: (6,) fx, fy, fz in N, mx, my, mz in N·m about the origin of ``ee``.
+    ``wrench``: (6,) fx, fy, fz in N, mx, my, mz in N·m about the origin of ``ee``. The bounds, N,
+    hold the true value in 95 % of cycles.
     """
 
     valid: bool
-    reasons: tuple[str, ...]
+    reasons: tuple[Reason, ...]
     peak_force: float
     peak_side: Side
     peak_position: Float
@@ -104,6 +118,14 @@ class Features:
     taxels_in_contact: int
     taxels_masked: int
     patches: tuple[Patch, ...] = field(default=())
+    peak_force_bound: float = math.inf
+    normal_force_bound: float = math.inf
+    tip_force_bound: float = math.inf
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """Codes of the reasons."""
+        return tuple(reason.code for reason in self.reasons)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,9 +133,10 @@ class Cycle:
     """Everything known of one sampling cycle of a board, all N taxels one array after another.
 
     ``force``: (N, 3) N in taxel axes, NaN where the taxel is not healthy. ``field_ut``: (N, 3) µT
-    in taxel axes after rest field and temperature, before compensation; NaN likewise. ``health``:
-    (N,) uint8 of `TaxelHealth`. ``features_due``: by the feature rate, these features are to be
-    sent; they are computed in every cycle.
+    in taxel axes after rest field and temperature, before compensation; NaN likewise.
+    ``normal_bound``: (N,) N that hold the true normal force in 95 % of cycles; NaN likewise.
+    ``health``: (N,) uint8 of `TaxelHealth`. ``features_due``: by the feature
+    rate, these features are to be sent; they are computed in every cycle.
     """
 
     sequence: int
@@ -123,6 +146,7 @@ class Cycle:
     temperature_c: Float
     field_ut: Float
     force: Float
+    normal_bound: Float
     health: NDArray[np.uint8]
     ambient: Ambient
     features: Features

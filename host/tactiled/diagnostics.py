@@ -68,8 +68,11 @@ def summary(port: Port, node: int, station: Station, now: Instant) -> dict[str, 
             "field_residual_ut": [_finite(v) for v in ambient.residual_ut.tolist()],
             "field_valid": [bool(v) for v in ambient.valid],
             "features_valid": features.valid,
-            "reasons": list(features.reasons),
+            "reasons": [reason.text for reason in features.reasons],
+            "reason_codes": [reason.code for reason in features.reasons],
             "peak_force_n": _finite(features.peak_force),
+            "normal_force_n": _finite(features.normal_force),
+            "normal_force_bound_n": _finite(features.normal_force_bound),
             "unhealthy_taxels": health(cycle.health),
         }
     return values

@@ -37,7 +37,8 @@ class MessageMaker:
             uncertainty=cycle.uncertainty,
             sequence=cycle.sequence,
             valid=f.valid,
-            reasons=list(f.reasons),
+            reasons=[reason.text for reason in f.reasons],
+            reason_codes=[reason.code for reason in f.reasons],
             calibrated=cycle.calibrated,
             peak_force=f.peak_force,
             peak_side=int(f.peak_side),
@@ -49,6 +50,9 @@ class MessageMaker:
             taxels_in_contact=f.taxels_in_contact,
             taxels_masked=f.taxels_masked,
             patches=[_patch(p) for p in f.patches],
+            peak_force_bound=f.peak_force_bound,
+            normal_force_bound=f.normal_force_bound,
+            tip_force_bound=f.tip_force_bound,
         )
 
     def forces(self, cycle: Cycle) -> Any:
@@ -62,6 +66,7 @@ class MessageMaker:
             sequence=cycle.sequence,
             array_taxels=self._array_taxels,
             force=_flat(cycle.force),
+            normal_bound=_flat(cycle.normal_bound),
             status=cycle.health,
             compensated=ambient.method != "off" and bool(ambient.valid.all()),
             calibrated=cycle.calibrated,

@@ -85,7 +85,7 @@ def describe(station: Station) -> dict[str, str]:
             residual = float(np.nanmax(ambient.residual_ut)) if ambient.residual_ut.size else 0.0
             cells["field"] = f"{good} {worst:.0%} ±{residual:.1f} µT"
         cells["force"] = force_text(station)
-        cells["because"] = ", ".join(cycle.features.reasons)
+        cells["because"] = ", ".join(reason.text for reason in cycle.features.reasons)
     return cells
 
 

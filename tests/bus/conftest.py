@@ -38,10 +38,11 @@ def example_messages() -> dict[topics.Topic, Any]:
             head, 11, 12, 0.5, 7, True, ["tare", "few taxels"], True, 1.5, 2, point, 3.5,
             MSG.Wrench(vector, vector), 0.75, 0.25, 3, 4,
             [MSG.ContactPatch(1, 2, 3, 1.5, 0.5, vector, point)],
+            ["taring", "few:tip"], 0.5, 0.25, 0.125,
         ),
         topics.FORCES: MSG.TaxelForces(
             head, 11, 12, 0.5, 7, np.array([2, 1], u16), np.arange(9, dtype=f32),
-            np.array([0, 1, 32], u8), True, False,
+            np.array([0, 1, 32], u8), True, False, np.array([0.5, 0.25, 1.0], f32),
         ),
         topics.FIELD: MSG.TaxelField(
             head, 11, 12, 7, np.array([1], u16), np.array([1, 2, 3], f32), np.array([25.5], f32)

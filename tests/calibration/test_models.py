@@ -233,6 +233,6 @@ def test_forces_pause_and_say_so_while_a_taxel_is_blind(make_recording):
             0, i, now, now, 1e-3, recording.field_ut[i].reshape(5, 3), np.array([25.0]), status
         )
         for cycle in line.feed(block):
-            reasons |= set(cycle.features.reasons)
+            reasons |= set(cycle.features.codes)
             assert np.isnan(cycle.force[4]).all() == (i == 3)
-    assert any("fitted model paused" in reason for reason in reasons)
+    assert "model_paused" in reasons

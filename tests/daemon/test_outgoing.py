@@ -17,6 +17,7 @@ from tactile_bus.messages import MAX_PAYLOAD, codec, stamp_ns
 from tactile_bus.topics import AMBIENT, FEATURES, FIELD, FORCES, GEOMETRY, RAW
 from tactiled.blocks import Ambient, Chunk, Cycle, Features, Patch
 from tactiled.outgoing import MessageMaker, split
+from tactiled.sensing.reasons import array_missing
 from tactiled.transports.raw_chunk import from_raw, to_raw
 
 WALL = WallClock(offset_ns=10**18)
@@ -32,7 +33,7 @@ def cycle(instant: Callable[[float], Instant]) -> Cycle:
     n = 80
     features = Features(
         valid=False,
-        reasons=("array tip missing",),
+        reasons=(array_missing("tip"),),
         peak_force=2.5,
         peak_side=Side.RIGHT,
         peak_position=np.array([0.1, -0.02, 0.03]),
@@ -47,6 +48,9 @@ def cycle(instant: Callable[[float], Instant]) -> Cycle:
                 1, Side.RIGHT, 3, 4.0, 2.5, np.array([0.0, -4.0, 0.0]), np.array([0.1, 0.0, 0.0])
             ),
         ),
+        peak_force_bound=0.5,
+        normal_force_bound=0.75,
+        tip_force_bound=0.25,
     )
     return Cycle(
         sequence=42,
@@ -56,6 +60,7 @@ def cycle(instant: Callable[[float], Instant]) -> Cycle:
         temperature_c=np.array([25.0, 26.0, 27.0]),
         field_ut=np.arange(3.0 * n).reshape(n, 3),
         force=np.full((n, 3), np.nan),
+        normal_bound=np.full(n, 0.25),
         health=np.full(n, 32, np.uint8),
         ambient=Ambient(
             "consensus",
@@ -85,7 +90,13 @@ def test_features(calibration: BoardCalibration, cycle: Cycle) -> None:
         42,
     )
     assert not seen.valid
-    assert seen.reasons == ["array tip missing"]
+    assert seen.reasons == ["array tip missing: check its cable"]
+    assert seen.reason_codes == ["array_missing:tip"]
+    assert (seen.peak_force_bound, seen.normal_force_bound, seen.tip_force_bound) == (
+        0.5,
+        0.75,
+        0.25,
+    )
     assert seen.peak_side == 2
     assert seen.peak_position.y == pytest.approx(-0.02)
     assert (seen.wrench.force.z, seen.wrench.torque.x) == (2.0, 3.0)

@@ -107,6 +107,7 @@ def features(at: int, number: int) -> bytes:
         header(at, "ee"), at, at + 500_000, 0.001, number, number % 10 != 0,
         ["taring"] if number % 10 == 0 else [], True, float(np.float32(number / 7)), 1, point, 1.5,
         MSG.Wrench(zero, zero), 0.0, 0.0, 2, 0, [patch] * (number % 3),
+        ["taring"] if number % 10 == 0 else [], 0.1, 0.1, 0.1,
     )  # fmt: skip
     return codec().encode(topics.FEATURES, message)
 

@@ -118,7 +118,7 @@ def test_lists_of_numbers_are_columns_lists_or_matrices(log_tool: Any, tmp_path:
         force[4] = np.nan if i == 1 else force[4]
         message = MSG.TaxelForces(
             header(i, "ee"), i, i, 0.0, i, np.array([3], np.uint16), force[: 9 - 3 * (i == 2)],
-            np.zeros(3, np.uint8), True, True,
+            np.zeros(3, np.uint8), True, True, np.zeros(3, np.float32),
         )  # fmt: skip
         data = codec().encode(topics.FORCES, message)
         recorder.write(topics.FORCES, "b", data, 10**18 + i, 10**18 + i)

@@ -43,6 +43,10 @@ def main(endpoint: str, board: str, ahead: float, prefix: str) -> None:
             taxels_in_contact=0,
             taxels_masked=0,
             patches=[],
+            reason_codes=[],
+            peak_force_bound=0.1,
+            normal_force_bound=0.1,
+            tip_force_bound=0.1,
         )
         publisher.put(codec().encode(FEATURES, message), wall.wall_ns(now))
         time.sleep(0.01)

@@ -338,5 +338,5 @@ def _none() -> Any:
     zero = MSG.Vector3(0.0, 0.0, 0.0)
     return MSG.ContactFeatures(
         header(0, "ee"), 0, 0, 0.0, 1, True, [], True, 9.0, 1, MSG.Point(0.0, 0.0, 0.0), 9.0,
-        MSG.Wrench(zero, zero), 0.0, 0.0, 1, 0, [],
+        MSG.Wrench(zero, zero), 0.0, 0.0, 1, 0, [], [], 0.1, 0.1, 0.1,
     )  # fmt: skip

@@ -35,6 +35,8 @@ def features(captured: int, **changes: Any) -> Any:
         "peak_force": 2.5, "peak_side": 1, "peak_position": MSG.Point(0.1, 0.028, 0.0),
         "normal_force": 4.0, "wrench": MSG.Wrench(zero, zero), "tip_force": 0.5,
         "tip_contact_time": 0.0, "taxels_in_contact": 2, "taxels_masked": 0, "patches": [],
+        "reason_codes": [], "peak_force_bound": 0.1, "normal_force_bound": 0.1,
+        "tip_force_bound": 0.1,
     }  # fmt: skip
     return MSG.ContactFeatures(**(values | changes))
 

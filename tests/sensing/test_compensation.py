@@ -83,7 +83,7 @@ def test_a_covered_array_is_marked_in_the_same_cycle_and_follows_the_others(scen
     s.go(cycles=5)
     cycle = s.go(pressed=LEFT)
     assert cycle.ambient.valid.tolist() == [False, True, True]
-    assert cycle.features.reasons == ("compensation borrowed: left",)
+    assert cycle.features.codes == ("compensation_borrowed:left",)
     assert cycle.features.valid
     assert cycle.ambient.age[0] == pytest.approx(0.01)
     # the board turns while the array is covered: its forces stay right
@@ -104,15 +104,15 @@ def test_a_covered_board_holds_the_last_plane_says_so_and_gives_up_in_time(scene
     cycle = s.go(pressed=EVERY)
     assert not cycle.ambient.valid.any()
     assert cycle.features.valid
-    assert cycle.features.reasons == tuple(
-        f"compensation held: {name}" for name in ("left", "right", "tip")
+    assert cycle.features.codes == tuple(
+        f"compensation_held:{name}" for name in ("left", "right", "tip")
     )
     np.testing.assert_array_equal(cycle.ambient.plane, before)
     cycle = s.go(pressed=EVERY, cycles=49)
     assert cycle.features.valid
     cycle = s.go(pressed=EVERY)
     assert not cycle.features.valid
-    assert cycle.features.reasons[0] == "compensation invalid: left"
+    assert cycle.features.codes[0] == "compensation_invalid:left"
     assert (cycle.ambient.age > 0.5).all()
     assert s.go().features.valid
 
@@ -138,7 +138,7 @@ def test_five_taxels_hold_through_any_contact(lone):
     cycle = s.go(pressed=range(5), cycles=1000)
     assert not cycle.ambient.valid.any()
     assert cycle.features.valid
-    assert cycle.features.reasons == ("compensation held: skin",)
+    assert cycle.features.codes == ("compensation_held:skin",)
     np.testing.assert_allclose(cycle.force, s.force, atol=0.25)
 
 
@@ -191,7 +191,7 @@ def test_ransac_marks_a_plane_that_is_no_longer_borne_out(scene):
     s.go(cycles=2)
     cycle = s.go(pressed=LEFT)
     assert cycle.ambient.valid.tolist() == [False, True, True]
-    assert cycle.features.reasons == ("compensation held: left",)
+    assert cycle.features.codes == ("compensation_held:left",)
 
 
 def test_a_reset_forgets_the_planes(scene):

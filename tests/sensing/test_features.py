@@ -232,7 +232,7 @@ def test_the_tips_time_survives_a_lost_tip_block_in_the_pipeline(board, stream, 
         flow.one(field + rng.normal(0, 3, (48, 3)))
     flow.cycle(field, without=(2,))
     lost, whole = flow.cycle(field + rng.normal(0, 3, (48, 3)))
-    assert "array tip missing" in lost.features.reasons
+    assert "array_missing:tip" in lost.features.codes
     assert whole.features.tip_contact_time == pytest.approx(0.11)
 
 

@@ -42,7 +42,7 @@ def test_the_next_sequence_ends_an_incomplete_cycle(flow):
     assert (incomplete.health[:16] == 0).all()
     assert np.isnan(incomplete.force[16:32]).all()
     assert not incomplete.features.valid
-    assert "array right missing" in incomplete.features.reasons
+    assert "array_missing:right" in incomplete.features.codes
     assert whole.features.valid
     counters = flow.pipeline.counters
     assert (counters.cycles, counters.incomplete_cycles, counters.missing_blocks) == (2, 1, 1)

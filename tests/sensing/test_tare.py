@@ -41,7 +41,7 @@ def test_a_nominal_board_is_tared_at_the_start(unknown):
     first = bench.go()
     assert bench.pipeline.taring
     assert not first.features.valid
-    assert first.features.reasons == ("taring",)
+    assert first.features.codes == ("taring",)
     assert np.isnan(first.force).all()  # rest fields of 3 mT are not forces of 30 N
     assert not first.ambient.valid.any()
     bench.go(50)
@@ -71,7 +71,7 @@ def test_a_skin_that_moves_at_the_start_waits_then_gets_a_rough_rest(unknown):
     assert "rough" in report.message
     cycle = bench.go()
     assert not cycle.features.valid
-    assert cycle.features.reasons[0] == "rest field uncertain: tare"
+    assert cycle.features.codes[0] == "rest_uncertain"
     assert np.isfinite(cycle.force).all()
     bench.pipeline.tare()
     bench.go(51)

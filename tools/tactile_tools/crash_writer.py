@@ -65,16 +65,19 @@ def run(directory: Path, truth: Path, seed: int, seconds: float) -> None:
         head = header(now_ns, "ee")
         forces = rng.normal(0, 1, 3 * TAXELS).astype(np.float32)
         status = np.zeros(TAXELS, np.uint8)
+        bounds = np.full(TAXELS, 0.1, np.float32)
         taxels = np.array([TAXELS], np.uint16)
         hand_over(
             FORCES,
-            MSG.TaxelForces(head, now_ns, now_ns, 1e-4, cycle, taxels, forces, status, True, True),
+            MSG.TaxelForces(
+                head, now_ns, now_ns, 1e-4, cycle, taxels, forces, status, True, True, bounds
+            ),
             now_ns,
         )
         zero, origin = MSG.Vector3(0.0, 0.0, 0.0), MSG.Point(0.0, 0.0, 0.0)
         features = MSG.ContactFeatures(
             head, now_ns, now_ns, 1e-4, cycle, True, [], True, float(forces[0]), 1, origin,
-            1.0, MSG.Wrench(zero, zero), 0.5, 0.1, 3, 0, [],
+            1.0, MSG.Wrench(zero, zero), 0.5, 0.1, 3, 0, [], [], 0.1, 0.1, 0.1,
         )  # fmt: skip
         hand_over(FEATURES, features, now_ns)
         none = np.zeros(0, np.uint32), np.zeros(0, np.uint8)

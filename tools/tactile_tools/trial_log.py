@@ -216,6 +216,10 @@ class TrialLog:
             taxels_in_contact=0,
             taxels_masked=0,
             patches=patches,
+            reason_codes=[],
+            peak_force_bound=0.0,  # the engine's own contacts
+            normal_force_bound=0.0,
+            tip_force_bound=0.0,
         )
 
     def _event(self, now: Instant, kind: str, code: str, text: str) -> None:

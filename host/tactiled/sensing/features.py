@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tactile_bus.geometry import Side, SkinGeometry
 from tactile_bus.instant import Instant, seconds_between
-from tactiled.blocks import Features, Patch
+from tactiled.blocks import Features, Patch, Reason
 from tactiled.sensing.patches import Adjacency
 from tactiled.sensing.pipeline_settings import PipelineSettings
 
@@ -87,7 +87,7 @@ class FeatureExtractor:
         self,
         force: Float,
         masked: int,
-        reasons: tuple[str, ...],
+        reasons: tuple[Reason, ...],
         valid: bool,
         tip_usable: bool,
         captured: Instant,

@@ -20,9 +20,6 @@ from tactiled.sensing.net_force import NetEstimator
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-PAUSED = "fitted model paused: taxels masked"
-"""Reason of a cycle whose forces are from the matrices alone."""
-
 _LEAST_SHEAR_N = 1e-9  # below it a shear has no direction
 
 

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from tactile_bus.calibration_types import BoardCalibration
 from tactile_bus.instant import NS_PER_S, Instant
-from tactiled.blocks import Ambient, Cycle, SampleBlock, TaxelHealth
+from tactiled.blocks import Ambient, Cycle, Reason, SampleBlock, TaxelHealth
+from tactiled.sensing import reasons as why
 from tactiled.sensing.candidates import PLANE_TAXELS
 from tactiled.sensing.compensate import Compensator, Estimate
 from tactiled.sensing.features import FeatureExtractor
@@ -16,7 +17,7 @@ from tactiled.sensing.grouping import CycleCounters, Group, Grouper, gather_temp
 from tactiled.sensing.health import HealthMonitor
 from tactiled.sensing.layout import Layout
 from tactiled.sensing.methods import make_compensator
-from tactiled.sensing.net_stage import PAUSED, NetStage
+from tactiled.sensing.net_stage import NetStage
 from tactiled.sensing.pipeline_settings import PipelineSettings
 from tactiled.sensing.rest import RestField
 from tactiled.sensing.tare import TareReport
@@ -175,6 +176,7 @@ class BoardPipeline:
             temperature_c=gather_temperature(group),
             field_ut=layout.flat_vectors(field),
             force=force,
+            normal_bound=np.full(layout.taxels, np.inf),
             health=self._health,
             ambient=estimate.ambient,
             features=features,
@@ -201,36 +203,36 @@ class BoardPipeline:
 
     def _reasons(
         self, estimate: Estimate, healthy: Bool, present: Bool, known: bool
-    ) -> tuple[tuple[str, ...], bool]:
+    ) -> tuple[tuple[Reason, ...], bool]:
         """Why features are degraded, and whether they are valid all the same."""
-        reasons: list[str] = []
+        reasons: list[Reason] = []
         valid = True
         if not known:
-            reasons.append("taring")
+            reasons.append(why.TARING)
             valid = False
         elif self._rest.rough:
-            reasons.append("rest field uncertain: tare")
+            reasons.append(why.REST_UNCERTAIN)
             valid = False
         if np.count_nonzero(present) < len(present):
-            reasons += [f"array {self._names[a]} missing" for a in np.flatnonzero(~present)]
+            reasons += [why.array_missing(self._names[a]) for a in np.flatnonzero(~present)]
             valid = False
         if healthy is not self._layout.real:
             masked = 1.0 - healthy.sum(axis=1) / self._layout.counts
             for a in np.flatnonzero((masked > self.settings.masked_limit) & present):
-                reasons.append(f"taxels masked: {self._names[a]} {masked[a]:.0%}")
+                reasons.append(why.taxels_masked(self._names[a], masked[a]))
                 valid = False
             if self._net.fitted and known:
-                reasons.append(PAUSED)
+                reasons.append(why.MODEL_PAUSED)
         ambient = estimate.ambient
         if known and np.count_nonzero(ambient.valid) < len(present):
             for a in np.flatnonzero(~ambient.valid & present):
                 name = self._names[a]
                 if estimate.borrowed[a]:
-                    reasons.append(f"compensation borrowed: {name}")
+                    reasons.append(why.compensation_borrowed(name))
                 elif ambient.age[a] <= self._hold[a]:
-                    reasons.append(f"compensation held: {name}")
+                    reasons.append(why.compensation_held(name))
                 else:
-                    reasons.append(f"compensation invalid: {name}")
+                    reasons.append(why.compensation_invalid(name))
                     valid = False
         return tuple(reasons), valid
 

@@ -1,0 +1,44 @@
+"""Every reason for which features are degraded or not valid: a stable code, words and remedy.
+
+Programs act on codes, people read texts; `docs/faults` lists them. A code never changes its
+meaning. Those that concern one array end in ``:name``.
+"""
+
+from __future__ import annotations
+
+from tactiled.blocks import Reason
+
+TARING = Reason("taring", "taring: leave the skin untouched")
+REST_UNCERTAIN = Reason(
+    "rest_uncertain", "the skin was never still while it tared: leave it untouched, then tare"
+)
+MODEL_PAUSED = Reason(
+    "model_paused", "fitted model paused: taxels masked; forces are the taxels' own"
+)
+
+
+def array_missing(array: str) -> Reason:
+    """An array's samples did not come in this cycle."""
+    return Reason(f"array_missing:{array}", f"array {array} missing: check its cable")
+
+
+def taxels_masked(array: str, share: float) -> Reason:
+    """More of an array's taxels are masked than features can do without."""
+    return Reason(f"taxels_masked:{array}", f"taxels masked: {array} {share:.0%}")
+
+
+def compensation_borrowed(array: str) -> Reason:
+    """The array's ambient field is carried on by what the board's other arrays see."""
+    return Reason(f"compensation_borrowed:{array}", f"compensation borrowed: {array}")
+
+
+def compensation_held(array: str) -> Reason:
+    """The array's last good fit is still in force."""
+    return Reason(f"compensation_held:{array}", f"compensation held: {array}")
+
+
+def compensation_invalid(array: str) -> Reason:
+    """The array's last good fit is too old."""
+    return Reason(
+        f"compensation_invalid:{array}", f"compensation invalid: {array}; lift the skin off"
+    )
