@@ -22,12 +22,20 @@ class Estimate:
 
     ``theta``: (A, 3, 3) µT, [a, component in ``ee``, coefficient over `Layout.design`].
     ``ambient``: the same for the outside. ``borrowed``: (A,) bool, where the array's own fit has
-    no support and the field was carried on by what the board's other arrays see.
+    no support and the field was carried on by what the board's other arrays see. ``sigma``:
+    (A, 3) µT rms, how well the field at the array's centre is known, along ``ee``;
+    ``slope_sigma``: (A,) µT rms, the same of either slope. ``leap``: (A,) µT by which the field
+    has leapt on all taxels alike, more than the earth's can; 0 otherwise. ``loaded``: (A, n) bool,
+    taxels that are known to bear something although it may be little; only small arrays tell.
     """
 
     theta: Float
     ambient: Ambient
     borrowed: Bool
+    sigma: Float
+    slope_sigma: Float
+    leap: Float
+    loaded: Bool
 
 
 class Compensator(Protocol):
@@ -43,8 +51,12 @@ class Compensator(Protocol):
     def set_noise(self, noise_ut: Float) -> None:
         """Noise of one sample, (3,) µT rms in chip axes, as a tare measured it."""
 
-    def reset(self) -> None:
-        """Forget every earlier fit: rest fields have changed or the stream has begun anew."""
+    def reset(self, rested: bool = False) -> None:
+        """Forget every earlier fit.
+
+        ``rested``: the rest field has just been taken, ambient field and all, so that this is
+        zero now; otherwise the stream has begun anew, and nobody knows how the board has turned.
+        """
 
 
 class Off:
@@ -64,6 +76,10 @@ class Off:
                 valid=np.ones(arrays, dtype=bool),
             ),
             borrowed=np.zeros(arrays, dtype=bool),
+            sigma=np.zeros((arrays, 3)),  # who turns compensation off says that nothing turns
+            slope_sigma=np.zeros(arrays),
+            leap=np.zeros(arrays),
+            loaded=np.zeros_like(layout.real),
         )
 
     def update(self, field_ee: Float, forces: Float, healthy: Bool, captured: Instant) -> Estimate:  # noqa: ARG002 - as every `Compensator`
@@ -73,7 +89,7 @@ class Off:
     def set_noise(self, noise_ut: Float) -> None:
         """Nothing depends on it."""
 
-    def reset(self) -> None:
+    def reset(self, rested: bool = False) -> None:
         """Nothing is remembered."""
 
 

@@ -76,7 +76,8 @@ class Fit:
 
     ``theta``: (A, 3, 3) µT, [a, component in ``ee``, coefficient]. ``support``, ``residual_ut``,
     ``valid``: (A,) as in `Ambient`. ``common``: (3,) µT in ``ee`` that the arrays with a valid fit
-    share; NaN when there is none. ``whole``: every array is valid.
+    share; NaN when there is none. ``whole``: every array is valid. ``leap``: (A,) µT, how far a
+    field that an array's taxels agree on is from where it must be; 0 where it is not beyond that.
     """
 
     theta: Float
@@ -85,6 +86,7 @@ class Fit:
     valid: Bool
     common: Float
     whole: bool
+    leap: Float
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +132,11 @@ class Consensus:
         self._shrink = 1.0 / (layout.scale * SLOPE_UT_PER_M) ** 2
         self._variance = 1.0
         self.set_noise(np.array([4.4, 4.4, 6.7]))
+
+    @property
+    def sample_sigma(self) -> float:
+        """µT rms by which one component of a free taxel is off a perfect plane."""
+        return math.sqrt(self._variance)
 
     def set_noise(self, noise_ut: Float) -> None:
         """Noise of one sample, (3,) µT rms in chip axes."""
@@ -279,11 +286,14 @@ class Consensus:
         valid = [ok and s >= MIN_SUPPORT for ok, s in zip(fair, support, strict=True)]
         residual = [math.sqrt(q / (3 * max(k, 1))) for q, k in zip(sums, inliers, strict=True)]
         agreed = _agreed(middle, inliers, valid, prior)
+        leap = np.zeros(len(middle))
         for a, centre in enumerate(middle):
             if agreed is None:
                 valid[a] = valid[a] and support[a] >= LONE_SUPPORT
             else:
                 off = math.dist(centre, agreed.constant)
+                if fair[a] and support[a] >= LONE_SUPPORT and off > agreed.reach:
+                    leap[a] = off
                 confirmed = fair[a] and support[a] >= CONFIRMED_SUPPORT and off <= CONFIRMED_UT
                 valid[a] = confirmed or (valid[a] and off <= agreed.reach)
         common = _shared(middle, inliers, valid)
@@ -294,6 +304,7 @@ class Consensus:
             np.array(valid),
             np.array(common or _NONE),
             all(valid),
+            leap,
         )
 
 

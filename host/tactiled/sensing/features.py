@@ -20,6 +20,9 @@ CERTAIN_RATIO = 4 / 3
 """A taxel above this many times its threshold (6 sigma) is in contact at once; between 1 and this
 it must be there in two cycles running, or noise on 80 taxels at 100 Hz would touch every second."""
 
+SLIGHT_SIGMAS = 1.5
+"""Sigma of its noise above which a taxel that is known to be loaded is in contact."""
+
 _ZERO3 = np.zeros(3)
 _ZERO6 = np.zeros(6)
 _ZERO3.flags.writeable = False
@@ -56,6 +59,7 @@ class FeatureExtractor:
         self._ratio = settings.release_ratio
         n = geometry.taxels
         self._on = np.full(n, self._minimum)
+        self._slight = self._on * SLIGHT_SIGMAS / self._sigmas
         self._certain = self._on * CERTAIN_RATIO
         self._off = self._on * self._ratio
         self._contact = np.zeros(n, dtype=bool)
@@ -63,6 +67,17 @@ class FeatureExtractor:
         self._light_since: Instant | None = None
         self._light_until: Instant | None = None
         self._unusable = 0
+        self.summed: list[int] = []
+        """Taxels whose normal forces were summed in the last cycle."""
+        self.tip_summed: list[int] = []
+        """Those of them at the tip."""
+        self.peak_taxel = 0
+        """The taxel of the peak force; the first where nothing is in contact."""
+
+    @property
+    def smallest(self) -> Float:
+        """(N,) N, normal force from which a taxel is in contact."""
+        return self._on
 
     @property
     def contact(self) -> Bool:
@@ -72,6 +87,7 @@ class FeatureExtractor:
     def set_noise(self, sigma_n: Float) -> None:
         """Noise of the normal forces, (N,) N rms: contact thresholds follow."""
         self._on = np.maximum(self._minimum, self._sigmas * sigma_n)
+        self._slight = SLIGHT_SIGMAS * sigma_n
         self._certain = self._on * CERTAIN_RATIO
         self._off = self._on * self._ratio
         self._threshold = np.where(self._contact, self._off, self._certain)
@@ -91,15 +107,19 @@ class FeatureExtractor:
         valid: bool,
         tip_usable: bool,
         captured: Instant,
+        loaded: Bool | None = None,
     ) -> Features:
         """Features of one cycle.
 
         ``force``: (N, 3) N in taxel axes, NaN where a taxel is masked. ``masked``: how many are.
         ``tip_usable``: whether what the tip feels counts towards its time in light contact.
+        ``loaded``: (N,) taxels known to bear something, in contact from a smaller force on.
         """
         normal = -force[:, 2]
         above = normal > self._on
         contact = normal > self._threshold
+        if loaded is not None and np.count_nonzero(loaded):
+            contact |= loaded & (normal > self._slight)
         members = contact.nonzero()[0]
         self._contact = contact
         if np.count_nonzero(above) or members.size:
@@ -107,6 +127,7 @@ class FeatureExtractor:
         else:
             self._threshold = self._certain
         if members.size == 0:
+            self.summed, self.tip_summed, self.peak_taxel = [], [], 0
             tip_time = self._tip_time(0.0, tip_usable, captured)
             return Features(
                 valid, reasons, 0.0, Side.NONE, _ZERO3, 0.0, _ZERO6, 0.0, tip_time, 0, masked
@@ -152,6 +173,8 @@ class FeatureExtractor:
         tip_force = sum((p.normal_force for p in patches if p.side is Side.TIP), 0.0)
         peak_force = max(presses)
         peak = taxels[presses.index(peak_force)]
+        self.summed, self.peak_taxel = involved, peak
+        self.tip_summed = [t for t in involved if self._side[self._array[t]] is Side.TIP]
         return Features(
             valid=valid,
             reasons=reasons,

@@ -18,12 +18,16 @@ MAX_OWN_CONDITION = 1e4
 """A taxel whose own 3 × 3 block is worse conditioned does not feel three components of force; its
 array is then compensated without undoing crosstalk."""
 
+MAGNET_DRIFT_PER_K = -0.0012
+"""Reversible loss of remanence of sintered NdFeB, −0.12 %/K (makers' datasheets)."""
+
 
 class ForceModel:
     """The calibration of a board as batched matrices.
 
     Force is linear in the field, so what a plane adds to every force is a fixed matrix times the
-    plane's nine coefficients.
+    plane's nine coefficients. ``press_direction``: (A, 3, n), unit vectors in ``ee`` along which
+    a press changes a taxel's field.
     """
 
     def __init__(self, calibration: BoardCalibration, layout: Layout) -> None:
@@ -33,7 +37,8 @@ class ForceModel:
         self._sin = np.zeros((arrays, n))
         self.rest = np.zeros((arrays, 3, n))
         self._drift = np.zeros((arrays, 3, n))
-        self._reference = np.zeros((arrays, 1))
+        self._reference = np.zeros((arrays, n))
+        self._nominal = calibration.nominal
         blocks = np.zeros((arrays, 3, n, 3, n))
         for a, array in enumerate(calibration.arrays):
             m = array.geometry.taxels
@@ -43,6 +48,7 @@ class ForceModel:
             self.rest[a, :, :m] = array.rest_ut.T
             self._drift[a, :, :m] = array.drift_ut_per_k.T
             self._reference[a] = array.reference_c
+        self._rested_at = self._reference.copy()
         self._turned = bool(self._sin.any() or (self._cos != 1).any())
         self._drifts = bool(self._drift.any())
         self._matrix = blocks.reshape(arrays, 3 * n, 3 * n)
@@ -65,6 +71,15 @@ class ForceModel:
                     1, 2, 0
                 )
         self.decouples = bool(self._decouples.any())
+        self.press_direction = np.zeros((arrays, 3, n))
+        for a in range(arrays):
+            for i in np.flatnonzero(layout.real[a]).tolist():
+                block = own[a, i]
+                along = np.array([0.0, 0.0, 1.0])
+                if abs(np.linalg.det(block)) > 0 and np.linalg.cond(block) < MAX_OWN_CONDITION:
+                    along = np.linalg.solve(block, [0.0, 0.0, -1.0])
+                along = layout.rotation[a, :, :, i] @ along
+                self.press_direction[a, :, i] = along / np.linalg.norm(along)
         in_ee = np.einsum("akn,cd->acndk", layout.design, np.eye(3)).reshape(arrays, 3, n, 9)
         in_taxel = np.einsum("adcn,adnp->acnp", layout.rotation, in_ee)
         self._plane_force = self._matrix @ in_taxel.reshape(arrays, 3 * n, 9)
@@ -74,6 +89,21 @@ class ForceModel:
         leak = undone - in_ee
         leak[~self._decouples] = 0
         self._plane_leak = leak.reshape(arrays, 3 * n, 9)
+
+    def rested_at(self, temperature_c: Float) -> None:
+        """The rest field was taken at ``temperature_c`` (A, n) °C.
+
+        Of a board nobody has measured the makers' drift of its magnets is taken off from there on.
+        """
+        self._rested_at = temperature_c.copy()
+        if self._nominal:
+            self._reference = temperature_c.copy()
+            self._drift = MAGNET_DRIFT_PER_K * self.rest
+            self._drifts = bool(self._drift.any())
+
+    def warmer(self, temperature_c: Float) -> Float:
+        """(A, n) K since the rest field was taken."""
+        return np.asarray(temperature_c - self._rested_at)
 
     def taxel_field(self, raw: Float, temperature_c: Float) -> Float:
         """µT in taxel axes, rest and drift taken off; ``raw`` µT in chip axes, ``temperature_c``
@@ -88,7 +118,7 @@ class ForceModel:
         else:
             field = raw - self.rest
         if self._drifts:
-            field -= self._drift * (temperature_c - self._reference)[:, None]
+            field -= self._drift * (temperature_c - self._reference)[:, None, :]
         return field
 
     def forces(self, field: Float) -> Float:
@@ -123,6 +153,14 @@ class ForceModel:
         in_ee = theta @ self.layout.design
         field: Float = (self.layout.rotation * in_ee[:, :, None]).sum(axis=1)
         return field
+
+    def normal_slopes(self) -> Float:
+        """(A, n, 3, 3) N/µT, what the normal forces lose to a plane: [a, taxel, component in
+        ``ee``, coefficient over `Layout.design`].
+        """
+        arrays, n = self.layout.arrays, self.layout.width
+        rows = self._plane_force.reshape(arrays, 3, n, 3, 3)[:, 2]
+        return np.ascontiguousarray(rows)
 
     def normal_sigma(self, noise_ut: Float) -> Float:
         """(A, n) N rms of the normal force, from independent noise ``noise_ut`` (3,) µT rms."""

@@ -1,4 +1,4 @@
-"""The methods of compensation there are, by name."""
+"""The methods of compensation, by name, and which arrays each is for."""
 
 from __future__ import annotations
 
@@ -6,16 +6,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bus.instant import NS_PER_S, Instant
-from tactiled.sensing.compensate import Compensator, Estimate, Off
+from tactiled.blocks import Ambient
+from tactiled.sensing.candidates import PLANE_TAXELS
+from tactiled.sensing.compensate import Compensator, Estimate, Off, outside_plane
 from tactiled.sensing.consensus import Consensus
 from tactiled.sensing.force_model import ForceModel
 from tactiled.sensing.layout import Layout
 from tactiled.sensing.pipeline_settings import PipelineSettings
 from tactiled.sensing.ransac import RansacCompensator
+from tactiled.sensing.small_array import SmallArray
 from tactiled.sensing.tracking import FieldTracker
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+
+
+MIN_FREE = 0.5
+"""Share of a small array's healthy taxels that must be free for its ambient field to be seen."""
+UNKNOWN_UT = 60.0
+"""µT rms a component, where the ambient field is not known at all: the earth's, turned."""
+LONGEST_GAP_S = 5.0
+"""s: after a longer gap the field of the room may be anything that the earth's can."""
 
 
 class ConsensusCompensator:
@@ -31,8 +42,9 @@ class ConsensusCompensator:
     def set_noise(self, noise_ut: Float) -> None:
         """Noise of one sample, (3,) µT rms in chip axes."""
         self._consensus.set_noise(noise_ut)
+        self._tracker.sample_sigma = self._consensus.sample_sigma
 
-    def reset(self) -> None:
+    def reset(self, rested: bool = False) -> None:  # noqa: ARG002 - as every `Compensator`
         """Forget every plane."""
         self._tracker.reset()
         self._fitted = None
@@ -55,10 +67,99 @@ class ConsensusCompensator:
         return self._tracker.take(fit, captured, fresh=False)
 
 
+class SmallArrays:
+    """Arrays of fewer than `PLANE_TAXELS` taxels, each by itself; see `SmallArray`.
+
+    ``rest``: the method of the board's other arrays; None where it has none.
+    """
+
+    def __init__(
+        self, layout: Layout, model: ForceModel, method: str, rest: Compensator | None
+    ) -> None:
+        self._layout, self._model, self._method, self._rest = layout, model, method, rest
+        few = np.flatnonzero(layout.counts < PLANE_TAXELS).tolist()
+        self._arrays = {a: SmallArray(model.press_direction[a, :, : layout.counts[a]]) for a in few}
+        self.reset()
+
+    def set_noise(self, noise_ut: Float) -> None:
+        """Noise of one sample, (3,) µT rms in chip axes."""
+        if self._rest is not None:
+            self._rest.set_noise(noise_ut)
+        for a, array in self._arrays.items():
+            turn = self._layout.rotation[a, :, :, 0]
+            array.set_noise(np.sqrt(turn**2 @ noise_ut**2))
+
+    def reset(self, rested: bool = False) -> None:
+        """Nothing touches; after a tare the ambient field is zero, else it is unknown."""
+        arrays = self._layout.arrays
+        self._theta = np.zeros((arrays, 3, 3))
+        self._last: Instant | None = None
+        self._age = np.zeros(arrays)
+        for array in self._arrays.values():
+            array.reset(0.0 if rested else UNKNOWN_UT)
+        if self._rest is not None:
+            self._rest.reset(rested)
+
+    def predict(self, change: Float, sigma: float) -> None:
+        """The ambient field changes by ``change`` (3,) µT in ``ee`` until the next cycle."""
+        for array in self._arrays.values():
+            array.predict(change, sigma)
+
+    def update(self, field_ee: Float, forces: Float, healthy: Bool, captured: Instant) -> Estimate:
+        """Estimate for one cycle."""
+        layout, model = self._layout, self._model
+        elapsed = 0.0 if self._last is None else (captured - self._last) / NS_PER_S
+        elapsed = min(max(elapsed, 1e-4), LONGEST_GAP_S)
+        self._last = captured
+        if self._rest is None:
+            estimate = self._blank()
+        else:
+            estimate = self._rest.update(field_ee, forces, healthy, captured)
+        target = field_ee
+        if model.decouples:
+            target = model.decoupled_in_ee(field_ee, forces) - model.plane_leak(self._theta)
+        theta, sigma = estimate.theta.copy(), estimate.sigma.copy()
+        slope_sigma, leap = estimate.slope_sigma.copy(), estimate.leap.copy()
+        support, residual = estimate.ambient.support.copy(), estimate.ambient.residual_ut.copy()
+        age, valid = estimate.ambient.age.copy(), estimate.ambient.valid.copy()
+        borrowed, loaded = estimate.borrowed.copy(), estimate.loaded.copy()
+        for a, array in self._arrays.items():
+            n = layout.counts[a]
+            said = array.update(target[a, :, :n], healthy[a, :n], elapsed)
+            theta[a] = 0.0
+            theta[a, :, 0] = said.field
+            sigma[a], slope_sigma[a], leap[a] = said.sigma, 0.0, said.leap
+            sound = int(np.count_nonzero(healthy[a]))
+            support[a] = np.count_nonzero(said.free & healthy[a, :n]) / sound if sound else 0.0
+            residual[a] = said.left_over
+            loaded[a, :n] = ~said.free & healthy[a, :n]
+            valid[a] = support[a] >= MIN_FREE and not said.leap
+            self._age[a] = 0.0 if valid[a] else self._age[a] + elapsed
+            age[a], borrowed[a] = self._age[a], False
+        self._theta = theta
+        ambient = Ambient(self._method, outside_plane(theta, layout), support, residual, age, valid)
+        return Estimate(theta, ambient, borrowed, sigma, slope_sigma, leap, loaded)
+
+    def _blank(self) -> Estimate:
+        arrays = self._layout.arrays
+        zero, none = np.zeros(arrays), np.zeros(arrays, dtype=bool)
+        theta = np.zeros((arrays, 3, 3))
+        ambient = Ambient(self._method, theta, zero, zero, zero, none)
+        loaded = np.zeros_like(self._layout.real)
+        return Estimate(theta, ambient, none, np.zeros((arrays, 3)), zero, zero, loaded)
+
+
 def make_compensator(settings: PipelineSettings, layout: Layout, model: ForceModel) -> Compensator:
     """Compensator that ``settings`` ask for."""
     if settings.method == "off":
         return Off(layout)
+    if settings.method == "consensus" and (layout.counts < PLANE_TAXELS).any():
+        rest: Compensator | None = None
+        if (layout.counts >= PLANE_TAXELS).any():
+            rest = ConsensusCompensator(
+                layout, Consensus(layout, model), settings.compensation_period_s
+            )
+        return SmallArrays(layout, model, settings.method, rest)
     consensus = Consensus(layout, model)
     if settings.method == "ransac":
         rng = np.random.default_rng(settings.seed)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bus.calibration_types import BoardCalibration
 from tactile_bus.instant import NS_PER_S, Instant
-from tactiled.blocks import Ambient, Cycle, Reason, SampleBlock, TaxelHealth
+from tactiled.blocks import Ambient, Cycle, Features, Reason, SampleBlock, TaxelHealth
 from tactiled.sensing import reasons as why
+from tactiled.sensing.bounds import QUANTILE_95, Bounds
 from tactiled.sensing.candidates import PLANE_TAXELS
 from tactiled.sensing.compensate import Compensator, Estimate
 from tactiled.sensing.features import FeatureExtractor
@@ -19,10 +23,11 @@ from tactiled.sensing.layout import Layout
 from tactiled.sensing.methods import make_compensator
 from tactiled.sensing.net_stage import NetStage
 from tactiled.sensing.pipeline_settings import PipelineSettings
-from tactiled.sensing.rest import RestField
+from tactiled.sensing.rest import RestField, RestState
+from tactiled.sensing.rest_watch import RestWatch
 from tactiled.sensing.tare import TareReport
 
-__all__ = ["BoardPipeline", "CycleCounters", "PipelineSettings", "TareReport"]
+__all__ = ["BoardPipeline", "CycleCounters", "PipelineSettings", "RestState", "TareReport"]
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -49,8 +54,13 @@ class BoardPipeline:
         self._net = NetStage(calibration.nets, layout)
         self._names = tuple(a.name for a in geometry.arrays)
         self._tip_arrays = [i for i, a in enumerate(geometry.arrays) if a.side.name == "TIP"]
-        # a few taxels feel every contact all together: their fit cannot outlast one, see hold_s
+        # how long a small array's field may be held is a matter of its bound alone
         self._hold = np.where(layout.counts < PLANE_TAXELS, np.inf, settings.hold_s).tolist()
+        self._bounds = Bounds(self._model, layout, calibration.nominal)
+        self._watch = RestWatch(layout, self._model, [a.name for a in geometry.arrays])
+        self._warmer: Float = np.zeros(layout.taxels)
+        self._drift: Float = np.zeros(layout.taxels)
+        self._forgotten: Reason | None = None
         self._theta = np.zeros((layout.arrays, 3, 3))
         self._feature_due: Instant | None = None
         self._health: NDArray[np.uint8] = np.full(layout.taxels, TaxelHealth.MISSING, np.uint8)
@@ -63,7 +73,16 @@ class BoardPipeline:
             age=np.full(layout.arrays, np.inf),
             valid=np.zeros(layout.arrays, dtype=bool),
         )
-        self._unknown = Estimate(nothing.plane, nothing, np.zeros(layout.arrays, dtype=bool))
+        zero = np.zeros(layout.arrays)
+        self._unknown = Estimate(
+            nothing.plane,
+            nothing,
+            np.zeros(layout.arrays, dtype=bool),
+            np.full((layout.arrays, 3), np.inf),
+            zero,
+            zero,
+            np.zeros_like(layout.real),
+        )
         automatic = settings.auto_tare
         unrested = calibration.nominal or self._net.fitted
         known = not (unrested if automatic is None else automatic)
@@ -92,13 +111,31 @@ class BoardPipeline:
         """What the last tare that ended did; None before the first."""
         return self._rest.report
 
-    def tare(self) -> None:
+    @property
+    def rest_state(self) -> RestState:
+        """What is known of the rest field."""
+        return self._rest.state
+
+    @property
+    def rest_reason(self) -> Reason | None:
+        """Why the rest field is suspect or was forgotten; None otherwise."""
+        return self._rest.suspicion or self._forgotten
+
+    def tare(self, force: bool = False) -> None:
         """Begin a tare: the mean field of the next cycles becomes the rest field.
 
         It ends by itself within ten times ``tare_s``; `tare_report` then says what it did. It is
         refused, and nothing changed, when the field moves or a taxel bears more than
         ``tare_limit_n``; less than that cannot be told from the drift that taring is there for.
+        ``force``: it is not refused.
         """
+        self._rest.begin(self._noise, force)
+
+    def forget_rest(self, reason: Reason) -> None:
+        """Another board or skin may be there: its rest field is unknown until it was tared."""
+        self._forgotten = reason
+        self.reset()
+        self._rest.forget()
         self._rest.begin(self._noise)
 
     def reset(self) -> None:
@@ -108,6 +145,7 @@ class BoardPipeline:
         self._compensator.reset()
         self._features.reset()
         self._net.pause()
+        self._watch.reset()
         self._theta = np.zeros_like(self._theta)
         self._last_captured = None
         if self._rest.taring:
@@ -130,10 +168,14 @@ class BoardPipeline:
         rest = self._rest
         known = rest.known  # before: a first tare takes effect from the next cycle on
         field = model.taxel_field(raw, temperature)
-        if rest.taring:
-            self._advance_tare(field, health, bool(present.all()), captured, group.sequence)
+        if rest.taring and not (self._watch.off and rest.suspicion is not None):
+            whole = bool(present.all())
+            self._advance_tare(field, temperature, health, whole, captured, group.sequence)
         if known and np.count_nonzero(rest.unrested):
             health[rest.unrested] |= np.uint8(TaxelHealth.OUT_OF_RANGE)
+        if np.count_nonzero(rest.bare):
+            health[rest.bare] |= np.uint8(TaxelHealth.OUT_OF_RANGE)
+        field_of_all = field.copy() if np.count_nonzero(rest.bare) else field
         masked = int(np.count_nonzero(health))
         sick = masked > 0
         healthy = layout.real
@@ -150,6 +192,12 @@ class BoardPipeline:
                 forces -= model.plane_forces(estimate.theta)
             if self._net.fitted and not sick:
                 self._net.share(forces, self._net.update(field, captured))
+            if np.count_nonzero(rest.bare):
+                regained = self._watch.regained(field_of_all, rest.bare)
+                if regained is not None:
+                    rest.suspect(regained, self._noise)
+            self._watch_rest(field, forces, estimate, healthy, captured)
+            self._feel_warmth(temperature)
             if sick:
                 np.copyto(forces, np.nan, where=~healthy[:, None])
         else:
@@ -160,11 +208,22 @@ class BoardPipeline:
         self._health = layout.flat(health)
         reasons, valid = self._reasons(estimate, healthy, present, known)
         tip_usable = valid or (known and self._tip_usable(estimate, present))
-        features = self._features.update(force, masked, reasons, valid, tip_usable, captured)
+        features = self._features.update(
+            force, masked, reasons, valid, tip_usable, captured, layout.flat(estimate.loaded)
+        )
+        features, normal_bound = self._bound(features, estimate, force, known)
         if rest.taring:
             rest.note_peak(features.peak_force)
         if self.settings.rest_tracking_s is not None and valid and not reasons:
             self._follow_rest(field, estimate, healthy, captured)
+        if known and np.count_nonzero(rest.unrested):
+            untouched = features.taxels_in_contact == 0
+            if rest.adopt(field, self._sound(health), untouched, captured):
+                self._settle_rest(temperature)
+        if known and self._last_captured is not None and rest.state is RestState.KNOWN:
+            elapsed = max(0.0, (captured - self._last_captured) / NS_PER_S)
+            left_over = field - self._model.plane_field(estimate.theta)
+            rest.recover(left_over, healthy, float(self._noise.max()), elapsed)
         self._last_captured = captured
         if sick:
             np.copyto(field, np.nan, where=~healthy[:, None])
@@ -176,7 +235,7 @@ class BoardPipeline:
             temperature_c=gather_temperature(group),
             field_ut=layout.flat_vectors(field),
             force=force,
-            normal_bound=np.full(layout.taxels, np.inf),
+            normal_bound=normal_bound,
             health=self._health,
             ambient=estimate.ambient,
             features=features,
@@ -208,7 +267,10 @@ class BoardPipeline:
         reasons: list[Reason] = []
         valid = True
         if not known:
-            reasons.append(why.TARING)
+            reasons.append(self._forgotten or why.TARING)
+            valid = False
+        elif self._rest.suspicion is not None:
+            reasons.append(self._rest.suspicion)
             valid = False
         elif self._rest.rough:
             reasons.append(why.REST_UNCERTAIN)
@@ -247,6 +309,7 @@ class BoardPipeline:
     def _advance_tare(
         self,
         field: Float,
+        temperature: Float,
         health: NDArray[np.uint8],
         whole: bool,
         captured: Instant,
@@ -255,21 +318,110 @@ class BoardPipeline:
         """Take one cycle into the tare under way; its end begins contacts and fits anew."""
         healthy = self._layout.real & (health == 0)
         usable = np.where(healthy[:, None], field, 0.0)
+        before = self._model.rest.copy()
+        stripped = self._rest.suspicion is not None
         shift = self._rest.advance(usable, healthy, whole, captured, sequence)
         report = self._rest.report
         if shift is None or report is None:
             return
         field -= shift
-        self._compensator.reset()
+        if stripped:
+            self._rest.bare |= self._watch.lost(before)
+            self._rest.bare &= ~self._watch.covered()
+        self._forgotten = None
+        self._compensator.reset(rested=True)
         self._features.reset()
         self._net.reset()
+        self._watch.reset()
         self._theta = np.zeros_like(self._theta)
+        self._settle_rest(temperature)
         self._apply_noise(report.noise_ut)
+
+    def _settle_rest(self, temperature: Float) -> None:
+        """A rest field has just come into force."""
+        self._model.rested_at(temperature)
+        self._bounds.set_rest(self._layout.flat_vectors(self._model.rest))
+
+    def _sound(self, health: NDArray[np.uint8]) -> Bool:
+        """(A, n) taxels with nothing against them but that their rest field is unknown."""
+        others = health & ~np.uint8(TaxelHealth.OUT_OF_RANGE)
+        return np.asarray(self._layout.real & (others == 0))
+
+    def _watch_rest(
+        self, field: Float, forces: Float, estimate: Estimate, healthy: Bool, captured: Instant
+    ) -> None:
+        """See whether the rest field is still what it was."""
+        reason = self._watch.judge(field, forces, estimate, healthy, captured)
+        if self._rest.rough:
+            return  # it is known to be wrong as it is
+        if reason is not None:
+            self._rest.suspect(reason, self._noise)
+        elif self._rest.suspicion is not None and self._watch.restored(forces, estimate, healthy):
+            self._rest.trust()
+
+    def _feel_warmth(self, temperature: Float) -> None:
+        """What the warming since the tare may look like, from the taxels' own thermometers."""
+        warmer = self._layout.flat(self._model.warmer(temperature))
+        if float(np.abs(warmer - self._warmer).max()) > WARMING_STEP_K:
+            self._warmer = warmer.copy()
+            self._drift = self._bounds.drift_sigma(warmer)
+            self._set_thresholds()
+
+    def _set_thresholds(self) -> None:
+        """Contact begins where neither noise nor warming explains it."""
+        self._features.set_noise(np.hypot(self._sigma, WARMING_SIGMAS * self._drift))
+
+    def _bound(
+        self, features: Features, estimate: Estimate, force: Float, known: bool
+    ) -> tuple[Features, Float]:
+        """Features with their bounds, not valid where those are too wide; bounds of the taxels."""
+        if not known:
+            return features, np.full(len(force), np.nan)
+        bounds, extractor = self._bounds, self._features
+        taxels = bounds.taxels(estimate, self._drift)
+        least = extractor.smallest
+        unseen = float(least.max())
+        peak = float(taxels[extractor.peak_taxel])
+        if not extractor.summed:
+            peak = math.hypot(peak, unseen)
+        normal = math.hypot(bounds.together(extractor.summed, estimate, self._drift), unseen)
+        tip = math.hypot(bounds.together(extractor.tip_summed, estimate, self._drift), unseen)
+        odd = bounds.implausible(force)
+        peak, normal, tip = peak + odd, normal + odd, tip + odd
+        limit = self.settings.bound_limit_n
+        valid, reasons = features.valid, features.reasons
+        if peak > limit or (bounds.few and normal > limit):
+            valid = False
+            reasons = (*reasons, self._doubt(max(peak, normal)))
+        features = dataclasses.replace(
+            features,
+            valid=valid,
+            reasons=reasons,
+            peak_force_bound=peak + bounds.scaled(features.peak_force),
+            normal_force_bound=normal + bounds.scaled(features.normal_force),
+            tip_force_bound=tip + bounds.scaled(features.tip_force),
+        )
+        normal_bound = taxels + np.array([bounds.scaled(1.0)]) * np.abs(force[:, 2])
+        return features, normal_bound
+
+    def _doubt(self, bound: float) -> Reason:
+        """What most of the uncertainty comes from."""
+        warmest = float(self._warmer[np.argmax(np.abs(self._warmer))])
+        if QUANTILE_95 * float(self._drift.max()) > 0.5 * self.settings.bound_limit_n:
+            return why.too_warm(warmest)
+        return why.uncertain(self._names[self._features_array()], bound)
+
+    def _features_array(self) -> int:
+        """The array of the peak force."""
+        ends = np.cumsum(self._layout.counts)
+        return int(np.searchsorted(ends, self._features.peak_taxel, side="right"))
 
     def _apply_noise(self, noise: Float) -> None:
         """Noise of one sample, (3,) µT in chip axes, sets the thresholds of contact and fit."""
         self._noise = np.maximum(noise, MIN_NOISE_UT)
-        self._features.set_noise(self._layout.flat(self._model.normal_sigma(self._noise)))
+        self._sigma = self._layout.flat(self._model.normal_sigma(self._noise))
+        self._bounds.set_noise(self._sigma)
+        self._set_thresholds()
         self._compensator.set_noise(self._noise)
 
     def _follow_rest(
@@ -298,6 +450,10 @@ class BoardPipeline:
         return True
 
 
+WARMING_STEP_K = 0.5
+"""K of warming after which bounds and thresholds are worked out anew."""
+WARMING_SIGMAS = 0.5
+"""Weight of an unknown drift in a taxel's noise: a contact then begins at 2.25 sigma of it."""
 MIN_NOISE_UT = 0.3
 """µT below which noise is not believed: an int16 of the finest scale alone makes 0.04, but chips
 differ by 3 % in a field of tens of µT and that looks like noise to a fit."""

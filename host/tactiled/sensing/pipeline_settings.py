@@ -32,6 +32,9 @@ class PipelineSettings:
     support; the default keeps its error below 0.25 N, half the paper's least threshold, at
     0.35 rad/s in 50 µT. Without limit on arrays of fewer than nine taxels, where every contact
     takes the support away. The ambient field itself is marked invalid at once in any case.
+    ``bound_limit_n``: N, least additive bound of the peak force (and of the summed normal force
+    where every array has fewer than nine taxels) at which features are no longer valid; the
+    default is a third of the 1.5 N from which reachd's thresholds act.
     ``masked_limit``: fraction of an array's taxels beyond which features are invalid.
     ``seed``: of RANSAC's random draws.
     """
@@ -51,6 +54,7 @@ class PipelineSettings:
     auto_tare: bool | None = None
     rest_tracking_s: float | None = None
     hold_s: float = 1.5
+    bound_limit_n: float = 0.5
     masked_limit: float = 0.25
     seed: int = 0
 
@@ -73,6 +77,7 @@ class PipelineSettings:
             ("tare_limit_n", self.tare_limit_n, 0.01, 1000),
             ("rest_tracking_s", self.rest_tracking_s, 0.1, 1e6),
             ("hold_s", self.hold_s, 0, 3600),
+            ("bound_limit_n", self.bound_limit_n, 0.01, 1000),
             ("masked_limit", self.masked_limit, 0, 1),
             ("seed", self.seed, 0, 2**32 - 1),
         ):

@@ -47,8 +47,9 @@ class RansacCompensator:
     def set_noise(self, noise_ut: Float) -> None:
         """Noise of one sample, (3,) µT rms in chip axes."""
         self._checker.set_noise(noise_ut)
+        self._tracker.sample_sigma = self._checker.sample_sigma
 
-    def reset(self) -> None:
+    def reset(self, rested: bool = False) -> None:  # noqa: ARG002 - as every `Compensator`
         """Forget every plane."""
         self._tracker.reset()
         self._begun: Instant | None = None

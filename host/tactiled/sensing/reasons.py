@@ -42,3 +42,57 @@ def compensation_invalid(array: str) -> Reason:
     return Reason(
         f"compensation_invalid:{array}", f"compensation invalid: {array}; lift the skin off"
     )
+
+
+def uncertain(array: str, bound_n: float) -> Reason:
+    """The bound of the forces has passed the limit of the settings."""
+    return Reason(
+        f"uncertain:{array}",
+        f"forces of {array} uncertain by {bound_n:.1f} N: the ambient field is not seen under "
+        "this contact; lift the skin off",
+    )
+
+
+def too_warm(kelvin: float) -> Reason:
+    """The temperature has changed more than an unknown drift allows."""
+    return Reason(
+        "temperature_moved", f"temperature moved by {kelvin:+.0f} K since the tare: tare again"
+    )
+
+
+def field_jump(size_ut: float) -> Reason:
+    """The field of all taxels has leapt at once, by more than the earth's can change."""
+    return Reason(
+        "field_jump",
+        f"field changed on all taxels at once by {_field(size_ut)}: magnet near, or skin changed; "
+        "lift off and tare",
+    )
+
+
+def gain_changed(gain: float) -> Reason:
+    """All fields have changed by the same factor."""
+    return Reason(
+        "gain_changed",
+        f"all fields changed by a factor of {gain:.2f}: gain or resolution changed; tare",
+    )
+
+
+def skin_off(array: str) -> Reason:
+    """Most chips of an array read no magnet."""
+    return Reason(f"skin_off:{array}", f"no magnets over {array}: put the skin on, then tare")
+
+
+def magnet_lost(array: str, taxel: int) -> Reason:
+    """A chip reads no magnet."""
+    return Reason(
+        f"magnet_lost:{array}", f"no magnet over taxel {taxel} of {array}: mend the skin, then tare"
+    )
+
+
+REPLUGGED = Reason(
+    "replugged", "a board without a serial number was plugged in: taring, leave it untouched"
+)
+
+
+def _field(size_ut: float) -> str:
+    return f"{size_ut / 1000:.1f} mT" if size_ut >= 950 else f"{size_ut:.0f} µT"

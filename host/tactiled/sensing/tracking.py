@@ -29,6 +29,9 @@ this fraction of the board's taxels: half of one array of many might be chance."
 TURNING_UT_PER_S = 17.5
 """How fast a board turning at 0.35 rad/s sees 50 µT change: what it saw last binds the less, the
 longer ago."""
+BORROWED_UT = 5.0
+"""µT rms by which the field of an array that borrows differs from what the others see: gradients
+of 30 µT/m over the finger."""
 REVERSED_UT = 130.0
 """Most that the earth's field can change at all: 65 µT turned round. Beyond it a uniform press on a
 lone array is never taken for the field, however long it lasts."""
@@ -43,6 +46,8 @@ class FieldTracker:
         self._borrows = borrows and layout.arrays > 1
         self._zero_age = np.zeros(layout.arrays)
         self._none = np.zeros(layout.arrays, dtype=bool)
+        self.sample_sigma = 5.0
+        self._unloaded = np.zeros_like(layout.real)
         self._zero_age.flags.writeable = self._none.flags.writeable = False
         self.reset()
 
@@ -50,6 +55,7 @@ class FieldTracker:
         """Forget every plane."""
         arrays = self._layout.arrays
         self.theta: Float = np.zeros((arrays, 3, 3))
+        self._sure = np.zeros(arrays)  # taxels that bear out the plane in force
         self._common = np.full((arrays, 3), np.nan)
         self._fitted_at = np.zeros(arrays, dtype=np.int64)
         self._ever = np.zeros(arrays, dtype=bool)
@@ -89,6 +95,15 @@ class FieldTracker:
     def _estimate(
         self, fit: Fit, theta: Float, valid: Bool, age: Float, borrowed: Bool
     ) -> Estimate:
+        support = fit.support * self._layout.counts
+        self._sure = np.where(valid, support, self._sure)
+        variance = self.sample_sigma**2 / np.maximum(self._sure, 1.0)
+        if borrowed is not self._none:
+            variance = np.where(borrowed, variance + BORROWED_UT**2, variance)
+        sigma = np.sqrt(variance)
+        if age is not self._zero_age:
+            turned = np.where(borrowed, 0.0, TURNING_UT_PER_S * age)
+            sigma = sigma + np.where(np.isfinite(age), turned, REVERSED_UT)
         ambient = Ambient(
             method=self._method,
             plane=outside_plane(theta, self._layout),
@@ -97,7 +112,15 @@ class FieldTracker:
             age=age,
             valid=valid,
         )
-        return Estimate(theta, ambient, borrowed)
+        return Estimate(
+            theta,
+            ambient,
+            borrowed,
+            np.repeat(sigma[:, None], 3, axis=1),
+            sigma,
+            fit.leap,
+            self._unloaded,
+        )
 
     def _lends(self, fit: Fit) -> bool:
         """Whether the arrays with a valid fit are enough to speak for the board."""

@@ -1,0 +1,119 @@
+"""How far the published forces may be from the true ones: 95 % bounds in N.
+
+What is added up: noise of the chips, what is not known of the ambient field (which grows while it
+is held, `Estimate.sigma`), what chips differ by in a uniform field, temperature since the rest
+field was taken, forces too small to be seen, and the scale of the calibration. The first five are
+there without any force and decide whether features are valid; the last grows with the force.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactiled.sensing.candidates import PLANE_TAXELS
+from tactiled.sensing.compensate import Estimate
+from tactiled.sensing.force_model import ForceModel
+from tactiled.sensing.layout import Layout
+
+Float = NDArray[np.float64]
+
+QUANTILE_95 = 1.96
+"""Normal errors are within this many sigma in 95 % of cycles."""
+MEASURED_SCALE = 0.08
+"""Share of a force that a calibration of the very board leaves unknown (95 %): hysteresis of up to
+6 %, curvature of the dipole law of 7 % at twice the calibrated load."""
+NOMINAL_SCALE = 1.0
+"""The same of nominal figures, which are right to a factor of two."""
+PULL_N = 0.3
+"""N by which crosstalk and hysteresis may seem to pull at a taxel."""
+FRICTION = 1.0
+"""Shear over normal force that rubber bears at most."""
+SLIP_N = 0.5
+"""N of shear that are no matter: a neighbour's contact shears a taxel that bears little itself."""
+UNEVEN_UT = 1.5
+"""µT rms by which chips differ in a uniform field: 3 % sensitivity in 50 µT."""
+KNOWN_DRIFT_UT_PER_K = 0.3
+"""µT/K rms that a measured temperature drift leaves (0.1 of the chips' own)."""
+UNKNOWN_DRIFT_UT_PER_K = 1.5
+"""µT/K rms of a chip's offset that nobody has measured (datasheet: ± 150 µT over 60 K at most)."""
+UNKNOWN_DRIFT_SHARE_PER_K = 0.0003
+"""Share of the rest field, per K rms, by which magnets differ from their makers' −0.12 %/K."""
+
+
+class Bounds:
+    """Bounds of one board's forces, from its calibration; nothing is remembered but settings."""
+
+    def __init__(self, model: ForceModel, layout: Layout, nominal: bool) -> None:
+        self._layout = layout
+        slopes = model.normal_slopes()
+        every = [layout.flat(slopes[..., c, k].copy()) for c in range(3) for k in range(3)]
+        self._slopes = np.stack(every, axis=1).reshape(-1, 3, 3)  # (N, component, coefficient)
+        self._array = np.repeat(np.arange(layout.arrays), layout.counts)
+        self._few: bool = bool((layout.counts < PLANE_TAXELS).all())
+        self._scale = NOMINAL_SCALE if nominal else MEASURED_SCALE
+        self._nominal = nominal
+        self._gain = np.linalg.norm(self._slopes[:, :, 0], axis=1)  # N/µT
+        self._still: Float = np.zeros(layout.taxels)  # N², what does not change with the cycle
+        self._drift: Float = np.zeros(layout.taxels)  # N/K rms
+
+    @property
+    def few(self) -> bool:
+        """Whether every array has so few taxels that their sum is as well known as one of them."""
+        return self._few
+
+    def set_noise(self, normal_sigma: Float) -> None:
+        """Noise of each taxel's normal force, (N,) N rms."""
+        self._still = normal_sigma**2 + (UNEVEN_UT * self._gain) ** 2
+
+    def set_rest(self, rest_ut: Float) -> None:
+        """The rest field in force, (N, 3) µT."""
+        per_kelvin = np.full(len(rest_ut), KNOWN_DRIFT_UT_PER_K)
+        if self._nominal:
+            share = UNKNOWN_DRIFT_SHARE_PER_K * np.linalg.norm(rest_ut, axis=1)
+            per_kelvin = np.hypot(UNKNOWN_DRIFT_UT_PER_K, share)
+        self._drift = per_kelvin * self._gain
+
+    def drift_sigma(self, warmer_k: Float) -> Float:
+        """(N,) N rms that ``warmer_k`` (N,) K since the rest was taken may look like."""
+        return np.abs(warmer_k) * self._drift
+
+    def taxels(self, estimate: Estimate, drift: Float) -> Float:
+        """(N,) N, the additive bound of each taxel's normal force. ``drift``: `drift_sigma`."""
+        a = self._array
+        ambient = (self._slopes[:, :, 0] * estimate.sigma[a]) ** 2
+        slope = (self._slopes[:, :, 1:] ** 2).sum(axis=(1, 2)) * estimate.slope_sigma[a] ** 2
+        variance: Float = ambient.sum(axis=1) + slope + self._still + drift**2
+        return QUANTILE_95 * np.sqrt(variance)
+
+    def together(self, taxels: list[int], estimate: Estimate, drift: Float) -> float:
+        """N, the additive bound of the summed normal force of ``taxels``."""
+        if not taxels:
+            return 0.0
+        variance = float((self._still[taxels] + drift[taxels] ** 2).sum())
+        arrays = self._array[taxels]
+        for a in np.unique(arrays).tolist():
+            lost = self._slopes[taxels][arrays == a].sum(axis=0)  # (component, coefficient)
+            variance += float(((lost[:, 0] * estimate.sigma[a]) ** 2).sum())
+            variance += float((lost[:, 1:] ** 2).sum()) * float(estimate.slope_sigma[a]) ** 2
+        return QUANTILE_95 * math.sqrt(variance)
+
+    def implausible(self, force: Float) -> float:
+        """N that no contact exerts: pulls, and shear beyond friction; ``force`` (N, 3) N.
+
+        A magnet that passes looks like that. Only where the skin's own calibration tells what a
+        press looks like, and there is little else to tell it by.
+        """
+        if self._nominal or not self._few:
+            return 0.0
+        normal = -force[:, 2]
+        shear = np.hypot(force[:, 0], force[:, 1])
+        pull = float(np.nanmax(-normal, initial=0.0)) - PULL_N
+        slip = float(np.nanmax(shear - FRICTION * np.maximum(normal, 0.0), initial=0.0)) - SLIP_N
+        return max(pull, 0.0) + max(slip, 0.0)
+
+    def scaled(self, force: float) -> float:
+        """N by which a force of ``force`` N may be off for its scale alone."""
+        return self._scale * abs(force)
