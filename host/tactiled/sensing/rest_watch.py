@@ -96,7 +96,7 @@ class RestWatch:
         if estimate.leap.any() or (np.abs(estimate.theta[:, :, 0]) > EARTH_UT).any():
             return False
         free = (np.abs(forces).max(axis=1) < BACK_N) & healthy
-        return bool((free.sum(axis=1) >= 0.8 * healthy.sum(axis=1)).all())
+        return bool((free | ~healthy).all())
 
     def _bare(
         self, field: Float, healthy: Bool, captured: Instant, last: tuple[Instant, Float] | None
