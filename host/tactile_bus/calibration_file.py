@@ -26,8 +26,9 @@ from tactile_bus.net_file import net_lines, read_net
 Float = NDArray[np.float64]
 
 FORMAT_NAME = "tactile-calibration"
-FORMAT_VERSION = 2
-"""2 added ``[[net]]``, fitted models of the whole contact; a file without any is written as 1."""
+FORMAT_VERSION = 3
+"""2 added ``[[net]]``, fitted models of the whole contact; 3 ``posed``, for arrays whose place is not
+known. A file is written in the oldest version that holds what it says."""
 SUFFIX = ".cal.toml"
 MAX_FILE_BYTES = 64 * 1024 * 1024
 """Four arrays of 128 taxels with every coupling block come to about 13 MB of text."""
@@ -74,7 +75,7 @@ def saves(calibration: BoardCalibration) -> str:
         "# Calibration of one taxel board. Lengths in m, angles in deg, fields in uT, forces in N;",
         "# vectors in taxel axes (z is the outward normal) unless a key says otherwise.",
         f"format = {quoted(FORMAT_NAME)}",
-        f"format_version = {FORMAT_VERSION if calibration.nets else 1}",
+        f"format_version = {_version(calibration)}",
         f"serial_number = {quoted(calibration.serial_number)}",
         f"model = {quoted(calibration.model)}",
         f"frame = {quoted(calibration.frame)}",
@@ -124,6 +125,13 @@ def loads(text: str, source: str = "calibration") -> BoardCalibration:
         raise CalibrationError(f"{source}: {error}") from error
 
 
+def _version(calibration: BoardCalibration) -> int:
+    """Oldest version of the format that holds all that ``calibration`` says."""
+    if not all(array.geometry.posed for array in calibration.arrays):
+        return 3
+    return 2 if calibration.nets else 1
+
+
 def _array_lines(array: ArrayCalibration) -> Iterable[str]:
     g = array.geometry
     n = g.taxels
@@ -133,6 +141,8 @@ def _array_lines(array: ArrayCalibration) -> Iterable[str]:
     yield f"side = {quoted(g.side.name.lower())}"
     yield f"rows = {g.rows}"
     yield f"columns = {g.columns}"
+    if not g.posed:
+        yield "posed = false  # where it is mounted is not known: the places below are a guess"
     yield from matrix_lines("position_m", g.position, "x, y, z of each taxel in the frame above")
     yield from matrix_lines(
         "rotation", g.rotation.reshape(n, 9), "taxel axes to the frame, row-major"
@@ -167,6 +177,7 @@ def _read_array(table: Table) -> ArrayCalibration:
     skew = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max()
     if skew > ORTHONORMAL_TOLERANCE or (np.linalg.det(rotation) < 0).any():
         raise table.wrong("rotation", f"off by {skew:.2g}", "right-handed orthonormal matrices")
+    posed = table.boolean("posed") if table.has("posed") else True
     geometry = ArrayGeometry(
         name=name,
         side=_SIDES[side],
@@ -176,6 +187,7 @@ def _read_array(table: Table) -> ArrayCalibration:
         rotation=rotation,
         surface=table.matrix("surface_m", n, 2),
         chip_yaw=np.deg2rad(table.vector("chip_yaw_deg", n)),
+        posed=posed,
     )
     reference = table.number("reference_c")
     rest, drift = table.matrix("rest_ut", n, 3), table.matrix("drift_ut_per_k", n, 3)

@@ -121,7 +121,7 @@ class BoardCalibration:
         text("nominal" if self.nominal else "measured")
         for array in self.arrays:
             g = array.geometry
-            text(f"{g.name}/{int(g.side)}/{g.rows}x{g.columns}")
+            text(f"{g.name}/{int(g.side)}/{g.rows}x{g.columns}{'' if g.posed else '/unposed'}")
             for place in (g.position, g.rotation, g.surface, yaw_degrees(g.chip_yaw)):
                 numbers(place)
             numbers(array.rest_ut)

@@ -34,7 +34,10 @@ class ArrayGeometry:
     ``position``: (n, 3) m in ``ee``. ``rotation``: (n, 3, 3), taxel axes to ``ee`` axes (columns
     are the taxel's x, y, z in ``ee``). ``surface``: (n, 2) m, coordinates of the taxels on the
     unrolled skin, over which planes are fitted. ``chip_yaw``: (n,) rad, turn of each chip about
-    its z from the taxel's axes, so that v_taxel = Rz(chip_yaw) v_chip.
+    its z from the taxel's axes, so that v_taxel = Rz(chip_yaw) v_chip. ``posed``: whether the
+    array's place and attitude in ``ee`` are known. Where they are not (False), the taxels lie to
+    one another as said, but the array as a whole sits anywhere: it must not be told from another
+    array which way a field points, or where a contact of both is.
     """
 
     name: str
@@ -45,6 +48,7 @@ class ArrayGeometry:
     rotation: Float
     surface: Float
     chip_yaw: Float
+    posed: bool = True
 
     def __post_init__(self) -> None:
         """Refuse arrays whose shapes disagree."""
@@ -85,6 +89,11 @@ class SkinGeometry:
         """Where each array stands in arrays that hold all taxels one after another."""
         ends = np.cumsum([0, *(a.taxels for a in self.arrays)]).tolist()
         return tuple(slice(a, b) for a, b in itertools.pairwise(ends))
+
+    @property
+    def posed(self) -> bool:
+        """Whether the arrays' poses relative to one another are known; True for a lone array."""
+        return len(self.arrays) == 1 or all(a.posed for a in self.arrays)
 
 
 def grid_on_plane(
@@ -204,23 +213,66 @@ def finger() -> SkinGeometry:
     )
 
 
+ANYSKIN_CHIPS = 5
+"""Magnetometers of one AnySkin board: centre, left, right, up, down."""
+
+ANYSKIN_OFFSET = 0.008
+"""m from the centre to the other four."""
+
+ANYSKIN_YAW_DEG = (-90.0, -90.0, 180.0, 90.0, 0.0)
+"""How each chip is mounted."""
+
+
 def anyskin() -> SkinGeometry:
     """Five-magnetometer AnySkin board: centre, left, right, up, down, 8 mm out from the centre.
 
     Chips are mounted with their own yaw (−90, −90, 180, 90, 0°). The array is one row of five for
     numbering only; it is mounted flat at the tip until a calibration file says otherwise.
     """
-    d = 0.008
+    return SkinGeometry("anyskin", "ee", (anyskin_board("skin", Side.TIP),))
+
+
+def anyskin_board(name: str, side: Side, sideways: float = 0.0) -> ArrayGeometry:
+    """One five-magnetometer board on ``side`` of the finger, ``sideways`` m along its own x."""
+    d = ANYSKIN_OFFSET
     surface = np.array([[0, 0], [-d, 0], [d, 0], [0, d], [0, -d]])
-    axes = np.column_stack([(0, 1.0, 0), (0, 0, 1.0), (1.0, 0, 0)])
-    array = ArrayGeometry(
-        name="skin",
-        side=Side.TIP,
+    axes, centre = _mount(side)
+    return ArrayGeometry(
+        name=name,
+        side=side,
         rows=1,
-        columns=5,
-        position=np.array([FINGER_OUTLINE[3][0], 0, 0]) + surface @ axes[:, :2].T,
-        rotation=np.broadcast_to(axes, (5, 3, 3)).copy(),
+        columns=ANYSKIN_CHIPS,
+        position=centre + sideways * axes[:, 0] + surface @ axes[:, :2].T,
+        rotation=np.broadcast_to(axes, (ANYSKIN_CHIPS, 3, 3)).copy(),
         surface=surface,
-        chip_yaw=np.deg2rad([-90.0, -90.0, 180.0, 90.0, 0.0]),
+        chip_yaw=np.deg2rad(ANYSKIN_YAW_DEG),
     )
-    return SkinGeometry(model="anyskin", frame="ee", arrays=(array,))
+
+
+def _mount(side: Side) -> tuple[Float, Float]:
+    """Axes (3, 3) and centre (3,) m in ``ee`` of a board on a side of the finger; z outwards."""
+    up = (0.0, 0.0, 1.0)
+    if side is Side.LEFT:
+        axes, centre = np.column_stack([(-1.0, 0, 0), up, (0, 1.0, 0)]), (0.080, 0.0285, 0.0)
+    elif side is Side.RIGHT:
+        axes, centre = np.column_stack([(1.0, 0, 0), up, (0, -1.0, 0)]), (0.080, -0.0285, 0.0)
+    else:
+        axes, centre = np.column_stack([(0, 1.0, 0), up, (1.0, 0, 0)]), (FINGER_OUTLINE[3][0], 0, 0)
+    return axes, np.array(centre)
+
+
+MOUNTS = (Side.LEFT, Side.RIGHT, Side.TIP, Side.TIP)
+"""Sides of the finger on which up to four simulated AnySkin boards of a controller sit."""
+
+
+def anyskin_jaws(boards: int) -> SkinGeometry:
+    """Up to four AnySkin boards of one controller, on different sides of the finger."""
+    if not 1 <= boards <= len(MOUNTS):
+        raise ValueError(f"{boards} AnySkin boards; allowed: 1 to {len(MOUNTS)}")
+    if boards == 1:
+        return anyskin()
+    arrays = tuple(
+        anyskin_board(f"skin{i}", side, 0.03 if i == 3 else 0.0)
+        for i, side in enumerate(MOUNTS[:boards])
+    )
+    return SkinGeometry("anyskin", "ee", arrays)

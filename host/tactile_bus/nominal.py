@@ -6,12 +6,16 @@ about two; their rest field is unknown and must be tared.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from sensor_proto.packets import ArrayDescriptor, Descriptor
 from tactile_bus.calibration_types import ArrayCalibration, BoardCalibration
 from tactile_bus.geometry import (
+    ANYSKIN_CHIPS,
     ArrayGeometry,
     Side,
     SkinGeometry,
@@ -35,7 +39,8 @@ REFERENCE_C = 25.0
 ANYSKIN_PITCH = 0.008
 """m between neighbouring magnetometers of an AnySkin board."""
 ANYSKIN_BOARD_PITCH = 0.030
-"""m between the centres of AnySkin boards on one controller, until a file says how they lie."""
+"""m between the centres of AnySkin boards on one controller, until a file says how they lie: far
+enough apart for a picture. They sit on different fingers or jaws, so nothing follows from it."""
 MAX_ANYSKIN_MAGNETOMETERS = 20
 """One controller reads four boards of five."""
 
@@ -51,18 +56,25 @@ def nominal_newton_per_ut(taxels: int, shear: float, normal: float) -> Float:
     return np.diag(np.tile([1 / shear, 1 / shear, -1 / normal], taxels))
 
 
-def nominal(model: str, serial_number: str, magnetometers: int | None = None) -> BoardCalibration:
+def nominal(
+    model: str,
+    serial_number: str,
+    magnetometers: int | None = None,
+    arrays: Sequence[int] | None = None,
+) -> BoardCalibration:
     """Typical figures for ``model``, one of `NOMINAL_MODELS`; ValueError for any other.
 
-    ``magnetometers``: of an ``anyskin`` controller, 1 to 20 (five to a board), numbered as on its
-    bus; all of them are taxels of one array.
+    ``magnetometers``: of an ``anyskin`` controller, 1 to 20, numbered as on its bus. ``arrays``:
+    how many of them each of its boards has; None: fives where that goes up, else all one array.
+    Where several boards lie to one another nobody knows: their arrays are not ``posed``.
     """
     if model == "finger":
         if magnetometers is not None:
             raise ValueError("magnetometers is a property of anyskin boards alone")
         return _typical(finger(), serial_number, "finger of the default end-effector")
     if model == "anyskin":
-        return _typical(_anyskin_controller(magnetometers or 5), serial_number, "AnySkin")
+        count = sum(arrays) if magnetometers is None and arrays else magnetometers or ANYSKIN_CHIPS
+        return _typical(_anyskin_controller(count, arrays), serial_number, "AnySkin")
     raise ValueError(f"no nominal figures for model {model!r}; there are {NOMINAL_MODELS}")
 
 
@@ -70,7 +82,7 @@ def nominal_from_descriptor(descriptor: Descriptor) -> BoardCalibration:
     """Typical figures for the board that sent ``descriptor``.
 
     A known model whose arrays have the same shapes gets that model's geometry; any other gets
-    flat grids of the descriptor's rows, columns and pitch, all at the tip.
+    flat grids of the descriptor's rows, columns and pitch, all at the tip and not ``posed``.
     """
     shapes = [(a.rows, a.columns) for a in descriptor.arrays]
     if descriptor.model == "finger":
@@ -107,46 +119,71 @@ def _typical(geometry: SkinGeometry, serial_number: str, what: str) -> BoardCali
     )
 
 
-def _anyskin_controller(magnetometers: int) -> SkinGeometry:
-    """One board of five, several of them side by side, or a plain row of any other number."""
+def default_arrays(magnetometers: int) -> tuple[int, ...]:
+    """How many magnetometers each board of an AnySkin controller has, where nobody says it."""
+    boards, rest = divmod(magnetometers, ANYSKIN_CHIPS)
+    return (magnetometers,) if rest else (ANYSKIN_CHIPS,) * boards
+
+
+def _anyskin_controller(magnetometers: int, arrays: Sequence[int] | None) -> SkinGeometry:
+    """The boards of one controller side by side; a plain row for a board that has not five."""
     if not 1 <= magnetometers <= MAX_ANYSKIN_MAGNETOMETERS:
         raise ValueError(
             f"{magnetometers} magnetometers: an AnySkin controller reads 1 to "
             f"{MAX_ANYSKIN_MAGNETOMETERS}"
         )
-    board = anyskin()
-    if magnetometers == board.taxels:
-        return board
-    five = board.arrays[0]
-    axes, centre = five.rotation[0], five.position[0]
-    boards, rest = divmod(magnetometers, five.taxels)
-    if rest:
-        surface = np.zeros((magnetometers, 2))
-        surface[:, 0] = (np.arange(magnetometers) - (magnetometers - 1) / 2) * ANYSKIN_PITCH
-        yaw = np.zeros(magnetometers)
-    else:
-        along = (np.arange(boards) - (boards - 1) / 2) * ANYSKIN_BOARD_PITCH
-        surface = np.tile(five.surface, (boards, 1))
-        surface[:, 0] += np.repeat(along, five.taxels)
-        yaw = np.tile(five.chip_yaw, boards)
-    array = ArrayGeometry(
-        name=five.name,
+    sizes = default_arrays(magnetometers) if arrays is None else tuple(arrays)
+    if sum(sizes) != magnetometers or min(sizes) < 1:
+        raise ValueError(
+            f"arrays of {' + '.join(map(str, sizes))} magnetometers for a board that has "
+            f"{magnetometers}; allowed: whole numbers above 0 that add up to {magnetometers}"
+        )
+    five = anyskin().arrays[0]
+    middle = (len(sizes) - 1) / 2
+    return SkinGeometry(
+        "anyskin",
+        "ee",
+        tuple(
+            _board(
+                five,
+                five.name if len(sizes) == 1 else f"{five.name}{i}",
+                size,
+                (i - middle) * ANYSKIN_BOARD_PITCH,
+            )
+            for i, size in enumerate(sizes)
+        ),
+    )
+
+
+def _board(five: ArrayGeometry, name: str, size: int, sideways: float) -> ArrayGeometry:
+    """One board of ``size`` magnetometers, ``sideways`` m along its x from the place of ``five``.
+
+    Nobody said where it is mounted: it is not posed.
+    """
+    axes = five.rotation[0]
+    shift = sideways * axes[:, 0]
+    if size == five.taxels:
+        return replace(five, name=name, position=five.position + shift, posed=False)
+    surface = np.zeros((size, 2))
+    surface[:, 0] = (np.arange(size) - (size - 1) / 2) * ANYSKIN_PITCH
+    return ArrayGeometry(
+        name=name,
         side=five.side,
         rows=1,
-        columns=magnetometers,
-        position=centre + surface @ axes[:, :2].T,
-        rotation=np.broadcast_to(axes, (magnetometers, 3, 3)).copy(),
+        columns=size,
+        position=five.position[0] + shift + surface @ axes[:, :2].T,
+        rotation=np.broadcast_to(axes, (size, 3, 3)).copy(),
         surface=surface,
-        chip_yaw=yaw,
+        chip_yaw=np.zeros(size),
+        posed=False,
     )
-    return SkinGeometry(board.model, board.frame, (array,))
 
 
 def _flat(array: ArrayDescriptor) -> ArrayGeometry:
     tip = finger().arrays[-1]
     axes = np.column_stack([(0, 1.0, 0), (0, 0, 1.0), (1.0, 0, 0)])
     pitch = array.pitch_um * 1e-6
-    return grid_on_plane(
+    grid = grid_on_plane(
         array.name or f"array{array.array}",
         Side.TIP,
         (array.rows, array.columns),
@@ -154,3 +191,4 @@ def _flat(array: ArrayDescriptor) -> ArrayGeometry:
         (float(tip.position[:, 0].max()), 0.0, 0.0),
         axes,
     )
+    return replace(grid, posed=False)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from enum import IntFlag
 from typing import NamedTuple
 
@@ -54,6 +56,26 @@ class SampleBlock:
     field_ut: Float
     temperature_c: Float
     status: NDArray[np.uint8]
+
+    def split(self, sizes: Sequence[int]) -> tuple[SampleBlock, ...]:
+        """One block an array, of a block that holds all ``sizes`` taxels of a board together.
+
+        So send boards that know nothing of arrays. Any other block comes back as it is.
+        """
+        if len(sizes) < 2 or self.array != 0 or self.field_ut.shape != (sum(sizes), 3):
+            return (self,)
+        ends = np.cumsum([0, *sizes]).tolist()
+        common = len(self.temperature_c) == 1
+        return tuple(
+            replace(
+                self,
+                array=a,
+                field_ut=self.field_ut[begin:end],
+                temperature_c=self.temperature_c if common else self.temperature_c[begin:end],
+                status=self.status[begin:end],
+            )
+            for a, (begin, end) in enumerate(itertools.pairwise(ends))
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -114,6 +114,7 @@ class MessageMaker:
             position=_flat(np.concatenate([a.position for a in arrays])),
             normal=_flat(np.concatenate([a.rotation[:, :, 2] for a in arrays])),
             surface=_flat(np.concatenate([a.surface for a in arrays])),
+            array_posed=np.array([a.posed for a in arrays], np.bool_),
         )
 
     def _header(self, cycle: Cycle) -> Any:

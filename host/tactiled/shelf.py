@@ -17,6 +17,7 @@ from tactile_bus.calibration import (
 from tactile_bus.calibration_file import SUFFIX
 from tactile_bus.log_reader import LogReader
 from tactile_bus.log_records import AttachmentRecord
+from tactile_bus.nominal import default_arrays
 from tactiled.links.events import Identity, Refusal
 
 UNNUMBERED = "unknown"
@@ -81,7 +82,7 @@ class Shelf:
             alike = [
                 (p, c)
                 for p, c in self._files.items()
-                if c.model == identity.model and _shapes(c) == identity.shapes
+                if c.model == identity.model and _alike(identity, c)
             ]
             if len(alike) == 1:
                 path, calibration = alike[0]
@@ -104,20 +105,44 @@ def _nominal(identity: Identity) -> Choice | Refusal:
     if identity.descriptor is not None:
         calibration = nominal_from_descriptor(identity.descriptor)
     else:
-        count = identity.shapes[0][0] * identity.shapes[0][1]
-        calibration = nominal(identity.model, identity.serial_number or UNNUMBERED, count)
+        serial, count, arrays = identity.serial_number, identity.taxels, identity.arrays
+        if arrays is not None and sum(arrays) != count:
+            return Refusal(
+                f"--arrays {'+'.join(map(str, arrays))} names {sum(arrays)} magnetometers, the "
+                f"{identity} has {count}",
+                f"give numbers that add up to {count}, such as "
+                f"{'+'.join(map(str, default_arrays(count)))}",
+            )
+        calibration = nominal(identity.model, serial or UNNUMBERED, count, arrays)
     warning = f"no calibration for {identity}: nominal figures, forces right to a factor of two"
     return Choice(calibration, None, warning)
 
 
 def _fitting(identity: Identity, calibration: BoardCalibration, path: Path) -> Choice | Refusal:
-    if _shapes(calibration) == identity.shapes:
+    if _alike(identity, calibration):
         return Choice(calibration, path)
+    if identity.arrays is not None and calibration.geometry.taxels == identity.taxels:
+        return Refusal(
+            f"{path} describes arrays of {_text(_shapes(calibration))} taxels, --arrays says "
+            f"{'+'.join(map(str, identity.arrays))}",
+            "leave --arrays out: the file knows",
+        )
     return Refusal(
         f"{path} describes arrays of {_text(_shapes(calibration))} taxels, {identity} has "
         f"{_text(identity.shapes)}",
         "calibrate the board again: its firmware or its arrays have changed since",
     )
+
+
+def _alike(identity: Identity, calibration: BoardCalibration) -> bool:
+    """Whether a calibration is of arrays like the board's.
+
+    A board that describes itself names its arrays; of one that does not the file knows better.
+    """
+    if identity.descriptor is not None:
+        return _shapes(calibration) == identity.shapes
+    sizes = tuple(array.geometry.taxels for array in calibration.arrays)
+    return sum(sizes) == identity.taxels and identity.arrays in (None, sizes)
 
 
 def _shapes(calibration: BoardCalibration) -> tuple[tuple[int, int], ...]:

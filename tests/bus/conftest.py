@@ -54,7 +54,7 @@ def example_messages() -> dict[topics.Topic, Any]:
         topics.GEOMETRY: MSG.SkinGeometry(
             head, "0011223344556677", "finger", ["left"], np.array([1], u8), np.array([1], u16),
             np.array([1], u16), np.arange(3, dtype=f32), np.arange(3, dtype=f32),
-            np.arange(2, dtype=f32),
+            np.arange(2, dtype=f32), np.array([True]),
         ),
         topics.RAW: MSG.RawChunk(
             head, 12, 1, np.array([0x1234], np.uint32), np.array([3], u8), np.array([1, 2, 3], u8)

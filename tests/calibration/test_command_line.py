@@ -166,7 +166,7 @@ def test_a_fit_leaves_a_file_that_says_where_it_is_from(capsys, quick, write_pai
     # what is wrong with the file is named, by key
     text = out.read_text()
     for old, new, words in (
-        ("format_version = 2", "format_version = 9", ["newer than 2"]),
+        ("format_version = 3", "format_version = 9", ["newer than 3"]),
         ('targets = ["normal"]', 'targets = ["weight"]', ["net[0]", "weight", "normal"]),
         ("degree = 1", "degree = 99", ["net[0].degree", "99"]),
         ("lagged = 0", "lagged = 900", ["lagged is 900"]),

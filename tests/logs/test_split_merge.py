@@ -66,7 +66,7 @@ def test_values_that_hold_begin_every_part(
     none = np.zeros(0, np.float32)
     geometry = MSG.SkinGeometry(
         header(1, "ee"), "0011", "finger", [], np.zeros(0, np.uint8), np.zeros(0, np.uint16),
-        np.zeros(0, np.uint16), none, none, none,
+        np.zeros(0, np.uint16), none, none, none, np.zeros(0, np.bool_),
     )  # fmt: skip
     path = tmp_path / "run.mcap"
     recorder = Recorder(path, RecorderSettings(min_free_bytes=0))

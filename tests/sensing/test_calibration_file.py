@@ -73,7 +73,7 @@ def test_the_hash_changes_with_any_number(measured):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("format_version = 1", "format_version = 3", ["format_version is 3", "newer than 2"]),
+        ("format_version = 1", "format_version = 4", ["format_version is 4", "newer than 3"]),
         ('format = "tactile-calibration"', 'format = "mask"', ["format", "mask"]),
         ("nominal = false", 'nominal = "no"', ["nominal is 'no'", "true or false"]),
         ('side = "left"', 'side = "top"', ["array[0].side is top", "left, right, tip"]),
@@ -163,14 +163,48 @@ def test_nominal_figures_say_so_and_have_the_published_sensitivity():
 
 def test_anyskin_controllers_of_any_size():
     for count in range(1, 21):
-        array = nominal("anyskin", "A", count).arrays[0].geometry
-        assert array.taxels == count
-        apart = np.linalg.norm(array.surface[:, None] - array.surface[None], axis=2)
-        assert count == 1 or apart[~np.eye(count, dtype=bool)].min() > 0.007
-    two = nominal("anyskin", "A", 10).arrays[0].geometry
-    np.testing.assert_allclose(np.rad2deg(two.chip_yaw), [-90, -90, 180, 90, 0] * 2)
+        skin = nominal("anyskin", "A", count).geometry
+        assert skin.taxels == count
+        assert {a.taxels for a in skin.arrays} == ({count} if count % 5 else {5})
+        for array in skin.arrays:
+            apart = np.linalg.norm(array.surface[:, None] - array.surface[None], axis=2)
+            assert array.taxels == 1 or apart[~np.eye(array.taxels, dtype=bool)].min() > 0.007
+    for array in nominal("anyskin", "A", 10).geometry.arrays:
+        np.testing.assert_allclose(np.rad2deg(array.chip_yaw), [-90, -90, 180, 90, 0])
     with pytest.raises(ValueError, match="1 to 20"):
         nominal("anyskin", "A", 21)
+
+
+def test_boards_of_one_controller_are_arrays_whose_places_nobody_knows():
+    skin = nominal("anyskin", "A", 10).geometry
+    assert [(a.name, a.taxels, a.posed) for a in skin.arrays] == [
+        ("skin0", 5, False),
+        ("skin1", 5, False),
+    ]
+    assert not skin.posed
+    assert nominal("anyskin", "A", 5).geometry.posed  # a lone array has no other to be posed to
+    uneven = nominal("anyskin", "A", 7, (5, 2)).geometry
+    assert [a.taxels for a in uneven.arrays] == [5, 2]
+    one = nominal("anyskin", "A", 10, (10,)).geometry
+    assert [a.taxels for a in one.arrays] == [10]
+    for wrong in ((5, 4), (5, 0, 5), (11,)):
+        with pytest.raises(ValueError, match="add up to 10"):
+            nominal("anyskin", "A", 10, wrong)
+
+
+def test_whether_arrays_are_posed_goes_through_the_file():
+    skin = nominal("anyskin", "A", 10)
+    text = calibration.saves(skin)
+    assert "format_version = 3" in text
+    again = calibration.loads(text)
+    assert [a.geometry.posed for a in again.arrays] == [False, False]
+    assert again.hash == skin.hash
+    placed = calibration.loads(text.replace("posed = false", "posed = true"))
+    assert placed.geometry.posed
+    assert placed.hash != skin.hash
+    assert "format_version = 1" in calibration.saves(placed)
+    with pytest.raises(CalibrationError, match="true or false"):
+        calibration.loads(text.replace("posed = false", "posed = 1"))
 
 
 def _descriptor(model, *shapes):

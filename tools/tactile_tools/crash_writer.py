@@ -57,7 +57,15 @@ def run(directory: Path, truth: Path, seed: int, seconds: float) -> None:
     names = np.zeros(0, np.uint8), np.zeros(0, np.uint16), np.zeros(0, np.uint16)
     now_ns = first_ns
     geometry = MSG.SkinGeometry(
-        header(now_ns, "ee"), "serial", "finger", [], *names, empty, empty, empty
+        header(now_ns, "ee"),
+        "serial",
+        "finger",
+        [],
+        *names,
+        empty,
+        empty,
+        empty,
+        np.zeros(0, np.bool_),
     )
     hand_over(GEOMETRY, geometry, now_ns)
     while time.monotonic() < end:

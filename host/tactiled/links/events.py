@@ -17,7 +17,9 @@ class Identity:
     """What is known of a board. ``serial_number`` is empty where neither board nor port has one.
 
     ``shapes``: rows and columns of each array. ``max_rate``: Hz, None where the board does not
-    say. ``descriptor``: the board's own words, None where it has none.
+    say. ``descriptor``: the board's own words, None where it has none. Boards without one send all
+    their taxels as one array; ``arrays`` says how many each of them has, where the user said it.
+    ``layout``: how such a board writes its samples, empty for the usual floats.
     """
 
     serial_number: str
@@ -26,6 +28,13 @@ class Identity:
     shapes: tuple[tuple[int, int], ...]
     max_rate: float | None
     descriptor: Descriptor | None = None
+    arrays: tuple[int, ...] | None = None
+    layout: str = ""
+
+    @property
+    def taxels(self) -> int:
+        """Number of taxels of the whole board."""
+        return sum(rows * columns for rows, columns in self.shapes)
 
     @classmethod
     def of(cls, descriptor: Descriptor) -> Identity:

@@ -47,7 +47,8 @@ class BoardPipeline:
         geometry = calibration.geometry
         self._layout = layout = Layout(geometry)
         self._model = ForceModel(calibration, layout)
-        self._grouper = Grouper(tuple(a.taxels for a in geometry.arrays))
+        self._sizes = tuple(a.taxels for a in geometry.arrays)
+        self._grouper = Grouper(self._sizes)
         self._monitor = HealthMonitor(layout, settings.frozen_after_s, settings.range_limit_ut)
         self._compensator: Compensator = make_compensator(settings, layout, self._model)
         self._features = FeatureExtractor(geometry, settings)
@@ -153,7 +154,11 @@ class BoardPipeline:
 
     def feed(self, block: SampleBlock) -> list[Cycle]:
         """Cycles that ``block`` ends: none, one, or two when it also ends an incomplete one."""
-        return [self._cycle(group) for group in self._grouper.feed(block)]
+        return [
+            self._cycle(group)
+            for part in block.split(self._sizes)
+            for group in self._grouper.feed(part)
+        ]
 
     def flush(self) -> list[Cycle]:
         """The cycle under way, as it stands; for the end of a stream."""
