@@ -11,19 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sensor_proto.anyskin_search import (
-    COLDEST_C,
-    END,
-    FLOAT,
-    HOTTEST_C,
-    MAX_MAGNETOMETERS,
-    TINY_C,
-    Search,
-    frame_size,
-    plausible,
-)
+from sensor_proto.anyskin_search import END, FLOAT, MAX_MAGNETOMETERS, Search, frame_size
 from sensor_proto.decoder import ACCEPTED, Reject, Tally
 from sensor_proto.packets import FloatBurst, FloatSamples, Received, TaxelStatus
+from sensor_proto.temperature import COLDEST_C, HOTTEST_C, TINY_C, plausible
 
 SUSPECT_FRAMES = 3
 """Consecutive frames with mostly impossible temperatures after which the boundary is doubted."""

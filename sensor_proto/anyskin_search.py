@@ -13,27 +13,22 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from sensor_proto.temperature import evidence, plausible, temperature_first
+
 MAX_MAGNETOMETERS = 20
 """Four boards of five on one controller, the largest assembly on sale."""
 
 LOCK_FRAMES = 3
 """Consecutive frames that must fit before a count of magnetometers is believed."""
 
+SURE_FRAMES = 8
+"""Frames that show whether a column moves as a temperature does."""
+
 READING = 16
 """Bytes of one magnetometer: t, x, y, z as float32."""
 
 END = b"\r\n"
 FLOAT = np.dtype("<f4")
-
-COLDEST_C, HOTTEST_C = -45.0, 130.0
-"""MLX90393 works from −40 to 85 °C; some room for self-heating and trim."""
-
-FAILED_C = (-998.1, 451.8)
-"""What its temperature formula gives for raw 0 and 0xFFFF: the chip did not answer."""
-
-TINY_C = 1e-3
-"""Half of all bit patterns are floats below 1; a temperature in steps of 1/45.2 °C never is this
-close to nought, save nought itself."""
 
 AFTER_END = 0.04
 """Worth of CR LF right before a frame: decides only between claims whose temperatures are equally
@@ -45,16 +40,6 @@ Flags = NDArray[np.bool_]
 def frame_size(magnetometers: int) -> int:
     """Bytes of one frame."""
     return READING * magnetometers + len(END)
-
-
-def plausible(temperature_c: NDArray[np.float32]) -> Flags:
-    """Whether each can come from a chip, working or dead; same shape."""
-    size = np.abs(temperature_c)
-    usual = (temperature_c >= COLDEST_C) & (temperature_c <= HOTTEST_C)
-    usual &= (size >= TINY_C) | (size == 0)
-    for dead in FAILED_C:
-        usual |= np.abs(temperature_c - np.float32(dead)) < 0.1
-    return usual
 
 
 class Search:
@@ -82,9 +67,37 @@ class Search:
             return None
         for count in counts:
             start = self._first(count, LOCK_FRAMES)
-            if start is not None:
+            if start is None:
+                continue
+            sure = self._sure(start, count)
+            if sure:
                 return start, count
+            if sure is None:
+                return None
         return None
+
+    def _sure(self, start: int, count: int) -> bool | None:
+        """Whether what stands where t should be is a temperature; None: more must come to tell.
+
+        Fields of a bare board are as small as temperatures. Then numbers in the order x, y, z, t
+        would pass for t, x, y, z, and so would four chips without temperatures for three with.
+        """
+        size = frame_size(count)
+        whole = 0
+        while whole < SURE_FRAMES and start + (whole + 1) * size <= self._size:
+            if not self._mark[start + (whole + 1) * size - len(END)]:
+                break
+            whole += 1
+        raw = self._values[start : start + whole * size].reshape(whole, size)
+        values = raw[:, : -len(END)].copy().view(FLOAT).reshape(whole, count, 4)
+        if temperature_first(values) is False:
+            return False
+        if count % 3:
+            return True
+        first = evidence(values, 0)
+        if first.sure:
+            return True
+        return None if first.likely and whole < SURE_FRAMES else False
 
     def _first(self, count: int, depth: int) -> int | None:
         """Best supported of the first claims that overlap; None while support may yet come."""

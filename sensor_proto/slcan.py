@@ -22,17 +22,29 @@ BITRATES = {
     10_000: b"S0",
     20_000: b"S1",
     50_000: b"S2",
+    83_300: b"S9",
+    83_333: b"S9",
     100_000: b"S3",
     125_000: b"S4",
     250_000: b"S5",
     500_000: b"S6",
+    750_000: b"S7",
     800_000: b"S7",
     1_000_000: b"S8",
 }
-"""bit/s → command, LAWICEL CAN232 manual. Some firmware takes S7 for 750 kbit/s."""
+"""bit/s → command, LAWICEL CAN232 manual; S9 (83.3 kbit/s) as CANable and Seeed add it. S7 is
+800 kbit/s by that manual and 750 with CANable's firmware: the adapter makes of it what it does."""
 
-DATA_BITRATES = {2_000_000: b"Y2", 5_000_000: b"Y5"}
-"""bit/s of the data phase → command, CANable 2.0."""
+DATA_BITRATES = {
+    500_000: b"Y0",
+    1_000_000: b"Y1",
+    2_000_000: b"Y2",
+    3_000_000: b"Y3",
+    4_000_000: b"Y4",
+    5_000_000: b"Y5",
+    8_000_000: b"Y8",
+}
+"""bit/s of the data phase → command, CANable 2.0 and its successors; few adapters have all."""
 
 LENGTH_OF_CODE = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 """Data bytes for each length code of CAN FD, ISO 11898-1."""

@@ -27,8 +27,8 @@ Float = NDArray[np.float64]
 
 FORMAT_NAME = "tactile-calibration"
 FORMAT_VERSION = 3
-"""2 added ``[[net]]``, fitted models of the whole contact; 3 ``posed``, for arrays whose place is not
-known. A file is written in the oldest version that holds what it says."""
+"""2 added ``[[net]]``, fitted models of the whole contact; 3 ``posed``, for arrays whose place
+is not known. A file is written in the oldest version that holds what it says."""
 SUFFIX = ".cal.toml"
 MAX_FILE_BYTES = 64 * 1024 * 1024
 """Four arrays of 128 taxels with every coupling block come to about 13 MB of text."""

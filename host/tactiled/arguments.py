@@ -11,9 +11,9 @@ from typing import Any
 
 from tactile_bus.options import add_log_and_bus, finite_above_zero
 from tactile_bus.session import PORTS
-from tactiled.links.line import KINDS
+from tactiled.links.line import KINDS, board_kind
 from tactiled.sensing.pipeline_settings import METHODS
-from tactiled.settings import DEFAULT_BAUD
+from tactiled.settings import DEFAULT_BAUD, array_sizes
 
 EPILOG = """\
 examples:
@@ -22,6 +22,15 @@ examples:
   tactiled --can slcan:/dev/ttyACM1@1000000
   tactiled --can socketcan:can0 --calibration left.cal.toml --calibration right.cal.toml
   tactiled --mcap tactile-logs/board0_20250101T120000Z_0000.mcap
+
+boards that write in a way of their own are declared with --board KIND:nFIELDS[,OPTION...]:
+  KIND     floats, doubles (IEEE), int16, uint16 (less 32768), int32 (counts), text
+  n        chips (magnetometers), 1 to 20
+  FIELDS   order of each chip's numbers: x y z in uT, t in C (may be left out), _ is not used
+  big      high byte first                       scale=XY/Z  uT a count (default 0.15/0.242)
+  start=HEX, skip=BYTES, check=xor|sum, tail=BYTES, end=crlf|lf|cr|none|HEX
+           what stands round the numbers of a binary frame; without any of them it is found out
+  lead=N   numbers of a text line before those of the chips; lines=N  lines of one frame
 
 exit status: 0 done; 1 failed while running; 2 bad argument or configuration; 3 refused by the
 environment: port missing, busy or not permitted, no board or the wrong one, log not writable.
@@ -78,8 +87,19 @@ def make_parser() -> argparse.ArgumentParser:
     add(
         "--board",
         action="append",
-        choices=KINDS,
-        help="what is on a serial port (default auto: found out); once for all ports, or for each",
+        type=_kind,
+        metavar="KIND",
+        help=f"what is on a serial port: {', '.join(KINDS)} (default auto: found out), or how it "
+        "writes, as in floats:5xyz, text:5txyz, int16:5xyz,big,scale=0.15/0.242 (see below); once "
+        "for all ports, or for each",
+    )
+    add(
+        "--arrays",
+        action="append",
+        type=_arrays,
+        metavar="N+N",
+        help="magnetometers of each AnySkin board on one controller, as in 5+5 (default: as the "
+        "calibration file says, else fives)",
     )
     add(
         "--name",
@@ -154,6 +174,21 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add("--verbose", action="store_true", help="say more")
     return parser
+
+
+def _kind(text: str) -> str:
+    try:
+        board_kind(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return text
+
+
+def _arrays(text: str) -> tuple[int, ...]:
+    try:
+        return array_sizes(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _above(unit: str) -> Callable[[str], float]:

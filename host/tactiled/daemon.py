@@ -151,6 +151,7 @@ class Daemon:
             fd=isinstance(transport, CanTransport) and transport.spec.fd,
             nodes=frozenset(wanted.nodes) or None,
             listen_only=replay,
+            arrays=wanted.arrays,
         )
 
         def names(nodes: tuple[int, ...], late: bool) -> dict[int, str]:

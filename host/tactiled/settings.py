@@ -15,15 +15,19 @@ from typing import Annotated, Literal, TypeVar
 import msgspec
 from msgspec import Meta
 
+from sensor_proto.layout import Kind
 from tactile_bus.calibration import CalibrationError, load
 from tactile_bus.can_bus import CanSpec
 from tactile_bus.config import ConfigError, Count, Duration, Positive, Rate, load_toml
+from tactile_bus.nominal import MAX_ANYSKIN_MAGNETOMETERS
 from tactile_bus.options import BusTable, LogTable, bus_config, log_destination
 from tactile_bus.recorder import RecorderSettings
 from tactile_bus.session import BusConfig
 from tactile_bus.topics import NAME
+from tactiled.links.line import KINDS, board_kind
 from tactiled.sensing.pipeline_settings import PipelineSettings
 from tactiled.transports import listing
+from tactiled.transports.slcan_link import slcan_commands
 
 DEFAULT_BAUD = 115_200
 
@@ -33,7 +37,22 @@ REPLAY_PREFIX = "replay"
 T = TypeVar("T")
 
 Node = Annotated[int, Meta(ge=0, le=126, description="a node number from 0 to 126")]
-Kind = Literal["auto", "tactile", "anyskin", "reskin", "eflesh"]
+
+
+BoardKind = Annotated[
+    str,
+    Meta(
+        pattern=rf"^({'|'.join(KINDS)}|({'|'.join(Kind)}):.*)$",
+        description=f"one of {', '.join(KINDS)}, or a layout such as floats:5xyz",
+    ),
+]
+Arrays = Annotated[
+    str,
+    Meta(
+        pattern=r"^[0-9]+([+][0-9]+)*$",
+        description="numbers of magnetometers joined by +, as in 5+5",
+    ),
+]
 
 
 class SettingsError(Exception):
@@ -47,7 +66,8 @@ class BoardTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     port: str | None = None
     can: str | None = None
     node: Node | None = None
-    kind: Kind = "auto"
+    kind: BoardKind = "auto"
+    arrays: Arrays | None = None
     baud: Count = DEFAULT_BAUD
     calibration: str | None = None
 
@@ -91,6 +111,7 @@ class PortSettings:
     """One port. ``spec``: path, CAN spec or log. ``nodes``: names of boards on a CAN bus by node.
 
     ``name``: of the board on a serial port; on a bus of its only board, or the stem of the names.
+    ``arrays``: magnetometers of each board of a controller that does not say it.
     """
 
     name: str
@@ -99,6 +120,7 @@ class PortSettings:
     kind: str = "auto"
     baud: int = DEFAULT_BAUD
     nodes: dict[int, str] = field(default_factory=dict)
+    arrays: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,8 +186,10 @@ def _ports(
             raise SettingsError(f"{len(names)} names for one log; give --name once: a board in it")
         return (PortSettings(names[0] if names else "", str(options.mcap), "log"),)
     if not given:
-        if names or options.board:
-            raise SettingsError("--name and --board go with --port or --can; none is given")
+        if names or options.board or options.arrays:
+            raise SettingsError(
+                "--name, --board and --arrays go with --port or --can; none is given"
+            )
         if file.board:
             return _ports_of_file(file.board, path)
         raise SettingsError(
@@ -181,7 +205,11 @@ def _ports(
         raise SettingsError(
             f"--board {options.board[0]}: such boards are serial; give their --port"
         )
+    if not serial and options.arrays:
+        raise SettingsError("--arrays: boards on a CAN bus say it themselves; leave it out")
     kinds = iter(_each("--board", options.board or ["auto"], serial))
+    sizes: list[tuple[int, ...] | None] = options.arrays or [None]
+    arrays = iter(_each("--arrays", sizes, serial))
     bauds = iter(_each("--baud", options.baud or [DEFAULT_BAUD], serial))
     out = []
     for i, (medium, spec) in enumerate(given):
@@ -190,7 +218,9 @@ def _ports(
             _check_can(spec)
             out.append(PortSettings(name, spec, "can"))
         else:
-            out.append(PortSettings(name, spec, "serial", next(kinds), next(bauds)))
+            out.append(
+                PortSettings(name, spec, "serial", next(kinds), next(bauds), arrays=next(arrays))
+            )
     return tuple(out)
 
 
@@ -204,12 +234,21 @@ def _ports_of_file(boards: tuple[BoardTable, ...], path: Path | None) -> tuple[P
         if board.port is not None:
             if board.node is not None:
                 raise SettingsError(f"{where}: node goes with can, not with port")
-            out.append(PortSettings(name, board.port, "serial", board.kind, board.baud))
+            try:
+                board_kind(board.kind)
+                arrays = None if board.arrays is None else array_sizes(board.arrays)
+            except ValueError as error:
+                raise SettingsError(f"{where}: {error}") from error
+            out.append(
+                PortSettings(name, board.port, "serial", board.kind, board.baud, arrays=arrays)
+            )
             continue
         spec = board.can or ""
         _check_can(spec, where)
         if board.kind not in ("auto", "tactile"):
             raise SettingsError(f"{where}: {board.kind} boards have no CAN; they are serial")
+        if board.arrays is not None:
+            raise SettingsError(f"{where}: boards on a CAN bus say their arrays; leave it out")
         bus = buses.get(spec)
         if bus is None:
             bus = PortSettings(name, spec, "can")
@@ -222,6 +261,22 @@ def _ports_of_file(boards: tuple[BoardTable, ...], path: Path | None) -> tuple[P
                 raise SettingsError(f"{where}: node {board.node} of {spec} is named twice")
             bus.nodes[board.node] = name
     return tuple(out)
+
+
+def array_sizes(text: str) -> tuple[int, ...]:
+    """Magnetometers of each array of a controller, as in ``5+5``; ValueError names the allowed."""
+    words = text.split("+")
+    if not all(word.isdecimal() and int(word) > 0 for word in words):
+        raise ValueError(
+            f"arrays {text!r} given; allowed: numbers of magnetometers joined by +, as in 5+5"
+        )
+    sizes = tuple(int(word) for word in words)
+    if sum(sizes) > MAX_ANYSKIN_MAGNETOMETERS:
+        raise ValueError(
+            f"arrays {text!r} are {sum(sizes)} magnetometers; allowed: at most "
+            f"{MAX_ANYSKIN_MAGNETOMETERS} on a controller"
+        )
+    return sizes
 
 
 def _each(flag: str, values: list[T], ports: int) -> list[T]:
@@ -237,7 +292,9 @@ def _each(flag: str, values: list[T], ports: int) -> list[T]:
 
 def _check_can(spec: str, where: str = "--can") -> None:
     try:
-        CanSpec.parse(spec)
+        parsed = CanSpec.parse(spec)
+        if parsed.interface == "slcan":
+            slcan_commands(parsed)
     except ValueError as error:
         raise SettingsError(f"{where}: {error}") from error
 

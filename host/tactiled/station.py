@@ -167,7 +167,8 @@ class Station:
                 if self.pipeline is not None and self.sent:
                     self.pipeline.reset()  # what it felt before it was out of sight is over
                 version = f", firmware {identity.firmware}" if identity.firmware else ""
-                self._say(logging.INFO, f"{identity}{version} found")
+                written = f", read as {identity.layout}" if identity.layout else ""
+                self._say(logging.INFO, f"{identity}{version} found{written}")
                 self._warn()
             case Streaming(rate):
                 self.state = "streaming"

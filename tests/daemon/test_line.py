@@ -121,7 +121,7 @@ def test_a_port_without_a_board_is_diagnosed_once(
     instant: At, data: Callable[[int], bytes], said: str
 ) -> None:
     line = SerialLine("/dev/ttyX", welcome)
-    line.connect(instant(0.0))
+    line.connect(instant(0.0), byte_time=1e-4)
     events = feed(line, instant, 6.0, data)
     (diagnosed,) = of(events, Diagnosed)
     assert "/dev/ttyX" in diagnosed.problem

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from sensor_proto.layout import COUNT_UT, COUNTS
+from sensor_proto.survey import Finding
 from tactile_bus.instant import Instant, seconds_between
 from tactiled.links.events import Diagnosed
 
 GARBAGE_AFTER = 3.0
 """s of bytes without a frame before they are called garbage: slower boards send twenty in it."""
+
+LITTLE, LITTLE_UNTIL = 400, 15.0
+"""Bytes of which nothing can be said yet, and s until which more are awaited: five frames of a slow
+board."""
 
 NOTHING_AFTER = 5.0
 """s without a byte before the port is called silent: boards that reset on opening boot in two."""
@@ -31,10 +37,15 @@ class Diagnosis:
         self._port = port
         self._baud = baud
         self._kind = kind
+        self._uart = True
         self.begin(Instant(0))
 
-    def begin(self, now: Instant) -> None:
-        """The port was opened."""
+    def begin(self, now: Instant, uart: bool | None = None) -> None:
+        """The port was opened. ``uart``: whether its baud rate means anything, as on USB none does.
+
+        None: it is still the same port.
+        """
+        self._uart = self._uart if uart is None else uart
         self._since = now
         self._total = self._zeros = self._printable = 0
         self._text = b""
@@ -48,17 +59,25 @@ class Diagnosis:
         if len(self._text) < 2 * SHOWN:
             self._text = (self._text + data)[: 2 * SHOWN]
 
-    def judge(self, now: Instant, answered: bool) -> Diagnosed | None:
-        """What is wrong, once it is time to say so. ``answered``: frames of ours were decoded."""
+    def judge(
+        self, now: Instant, answered: bool, finding: Finding | None = None
+    ) -> Diagnosed | None:
+        """What is wrong, once it is time to say so.
+
+        ``answered``: frames of ours were decoded. ``finding``: what the bytes look like.
+        """
         waited = seconds_between(self._since, now)
         if waited < (GARBAGE_AFTER if self._total else NOTHING_AFTER):
+            return None
+        if 0 < self._total < LITTLE and waited < LITTLE_UNTIL:
             return None
         port, asked = self._port, f"{waited:.0f} s"
         if not self._total:
             return Diagnosed(
                 f"{port} is silent: not one byte in {asked}, and no answer to Identify",
                 "check that this is the board's port (tactiled --list-ports), its power and its "
-                "firmware; on a UART check --baud and that TX and RX are crossed",
+                "firmware"
+                + ("; check --baud and that TX and RX are crossed" if self._uart else ""),
             )
         if answered:
             return Diagnosed(
@@ -69,8 +88,12 @@ class Diagnosis:
             return Diagnosed(
                 f"{port} floods zeros ({self._total} bytes in {asked}, no frame among them)",
                 "the line is held low or the baud rate is far too high: check wiring, power and "
-                f"--baud (now {self._baud})",
+                f"--baud (now {self._baud})"
+                if self._uart
+                else "the board sends no readings: check its chips, wiring and firmware",
             )
+        if finding is not None:
+            return Diagnosed(f"{port} sends {finding.what}", self._declare(finding))
         if self._printable >= MOSTLY * self._total:
             return Diagnosed(
                 f"{port} sends text, not taxel frames: {_first_line(self._text)!r}",
@@ -79,11 +102,22 @@ class Diagnosis:
             )
         other = "auto or tactile" if self._kind not in ("auto", "tactile") else "auto"
         kind = f", or give --board {other}" if self._kind != "auto" else ""
+        baud = f"the baud rate may be wrong (--baud, now {self._baud}), or " if self._uart else ""
         return Diagnosed(
             f"{port} sends {self._total} bytes in {asked} and no valid frame among them",
-            f"the baud rate may be wrong (--baud, now {self._baud}), or the device speaks "
-            f"something else than our protocol or AnySkin's{kind}",
+            f"{baud}the device speaks something else than our protocol or AnySkin's: declare it "
+            f"with --board (see tactiled --help){kind}",
         )
+
+    def _declare(self, finding: Finding) -> str:
+        """How to have ``finding`` read."""
+        if not finding.declare:
+            return "see sensor_proto/PROTOCOL.md, section 9, for what can be declared with --board"
+        remedy = f"declare it with --board {' or --board '.join(finding.declare)}"
+        if finding.declare[0].partition(":")[0] in COUNTS:
+            xy, _, z = COUNT_UT
+            remedy += f" (scale={xy:g}/{z:g} µT a count is meant: the MLX90393 at gain 7)"
+        return remedy
 
 
 def _first_line(text: bytes) -> str:

@@ -36,13 +36,22 @@ BACKLOG_LIMIT = 0.5
 class FloatLink:
     """State machine of one float board. ``serial_number``: of the USB port, for it has no other.
 
-    ``model``: what calibrations call it.
+    ``model``: what calibrations call it. ``arrays``: magnetometers of each of its boards, where the
+    user said it. ``layout``: how it writes, empty for the usual floats.
     """
 
-    def __init__(self, admit: Admission, model: str, serial_number: str = "") -> None:
+    def __init__(
+        self,
+        admit: Admission,
+        model: str,
+        serial_number: str = "",
+        arrays: tuple[int, ...] | None = None,
+    ) -> None:
         self._admit = admit
         self._model = model
         self.serial_number = serial_number
+        self.layout = ""
+        self._arrays = arrays
         self.state = State.DOWN
         self.identity: Identity | None = None
         self.clock = ArrivalClock()
@@ -133,7 +142,9 @@ class FloatLink:
 
     def _introduce(self, shape: tuple[int, int]) -> list[Event]:
         before, self._shape = self.identity, shape
-        identity = Identity(self.serial_number, self._model, "", (shape,), None)
+        identity = Identity(
+            self.serial_number, self._model, "", (shape,), None, None, self._arrays, self.layout
+        )
         refusal = None
         if before is not None and before.serial_number != self.serial_number:
             refusal = Refusal(

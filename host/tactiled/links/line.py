@@ -6,13 +6,17 @@ Pure: chunks and instants in; events, and payloads to write, out.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from sensor_proto.anyskin import AnySkinDecoder
 from sensor_proto.canseg import CanFrame
 from sensor_proto.framing import SerialDecoder, encode_serial
+from sensor_proto.layout import FORM, Framing, Kind, Layout
+from sensor_proto.layout_decoder import LayoutDecoder
 from sensor_proto.packets import FloatSamples, Received
+from sensor_proto.survey import Finding, Survey
+from sensor_proto.text_frames import TextDecoder
 from tactile_bus.instant import NS_PER_S, Instant, after
 from tactiled.blocks import Chunk
 from tactiled.links.diagnosis import Diagnosis
@@ -21,10 +25,14 @@ from tactiled.links.float_link import FloatLink
 from tactiled.links.link import BoardLink, State
 
 KINDS = ("auto", "tactile", "anyskin", "reskin", "eflesh")
-"""What --board takes; the last three speak the same floats."""
+"""What --board takes besides a layout; the last three are the same boards."""
 
 FLOAT_MODEL = "anyskin"
 """What calibrations call boards that send floats."""
+
+JUDGE_FIRST, JUDGE_SLOWEST = 0.25, 2.0
+"""s between looks at bytes of which no decoder makes a frame; the time doubles while nothing is
+found, as a look takes some milliseconds."""
 
 REPEAT_DIAGNOSIS = 30.0
 """s between repetitions of a diagnosis that still holds."""
@@ -33,6 +41,7 @@ Admit = Callable[[int, Identity], Refusal | None]
 """Judges the board with a node number (0 on a serial line)."""
 
 Link = BoardLink | FloatLink
+Unframed = AnySkinDecoder | LayoutDecoder | TextDecoder
 Payload = bytes | tuple[CanFrame, ...]
 
 
@@ -72,7 +81,10 @@ class Line(Protocol):
 
 
 class SerialLine:
-    """A serial line: one board, whose kind is found out unless ``kind`` says it."""
+    """A serial line: one board, whose kind is found out unless ``kind`` says it.
+
+    ``kind``: one of `KINDS`, or a layout. ``arrays``: magnetometers of each board of a controller.
+    """
 
     def __init__(
         self,
@@ -82,16 +94,23 @@ class SerialLine:
         rate: float | None = None,
         baud: int = 115_200,
         listen_only: bool = False,
+        arrays: tuple[int, ...] | None = None,
     ) -> None:
-        if kind not in KINDS:
-            raise ValueError(f"board kind {kind!r}; allowed: {', '.join(KINDS)}")
-        self._kind = kind
+        self._declared = board_kind(kind)
+        self._kind = kind if self._declared is None else "declared"
         self._own = SerialDecoder()
-        self._floats = AnySkinDecoder()
+        self._floats: Unframed | None = AnySkinDecoder()
+        self._survey = Survey(self._declared)
+        self._settled = False  # whether the unframed decoder has given a frame since the opening
+        self._layout: Layout | None = None  # what the unframed decoder reads; None: usual floats
+        self._finding: Finding | None = None
+        self._judge_due, self._judge_wait = Instant(0), JUDGE_FIRST
         self._board = BoardLink(lambda identity: admit(0, identity), rate, listen_only)
-        self._float = FloatLink(lambda identity: admit(0, identity), FLOAT_MODEL)
+        self._float = FloatLink(lambda identity: admit(0, identity), FLOAT_MODEL, "", arrays)
         self._link: Link | None = None
         self._diagnosis = Diagnosis(port, baud, kind)
+        if self._declared is not None:
+            self._adopt(self._declared)
         self._diagnose_from = Instant(0)
         self._byte_ns = 0.0
         self._up = False
@@ -104,7 +123,9 @@ class SerialLine:
     @property
     def rejects(self) -> dict[str, int]:
         """Refusals of the decoder in use (of ours while the kind is not known)."""
-        decoder = self._floats if isinstance(self._link, FloatLink) else self._own
+        decoder = self._own
+        if isinstance(self._link, FloatLink) and self._floats is not None:
+            decoder = self._floats
         return {reason: n for reason, n in decoder.counters.items() if reason != "accepted"}
 
     def connect(self, now: Instant, usb_serial: str = "", byte_time: float = 0.0) -> None:
@@ -113,8 +134,12 @@ class SerialLine:
         self._byte_ns = byte_time * NS_PER_S
         self._float.serial_number = usb_serial
         self._own.reset()
-        self._floats.reset()
-        self._diagnosis.begin(now)
+        if self._floats is not None:
+            self._floats.reset()
+        self._survey.reset()
+        self._settled, self._finding = False, None
+        self._judge_due, self._judge_wait = after(now, JUDGE_FIRST), JUDGE_FIRST
+        self._diagnosis.begin(now, uart=byte_time > 0)
         self._diagnose_from = now
         if self._kind in ("auto", "tactile") and not isinstance(self._link, FloatLink):
             self._board.connect(now)
@@ -134,7 +159,7 @@ class SerialLine:
         if not self._served:
             self._diagnosis.feed(data)
         events: list[Event] = []
-        for received in self._decode(data):
+        for received in self._decode(data, chunk.received):
             arrival = Instant(chunk.received - round(received.trailing * self._byte_ns))
             message = received.message
             if isinstance(message, FloatSamples):
@@ -153,8 +178,11 @@ class SerialLine:
         if was_served:
             # Should it go out of service, what is wrong is judged from here on.
             self._diagnosis.begin(now)
+        elif self._finding is not None and self._finding.layout is not None:
+            pass  # it is about to be read
         elif link.state is not State.REFUSED and now >= self._diagnose_from:
-            diagnosed = self._diagnosis.judge(now, answered=self._link is not None)
+            answered = isinstance(self._link, BoardLink)
+            diagnosed = self._diagnosis.judge(now, answered, self._finding)
             if diagnosed is not None:
                 self._diagnose_from = after(now, REPEAT_DIAGNOSIS)
                 out.append(LineEvent(None, diagnosed))
@@ -169,21 +197,66 @@ class SerialLine:
         """Whether a board has been found since the port was opened."""
         return self._link is not None and self._link.state in (State.CONFIGURING, State.STREAMING)
 
-    def _decode(self, data: bytes) -> list[Received]:
+    def _decode(self, data: bytes, now: Instant) -> list[Received]:
         """Messages by whichever decoder fits; the first to find one is kept."""
         if isinstance(self._link, BoardLink):
             return self._own.feed(data)
-        if isinstance(self._link, FloatLink):
-            return self._floats.feed(data)
-        if self._kind in ("auto", "tactile"):
+        if self._link is None and self._kind in ("auto", "tactile"):
             found = self._own.feed(data)
             if found:
                 self._link = self._board
                 return found
-        if self._kind != "tactile":
-            found = self._floats.feed(data)
-            if found:
+        if self._kind == "tactile":
+            return []
+        found = [] if self._floats is None else self._floats.feed(data)
+        if found:
+            self._settled = True
+            if self._link is None:
                 self._link = self._float
                 self._board.disconnect()
-                return found
-        return []
+        elif not self._settled:
+            self._look(data, now)
+        return found
+
+    def _look(self, data: bytes, now: Instant) -> None:
+        """Find out how the board writes, where it is plain: two looks must say the same."""
+        self._survey.feed(data)
+        if now < self._judge_due:
+            return
+        before, self._finding = self._finding, self._survey.judge()
+        layout = None if self._finding is None else self._finding.layout
+        if layout is not None:
+            self._judge_wait = JUDGE_FIRST
+            if before is not None and before.layout == layout:
+                self._adopt(layout)
+        elif self._survey.full:
+            self._judge_wait = min(2 * self._judge_wait, JUDGE_SLOWEST)
+        self._judge_due = after(now, self._judge_wait)
+
+    def _adopt(self, layout: Layout) -> None:
+        """Read frames of ``layout`` from now on, once it is known what stands round its numbers."""
+        if layout == self._layout:
+            return  # give it time
+        self._layout = layout
+        usual = layout == replace(USUAL, chips=layout.chips, framing=layout.framing)
+        if layout.kind is Kind.TEXT:
+            self._floats = TextDecoder(layout)
+        elif usual and layout.framing in (None, USUAL.framing):
+            chips = None if self._declared is None else layout.chips
+            self._floats = AnySkinDecoder(chips)
+        else:
+            self._floats = None if layout.framing is None else LayoutDecoder(layout)
+        self._float.layout = "" if isinstance(self._floats, AnySkinDecoder) else str(layout)
+
+
+USUAL = Layout(Kind.FLOATS, 1, "txyz", framing=Framing(end=b"\r\n"))
+"""What `AnySkinDecoder` reads: it knows that layout best."""
+
+
+def board_kind(text: str) -> Layout | None:
+    """Layout that ``--board`` declares, None for one of `KINDS`; ValueError for anything else."""
+    if text in KINDS:
+        return None
+    if ":" not in text:
+        raise ValueError(f"board kind {text!r}; allowed: {', '.join(KINDS)}, or a layout: {FORM}")
+    return Layout.parse(text)

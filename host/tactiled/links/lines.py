@@ -18,11 +18,15 @@ def make_line(
     fd: bool,
     nodes: frozenset[int] | None,
     listen_only: bool,
+    arrays: tuple[int, ...] | None = None,
 ) -> Line:
-    """The line of ``port``; ``nodes``: boards wanted on a CAN bus, None for all."""
+    """The line of ``port``; ``nodes``: boards wanted on a CAN bus, None for all.
+
+    ``arrays``: magnetometers of each board of a controller that does not say it.
+    """
     if medium is Medium.CAN:
         return CanLine(port, admit, fd, rate, nodes, listen_only)
-    return SerialLine(port, admit, kind, rate, baud, listen_only)
+    return SerialLine(port, admit, kind, rate, baud, listen_only, arrays)
 
 
 def bus_names(

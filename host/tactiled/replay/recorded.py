@@ -40,6 +40,7 @@ class RecordedPort:
     rate: float | None = None
     strict: bool = False
     nodes: Mapping[int, str] | None = None
+    arrays: tuple[int, ...] | None = None
 
 
 def describe(settings: Settings) -> dict[str, dict[str, str]]:
@@ -58,6 +59,7 @@ def describe(settings: Settings) -> dict[str, dict[str, str]]:
             "fd": json.dumps(fd),
             "rate": json.dumps(settings.rate),
             "strict": json.dumps(len(settings.calibrations) >= len(settings.ports)),
+            "arrays": json.dumps(port.arrays),
             "nodes": json.dumps({str(node): name for node, name in port.nodes.items()}),
         }
     return tables
@@ -82,6 +84,7 @@ def recorded_port(name: str, values: Mapping[str, str]) -> RecordedPort:
     """Port ``name`` (without the prefix) of a log; `RecordedError` when its record is none."""
     try:
         nodes = {int(node): text for node, text in json.loads(values["nodes"]).items()}
+        arrays = json.loads(values.get("arrays", "null"))  # older logs do not say it
         return RecordedPort(
             name=name,
             spec=values["spec"],
@@ -92,6 +95,7 @@ def recorded_port(name: str, values: Mapping[str, str]) -> RecordedPort:
             rate=json.loads(values["rate"]),
             strict=bool(json.loads(values["strict"])),
             nodes=nodes,
+            arrays=None if arrays is None else tuple(int(n) for n in arrays),
         )
-    except (KeyError, ValueError, AttributeError) as error:
+    except (KeyError, ValueError, AttributeError, TypeError) as error:
         raise RecordedError(f"the log's record of port {name!r} is spoilt: {error}") from error

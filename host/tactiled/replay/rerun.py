@@ -240,6 +240,7 @@ class Rerun:
         line = make_line(
             source.name, admit, medium, kind=recorded.kind, rate=recorded.rate, baud=recorded.baud,
             fd=recorded.fd, nodes=frozenset(recorded.nodes or ()) or None, listen_only=listen_only,
+            arrays=recorded.arrays,
         )  # fmt: skip
         port = self._port = Port(recorded.name, line, source, Inbox(Wake()), names, open_station)
         if medium is Medium.SERIAL:

@@ -54,6 +54,7 @@ class BoardPipeline:
         self._features = FeatureExtractor(geometry, settings)
         self._net = NetStage(calibration.nets, layout)
         self._names = tuple(a.name for a in geometry.arrays)
+        self._reference_c = [a.reference_c for a in calibration.arrays]
         self._tip_arrays = [i for i, a in enumerate(geometry.arrays) if a.side.name == "TIP"]
         # how long a small array's field may be held is a matter of its bound alone
         self._hold = np.where(layout.counts < PLANE_TAXELS, np.inf, settings.hold_s).tolist()
@@ -261,7 +262,9 @@ class BoardPipeline:
                 continue
             n = len(block.status)
             raw[a, :, :n] = block.field_ut.T
-            temperature[a, :n] = block.temperature_c
+            # Boards that send none are taken to be as warm as at their calibration.
+            told = np.isfinite(block.temperature_c) | (block.status & TaxelHealth.READ_FAILED > 0)
+            temperature[a, :n] = np.where(told, block.temperature_c, self._reference_c[a])
             status[a, :n] = block.status
         return raw, temperature, status, present
 

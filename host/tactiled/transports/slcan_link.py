@@ -29,23 +29,31 @@ SILENCE = 0.08
 from adapters that do not tell of it, and a busy one is never asked."""
 
 
+def slcan_commands(spec: CanSpec) -> tuple[bytes, ...]:
+    """Commands that set the bit rates of ``spec``; ValueError names those that adapters have."""
+    bitrate = spec.bitrate or DEFAULT_BITRATE
+    if bitrate not in slcan.BITRATES:
+        raise ValueError(
+            f"{spec} asks for {bitrate} bit/s; an slcan adapter has "
+            f"{', '.join(map(str, slcan.BITRATES))}"
+        )
+    if not spec.fd:
+        return (slcan.BITRATES[bitrate],)
+    data_bitrate = spec.data_bitrate or DEFAULT_DATA_BITRATE
+    if data_bitrate not in slcan.DATA_BITRATES:
+        raise ValueError(
+            f"{spec} asks for {data_bitrate} bit/s of data; an slcan adapter has "
+            f"{', '.join(map(str, slcan.DATA_BITRATES))}"
+        )
+    return slcan.BITRATES[bitrate], slcan.DATA_BITRATES[data_bitrate]
+
+
 class SlcanLink:
     """Frames in both directions through one adapter; see `CanTransport` for the contract."""
 
     def __init__(self, spec: CanSpec) -> None:
         self._spec = spec
-        self._bitrate = spec.bitrate or DEFAULT_BITRATE
-        if self._bitrate not in slcan.BITRATES:
-            raise ValueError(
-                f"{spec} asks for {self._bitrate} bit/s; an slcan adapter has "
-                f"{', '.join(map(str, slcan.BITRATES))}"
-            )
-        self._data_bitrate = spec.data_bitrate or DEFAULT_DATA_BITRATE
-        if spec.fd and self._data_bitrate not in slcan.DATA_BITRATES:
-            raise ValueError(
-                f"{spec} asks for {self._data_bitrate} bit/s of data; an slcan adapter has "
-                f"{', '.join(map(str, slcan.DATA_BITRATES))}"
-            )
+        self._setup = slcan_commands(spec)
         self.port = SerialTransport(spec.channel)
         self._decoder = slcan.SlcanDecoder()
         self._tells_flags = False
@@ -124,10 +132,7 @@ class SlcanLink:
     def _open_channel(self) -> None:
         # Empty lines end whatever a previous owner left half-written; a closed channel refuses C.
         answered = self._ask(b"\r\rC\r") is not None
-        setup = [slcan.BITRATES[self._bitrate]]
-        if self._spec.fd:
-            setup.append(slcan.DATA_BITRATES[self._data_bitrate])
-        for command in (*setup, b"O"):
+        for command in (*self._setup, b"O"):
             answer = self._ask(command + slcan.CR)
             answered |= answer is not None
             if answer == slcan.BEL:

@@ -1,0 +1,361 @@
+"""What a port carries when no frame is known: the layout where it is plain, else its looks.
+
+Frames repeat, so bytes at the distance of a frame are often equal; what stands still in every frame
+is its start or its end; numbers read with the wrong width, order of bytes or offset are absurd; and
+a temperature is told from a field (`temperature`). Where one of these leaves two readings, nothing
+is read: both are named.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sensor_proto.layout import MAX_CHIPS, Framing, Kind, Layout, check_of
+from sensor_proto.temperature import with_or_without
+from sensor_proto.text_survey import TextFinding, read_text
+
+KEEP = 8192
+"""Bytes looked at: six of the longest frames, and some lines of text of the widest."""
+
+LEAST_FRAMES = 6
+"""Frames that must repeat."""
+
+ROWS = 8
+"""Frames compared; more would more often hold one that lost a byte."""
+
+LONGEST = MAX_CHIPS * 4 * 8 + 32
+"""Bytes of the longest frame: doubles of the largest board."""
+
+REPEATS = 0.2
+"""Share of equal bytes at the distance of a frame: of noise it is 1/256."""
+
+STARTS = tuple(
+    bytes.fromhex(word)
+    for word in (
+        *("aa55", "55aa", "a55a", "5aa5", "ffff", "fefe", "eb90", "aaaa", "5555", "a5a5"),
+        *("aa", "55", "a5", "5a", "ff", "fe", "02", "24", "3c", "7e"),
+    )
+)
+"""What firmware begins its frames with."""
+
+MOSTLY = 0.9
+"""Share of printable characters from which it is text."""
+
+MOST_UT, LEAST_UT = 1e5, 1e-3
+"""Floats beyond these are no fields in microtesla, save nought."""
+
+_PRINTABLE = np.zeros(256, bool)
+_PRINTABLE[32:127] = True
+_PRINTABLE[[9, 10, 13, 0xB0, 0xB5, 0xC2]] = True
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What comes, in words (``what``).
+
+    ``layout``: None unless it is plain. ``declare``: what it may be, as ``--board`` takes it.
+    """
+
+    layout: Layout | None
+    what: str
+    declare: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """Repeating frames: (k, size) bytes, each row one frame as far as ``framing`` tells."""
+
+    rows: NDArray[np.uint8]
+    framing: Framing
+
+    @property
+    def size(self) -> int:
+        return self.rows.shape[1]
+
+    def body(self, layout: Layout) -> NDArray[np.generic]:
+        before = self.framing.before
+        cut = np.ascontiguousarray(self.rows[:, before : before + layout.payload])
+        return cut.view(layout.dtype)
+
+
+class Survey:
+    """Keeps the last bytes of a port and judges them. ``declared``: what the user said of them."""
+
+    def __init__(self, declared: Layout | None = None) -> None:
+        self._declared = declared
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what came."""
+        self._data = b""
+
+    def feed(self, data: bytes) -> None:
+        """Take what one read returned."""
+        self._data = (self._data + data)[-KEEP:]
+
+    @property
+    def full(self) -> bool:
+        """Whether as many bytes came as are looked at."""
+        return len(self._data) >= KEEP
+
+    def judge(self) -> Finding | None:
+        """What the bytes are; None: nothing that repeats, or not enough yet."""
+        values = np.frombuffer(self._data, np.uint8)
+        declared = self._declared
+        if not len(values):
+            return None
+        if declared is not None and declared.kind is not Kind.TEXT:
+            placed = self._place(values, declared)
+            if placed is not None:
+                return placed
+        found = self._free(values)
+        if declared is None or found is None:
+            return found
+        other = [layout for layout in found.declare if layout != str(declared)]
+        return Finding(None, f"{found.what}, not {declared} as declared", tuple(other))
+
+    def _free(self, values: NDArray[np.uint8]) -> Finding | None:
+        """What the bytes are, whatever was declared."""
+        if _PRINTABLE[values].mean() >= MOSTLY:
+            return _of_text(read_text(self._data))
+        size = _period(values, None)
+        if size is None:
+            return None
+        rows = _rows(values, size)
+        return None if (rows == rows[0, 0]).all() else _of_frames(rows)
+
+    def _place(self, values: NDArray[np.uint8], declared: Layout) -> Finding | None:
+        """Framing round the numbers that were declared; None where they find no place."""
+        size = _period(values, declared.payload)
+        if size is None:
+            return None
+        rows = _rows(values, size)
+        if (rows == rows[0, 0]).all():
+            return None
+        for frame in _framed(rows):
+            for around in _around(frame, declared.payload):
+                whole = replace(declared, framing=around.framing)
+                if whole.size == frame.size and _sensible(whole, around.body(whole)):
+                    return Finding(whole, _words(around, f"{declared.numbers} {declared.kind}"))
+        return None
+
+
+def _period(values: NDArray[np.uint8], payload: int | None) -> int | None:
+    """Distance in bytes at which bytes are equal most often."""
+    recent = values[-4 * LONGEST :] if len(values) > 4 * LONGEST else values
+    longest = min(LONGEST, len(recent) // LEAST_FRAMES)
+    if longest < 8:
+        return None
+    share = np.zeros(longest + 1)
+    for size in range(6, longest + 1):
+        share[size] = np.count_nonzero(recent[size:] == recent[:-size]) / (len(recent) - size)
+    if payload is not None:
+        share[: min(payload, longest + 1)] = 0.0
+    best = int(share.argmax())
+    if share[best] < REPEATS:
+        return None
+    for parts in range(best // 6, 1, -1):
+        if best % parts == 0 and share[best // parts] >= share[best] - 0.03:
+            return best // parts
+    return best
+
+
+def _rows(values: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
+    """Consecutive frames that are most alike: the others may have lost bytes.
+
+    They end where a read may have ended: whole frames before the last byte.
+    """
+    count = min(ROWS, len(values) // size)
+    same = np.concatenate([[0], np.cumsum(values[size:] == values[:-size])])
+    ends = np.arange(len(values), count * size - 1, -size)
+    alike = same[ends - size] - same[ends - count * size]
+    end = int(ends[alike.argmax()])
+    return values[end - count * size : end].reshape(count, size)
+
+
+def _framed(rows: NDArray[np.uint8]) -> list[_Frame]:
+    """Frames cut at whatever may be their start or end, the most telling first."""
+    still = (rows == rows[0]).all(axis=0)
+    modes = rows[0]
+    size = rows.shape[1]
+    out: list[tuple[int, _Frame]] = []
+
+    def cut(at: int) -> NDArray[np.uint8]:
+        """Rows that begin at column ``at``; the wrap costs one frame."""
+        flat = rows.reshape(-1)[at : at + (len(rows) - 1) * size] if at else rows.reshape(-1)
+        return flat.reshape(-1, size)
+
+    def stands(word: bytes, at: int) -> bool:
+        places = [(at + i) % size for i in range(len(word))]
+        return all(still[p] and modes[p] == b for p, b in zip(places, word, strict=True))
+
+    ends = [(b"\r\n", at) for at in range(size) if stands(b"\r\n", at)]
+    if not ends:
+        ends = [(b"\n", at) for at in range(size) if stands(b"\n", at)]
+    starts = [(word, at) for word in STARTS for at in range(size) if stands(word, at)]
+    for end, at in ends:
+        begin = (at + len(end)) % size
+        framed = [w for w, s in starts if s == begin and len(w) == 2]
+        if framed:
+            out.append((len(end) + 2, _Frame(cut(begin), Framing(start=framed[0], end=end))))
+        out.append((len(end), _Frame(cut(begin), Framing(end=end))))
+    out += [(len(word), _Frame(cut(at), Framing(start=word))) for word, at in starts]
+    out.sort(key=lambda item: -item[0])
+    return [frame for _, frame in out[:40]] + [_Frame(rows, Framing())]
+
+
+def _around(frame: _Frame, payload: int | None = None) -> list[_Frame]:
+    """Frames with what is not a number before and behind the numbers left out."""
+    rows, plain = frame.rows, frame.framing
+    room = frame.size - len(plain.start) - len(plain.end)
+    begin = len(plain.start)
+    marked = bool(plain.start or plain.end)
+    out: list[_Frame] = []
+    for skip in range(5 if marked else 1):
+        if skip and not _idle(rows[:, begin : begin + skip]):
+            break
+        for tail in range(3 if marked else 1):
+            if payload is not None and room - skip - tail != payload:
+                continue
+            if room - skip - tail < 6:
+                continue
+            framing = replace(plain, skip=skip, tail=tail)
+            place = frame.size - len(plain.end) - 1
+            if tail == 1:
+                for check in ("xor", "sum"):
+                    if all(check_of(check, r[begin:place].tobytes()) == r[place] for r in rows):
+                        framing = replace(plain, skip=skip, check=check)
+                        break
+            out.append(_Frame(rows, framing))
+    # What is explained comes first.
+    out.sort(key=lambda f: (f.framing.tail, f.framing.skip if not f.framing.check else 0))
+    return out
+
+
+def _idle(columns: NDArray[np.uint8]) -> bool:
+    """Whether every column stands still or counts frames."""
+    for column in columns.T:
+        steps = np.diff(column.astype(np.int16)) % 256
+        if not ((steps == 0).all() or (steps == 1).all()):
+            return False
+    return True
+
+
+def _sensible(layout: Layout, values: NDArray[np.generic]) -> bool:
+    """Whether the numbers can be those of a board."""
+    if layout.kind in (Kind.FLOATS, Kind.DOUBLES):
+        return _floats(values)
+    return True
+
+
+def _floats(values: NDArray[np.generic]) -> bool:
+    with np.errstate(invalid="ignore", over="ignore"):
+        size = np.abs(values.astype(np.float64))
+        good = (size <= MOST_UT) & ((size >= LEAST_UT) | (size == 0))
+        return bool(good.mean() >= 0.97 and (size > 0).any())
+
+
+def _of_frames(rows: NDArray[np.uint8]) -> Finding | None:
+    """What frames hold, with the first reading that makes sense."""
+    frames = _framed(rows)
+    for kind, big in ((Kind.FLOATS, False), (Kind.DOUBLES, False), (Kind.FLOATS, True)):
+        for frame in frames:
+            for around in _around(frame):
+                framing = around.framing
+                probe = Layout(kind, 1, "xyz", big=big)
+                room = around.size - framing.extra
+                count, rest = divmod(room, probe.dtype.itemsize)
+                if rest or count < 3:
+                    continue
+                probe = replace(probe, fields="x" * count)
+                values = around.body(probe)
+                if _floats(values):
+                    return _of_floats(around, kind, big, values)
+    return _of_counts(frames)
+
+
+def _of_floats(frame: _Frame, kind: Kind, big: bool, values: NDArray[np.generic]) -> Finding:
+    count = values.shape[1]
+    framing = frame.framing
+    order = with_or_without(np.asarray(values, np.float64))
+    name = "floats" if kind is Kind.FLOATS else "doubles"
+    number = f"{count} {'big-endian ' if big else ''}{name}"
+    marked = framing.start or framing.end or framing.check
+    # A framing that would be found again by itself need not be declared.
+    declared = framing if framing.tail or not marked else None
+
+    def layout(fields: str) -> Layout:
+        return Layout(kind, count // len(fields), fields, big, framing=declared)
+
+    fits = [f for f in ("txyz", "xyz") if count % len(f) == 0 and count // len(f) <= MAX_CHIPS]
+    if order in ("txyz", "xyzt") and count // 4 <= MAX_CHIPS:
+        what = _words(frame, f"{number}, {count // 4} chips with temperatures")
+        plain = marked and not framing.tail
+        whole = replace(layout(order), framing=framing)
+        return Finding(whole if plain else None, what, (str(layout(order)),))
+    if order == "xyz" and "xyz" in fits:
+        return Finding(None, _words(frame, f"{number}, no temperatures"), (str(layout("xyz")),))
+    if len(fits) == 2:
+        what = f"{number}: {count // 4} chips with temperatures, or {count // 3} without"
+        return Finding(None, _words(frame, what), tuple(str(layout(f)) for f in fits))
+    if fits == ["txyz"]:
+        fits = ["txyz", "xyzt"]
+    return Finding(None, _words(frame, number), tuple(str(layout(f)) for f in fits))
+
+
+def _of_counts(frames: list[_Frame]) -> Finding | None:
+    """Frames of 16-bit integers, by the order of bytes in which they move least."""
+    best: tuple[float, _Frame, bool, int] | None = None
+    for frame in frames:
+        for around in _around(frame):
+            framing = around.framing
+            count, rest = divmod(around.size - framing.extra, 2)
+            if rest or count < 3 or (count % 3 and count % 4):
+                continue
+            moves = []
+            for big in (False, True):
+                probe = Layout(Kind.INT16, 1, "x" * count, big)
+                steps = np.diff(around.body(probe).astype(np.int32), axis=0)
+                moves.append(float(np.abs((steps + 32768) % 65536 - 32768).mean()) + 0.5)
+            little, large = moves
+            ratio = max(little, large) / min(little, large)
+            telling = ratio * (4 if framing.check else 1) * (2 if not framing.tail else 1)
+            if ratio > 4 and (best is None or telling > best[0] * 1.5):
+                best = telling, around, large < little, count
+    if best is None:
+        if not frames[0].framing.start and not frames[0].framing.end:
+            return None
+        return Finding(None, _words(frames[0], "numbers of a kind that is not known"))
+    _, frame, big, count = best
+    fits = [f for f in ("txyz", "xyz") if count % len(f) == 0]
+    declared = [
+        str(Layout(Kind.INT16, count // len(f), f, big, (0.15, 0.15, 0.242), frame.framing))
+        for f in fits
+    ]
+    order = "big-endian" if big else "little-endian"
+    return Finding(None, _words(frame, f"{count} {order} 16-bit integers"), tuple(declared))
+
+
+def _words(frame: _Frame, numbers: str) -> str:
+    """Frames in words."""
+    framing = frame.framing
+    words = []
+    if framing.start:
+        words.append("beginning with " + framing.start.hex(" ").upper())
+    if framing.end:
+        name = {b"\r\n": "CR LF", b"\n": "LF", b"\r": "CR"}.get(framing.end)
+        words.append(f"ending in {name or framing.end.hex(' ').upper()}")
+    if not words and not framing.check:
+        words.append("with neither start nor end")
+    if framing.check:
+        words.append(f"with a check ({framing.check})")
+    if framing.tail:
+        words.append(f"with {framing.tail} bytes behind the numbers that may be a check")
+    return f"frames of {frame.size} bytes {' and '.join(words)}: {numbers}"
+
+
+def _of_text(found: TextFinding | None) -> Finding | None:
+    return None if found is None else Finding(found.layout, found.what, found.declare)
