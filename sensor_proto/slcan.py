@@ -1,8 +1,9 @@
 """The text lines of USB-CAN adapters that speak slcan; the host's half of the dialogue.
 
 Frames and answers as in the LAWICEL CAN232/CANUSB manual; FD lines (``d D b B``) as the CANable 2.0
-firmware adds them; ``s`` and ``e`` lines as the Linux slcan driver reads them. A frame is
-``T`` + 8 hex digits of identifier + 1 hex digit of length code + 2 hex digits a byte + CR.
+firmware adds them; ``s`` and ``e`` lines as the Linux slcan driver reads them; ``E``, ``L`` and
+``#`` lines of CANable 2.5 firmware. A frame is ``T`` + 8 hex digits of identifier + 1 hex digit of
+length code + 2 hex digits a byte + CR; CANdapter writes ``x`` for ``T``. PROTOCOL.md has it all.
 """
 
 from __future__ import annotations
@@ -58,15 +59,17 @@ MAX_ANSWERS = 64
 """Answers kept for whoever asked; each command brings one, and few are asked at once."""
 
 _TIMESTAMP_DIGITS = 4  # Z1 puts milliseconds behind every frame
-_ENDS = re.compile(rb"([\r\a])")
+_ENDS = re.compile(rb"(\r\n?|\n|\a(?:\r\n)?)")
 _STATES = {
     ord("a"): BusState.ACTIVE,
     ord("w"): BusState.WARNING,
     ord("p"): BusState.PASSIVE,
     ord("b"): BusState.BUS_OFF,
 }
-_FRAME_LETTERS = b"TtRrDdBb"
-_EXTENDED = b"TRDB"
+_FRAME_LETTERS = b"TtRrDdBbx"
+_EXTENDED = b"TRDBx"
+ACK, NAK = b"\x06", b"\x15"
+"""What CANdapter answers instead of an empty line and BEL."""
 
 
 class Rejected(StrEnum):
@@ -95,7 +98,7 @@ def decode_frame(line: bytes) -> CanFrame | Rejected:
         return Rejected.STANDARD_ID if letter and letter in b"tdb" else _not_data(letter)
     if letter == b"R":
         return Rejected.REMOTE
-    fd = letter != b"T"
+    fd = letter in b"DB"
     try:
         identifier = int(line[1:9], 16)
         length = LENGTH_OF_CODE[int(line[9:10], 16)]
@@ -122,6 +125,9 @@ class SlcanDecoder:
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._counts: Counter[str] = Counter()
+        self._last_end = b""
+        self._ends_crlf = False
+        self._errors_told = 0
         self.answers: deque[bytes] = deque(maxlen=MAX_ANSWERS)
         """Lines that answer commands, without their CR; a refusal is a single BEL."""
 
@@ -133,6 +139,7 @@ class SlcanDecoder:
     def reset(self) -> None:
         """Forget a broken line and all answers; counters stay."""
         self._buffer.clear()
+        self._last_end, self._ends_crlf, self._errors_told = b"", False, 0
         self.answers.clear()
 
     def feed(self, data: bytes) -> list[CanFrame]:
@@ -140,10 +147,17 @@ class SlcanDecoder:
 
         Errors, states and answers to ``F`` are SocketCAN error frames among them.
         """
+        if self._last_end == b"\r" and not self._buffer and data.startswith(b"\n"):
+            data = data[1:]  # the other half of the last line's end
+            self._ends_crlf = True
         parts = _ENDS.split(bytes(self._buffer) + data)
         frames: list[CanFrame] = []
         for line, end in zip(parts[:-1:2], parts[1::2], strict=True):
-            self._line(line, end, frames)
+            refused, self._last_end = self._last_end[:1] == BEL, end
+            self._ends_crlf |= end.endswith(b"\r\n")
+            if refused and not line and self._ends_crlf and end[:1] == CR:
+                continue  # a refusal printed as a line of its own
+            self._line(line, end[:1], frames)
         self._buffer = bytearray(parts[-1])
         if len(self._buffer) > MAX_LINE:
             self._counts[Rejected.MALFORMED] += 1
@@ -163,15 +177,71 @@ class SlcanDecoder:
             frames.append(can_errors.state_frame(_STATES[line[1]]))
         elif line[:1] == b"e" and len(line) >= 3:
             frames.append(_error_of(line))
-        elif line in (b"z", b"Z"):
-            pass  # "sent", of adapters with automatic polling
+        elif _REPORT.fullmatch(line):
+            frames += _report_of(line)
+        elif line in (b"z", b"Z") or _BUS_LOAD.fullmatch(line):
+            pass  # "sent", of adapters with automatic polling; load of the bus in percent
+        elif line in (ACK, b"#"):
+            self.answers.append(b"")
+        elif line == NAK or (line[:1] == b"#" and len(line) < 4):
+            self.answers.append(BEL)
         elif not line or line[:1] in b"VvNF":
             self.answers.append(line)
-            state = state_of_flags(line)
-            if state is not None:  # in its place among the lines, or an old answer would undo news
-                frames.append(can_errors.state_frame(state))
+            # In their place among the lines, or an old answer would undo news.
+            frames += self._flags_of(line)
         else:
             self._counts[Rejected.MALFORMED] += 1
+
+    def _flags_of(self, answer: bytes) -> list[CanFrame]:
+        """State and errors that the answer to ``F`` tells; errors only once while they stay."""
+        flags = flags_of(answer)
+        state = state_of_flags(answer)
+        if flags is None or state is None:
+            return []
+        frames = [can_errors.state_frame(state)]
+        errors = flags & ERROR_FLAGS
+        if errors and errors != self._errors_told:
+            frames.append(_errors_of_flags(errors))
+        self._errors_told = errors
+        return frames
+
+
+_REPORT = re.compile(rb"E[0-9A-Fa-f]{8}")
+_BUS_LOAD = re.compile(rb"L[0-9]{1,3}")
+_REPORT_STATES = (BusState.ACTIVE, BusState.WARNING, BusState.PASSIVE, BusState.BUS_OFF)
+_REPORT_PROTOCOL = (
+    0,
+    0x04,
+    0x02,
+    0,
+    0x10,
+    0x08,
+    0x00,
+)  # none stuff form ack recessive dominant CRC
+
+
+def _report_of(line: bytes) -> list[CanFrame]:
+    """Error frames for ``E`` + state, last protocol error, two digits of firmware errors, counts.
+
+    As CANable 2.5 sends it: protocol errors 1 stuff, 2 form, 3 no acknowledgement, 4 recessive bit,
+    5 dominant bit, 6 CRC; firmware errors 0x04 transmit and 0x08 receive overflow.
+    """
+    state, last, firmware = int(line[1:2], 16), int(line[2:3], 16), int(line[3:5], 16)
+    frames = []
+    if state < len(_REPORT_STATES):
+        frames.append(can_errors.state_frame(_REPORT_STATES[state]))
+    error_class = controller = protocol = 0
+    if last == 3:
+        error_class |= can_errors.NO_ACK
+    elif 0 < last < len(_REPORT_PROTOCOL):
+        error_class |= can_errors.PROTOCOL | can_errors.BUS_ERROR
+        protocol = _REPORT_PROTOCOL[last]
+    if firmware & 0x0C:
+        error_class |= can_errors.CONTROLLER
+        controller = (0x02 if firmware & 0x04 else 0) | (0x01 if firmware & 0x08 else 0)
+    if error_class:
+        frames.append(can_errors.error_frame(error_class, controller, protocol))
+    return frames
 
 
 def _error_of(line: bytes) -> CanFrame:
@@ -190,19 +260,33 @@ def _error_of(line: bytes) -> CanFrame:
     return can_errors.error_frame(error_class, controller, protocol)
 
 
+FLAG_RX_FULL = 0x01
+FLAG_TX_FULL = 0x02
 FLAG_WARNING = 0x04
+FLAG_OVERRUN = 0x08
 FLAG_PASSIVE = 0x20
+FLAG_ARBITRATION = 0x40
 FLAG_BUS_ERROR = 0x80
+"""Bits of the answer to ``F``, LAWICEL CAN232 manual; 0x10 is not used."""
+
+ERROR_FLAGS = FLAG_RX_FULL | FLAG_TX_FULL | FLAG_OVERRUN | FLAG_ARBITRATION | FLAG_BUS_ERROR
+"""Those that tell of errors, as the others tell a state."""
+
 BUS_OFF_FLAGS = FLAG_WARNING | FLAG_PASSIVE | FLAG_BUS_ERROR
 """The flags have no bit for bus-off; a controller in it shows these three together."""
 
 
-def state_of_flags(answer: bytes) -> BusState | None:
-    """State told by the answer ``Fxx`` to the command ``F``; None when it is none."""
+def flags_of(answer: bytes) -> int | None:
+    """Flags of the answer ``Fxx`` to the command ``F``; None when it is none."""
     try:
-        flags = int(answer[1:3], 16) if answer[:1] == b"F" and len(answer) == 3 else None
+        return int(answer[1:3], 16) if answer[:1] == b"F" and len(answer) == 3 else None
     except ValueError:
         return None
+
+
+def state_of_flags(answer: bytes) -> BusState | None:
+    """State told by the answer ``Fxx`` to the command ``F``; None when it is none."""
+    flags = flags_of(answer)
     if flags is None:
         return None
     if flags & BUS_OFF_FLAGS == BUS_OFF_FLAGS:
@@ -210,3 +294,19 @@ def state_of_flags(answer: bytes) -> BusState | None:
     if flags & FLAG_PASSIVE:
         return BusState.PASSIVE
     return BusState.WARNING if flags & FLAG_WARNING else BusState.ACTIVE
+
+
+def _errors_of_flags(errors: int) -> CanFrame:
+    """Error frame for the `ERROR_FLAGS` among the flags."""
+    error_class = controller = 0
+    if errors & (FLAG_RX_FULL | FLAG_OVERRUN):
+        controller |= 0x01
+    if errors & FLAG_TX_FULL:
+        controller |= 0x02
+    if controller:
+        error_class |= can_errors.CONTROLLER
+    if errors & FLAG_ARBITRATION:
+        error_class |= can_errors.LOST_ARBITRATION
+    if errors & FLAG_BUS_ERROR:
+        error_class |= can_errors.BUS_ERROR
+    return can_errors.error_frame(error_class, controller)

@@ -32,6 +32,9 @@ LONGEST = MAX_CHIPS * 4 * 8 + 32
 REPEATS = 0.2
 """Share of equal bytes at the distance of a frame: of noise it is 1/256."""
 
+ALMOST = 0.85
+"""Of the best share that the right distance has at least, where the best is a multiple of it."""
+
 STARTS = tuple(
     bytes.fromhex(word)
     for word in (
@@ -158,7 +161,7 @@ def _period(values: NDArray[np.uint8], payload: int | None) -> int | None:
     if share[best] < REPEATS:
         return None
     for parts in range(best // 6, 1, -1):
-        if best % parts == 0 and share[best // parts] >= share[best] - 0.03:
+        if best % parts == 0 and share[best // parts] >= ALMOST * share[best]:
             return best // parts
     return best
 

@@ -6,13 +6,13 @@ from collections import deque
 
 import numpy as np
 
-from sensor_proto.anyskin import encode_anyskin
 from sensor_proto.anyskin_search import MAX_MAGNETOMETERS
 from sensor_proto.packets import FloatSamples, TaxelStatus
 from sim_device.chips import Reading, temperature_of_raw
 from sim_device.environment import Environment
 from sim_device.faults import FaultPlan
 from sim_device.faulty_wire import SerialWire
+from sim_device.formats import BANNER, REMARK, REMARK_EVERY, SKETCHES, Writer
 from sim_device.sampler import Contacts, Sampler, SkinOwner
 from sim_device.skin import SkinModel
 from tactile_bus.instant import Instant, after, seconds_between
@@ -42,8 +42,12 @@ class AnySkinBoard(SkinOwner):
         plan: FaultPlan | None = None,
         loop_rate: float = LOOP_RATE,
         conversion_rate: float = CONVERSION_RATE,
+        write: Writer | None = None,
+        banner: bool = False,
     ) -> None:
-        """ValueError beyond 20 magnetometers, for rates not above 0, for faults of other boards."""
+        """``write``: how it writes its samples; ``banner``: it prints remarks as well.
+
+        ValueError beyond 20 magnetometers, for rates not above 0, for faults of other boards."""
         if skin.geometry.taxels > MAX_MAGNETOMETERS:
             raise ValueError(f"{skin.geometry.taxels} magnetometers: 1 to {MAX_MAGNETOMETERS}")
         if not (loop_rate > 0 and conversion_rate > 0):
@@ -54,6 +58,8 @@ class AnySkinBoard(SkinOwner):
         super().__init__(Sampler(skin, environment or Environment(), contacts, plan))
         self._wire = SerialWire(plan, delimited=False)
         self._rng = np.random.default_rng([plan.seed, 2])
+        self._write = write or SKETCHES["anyskin"]
+        self._banner = banner
         self._loop = 1.0 / loop_rate
         self._conversion = 1.0 / conversion_rate
         self._power_on: Instant | None = None
@@ -89,6 +95,8 @@ class AnySkinBoard(SkinOwner):
             self._overruns += skipped
             self._frames += skipped
         frames: deque[bytes] = deque()
+        if self._banner and not self._frames:
+            frames.append(BANNER)
         while self._frames <= due:
             frames.append(self._frame(start, self._frames * self._loop))
             self._frames += 1
@@ -103,7 +111,9 @@ class AnySkinBoard(SkinOwner):
             self._reading = self._sampler.read(after(start, ended), ended)
         else:
             self._duplicates += 1
-        return encode_anyskin(self._floats(self._reading))
+        written = self._write(self._floats(self._reading), self._frames)
+        remark = self._banner and self._frames % REMARK_EVERY == REMARK_EVERY - 1
+        return written + REMARK if remark else written
 
     def _floats(self, reading: Reading) -> FloatSamples:
         lsb = self._sampler.skin.chips.lsb_ut

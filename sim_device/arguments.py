@@ -9,6 +9,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sensor_proto.anyskin_search import MAX_MAGNETOMETERS
+from sim_device.formats import SKETCHES
+from sim_device.slcan import DIALECTS
 from sim_device.world.engines import ENGINES
 
 if TYPE_CHECKING:
@@ -89,8 +92,21 @@ def _add_boards(commands: Commands) -> argparse.ArgumentParser:
         "--fd", action="store_true",
         help="CAN FD on --slcan (default CAN 2.0B, which at 1 Mbit/s carries one finger at 60 Hz)",
     )  # fmt: skip
+    ports.add_argument(
+        "--adapter", choices=DIALECTS, default="lawicel", metavar="DIALECT",
+        help=f"firmware of the --slcan adapters: {', '.join(DIALECTS)} (default lawicel)",
+    )  # fmt: skip
     who = boards.add_argument_group("boards")
     _add_identity(who)
+    who.add_argument(
+        "--format", default="", metavar="FORMAT",
+        help=f"how anyskin boards write: {', '.join(SKETCHES)} (default anyskin), or a layout such "
+        "as floats:5xyz,end=lf (see tactiled --help)",
+    )  # fmt: skip
+    who.add_argument(
+        "--banner", action="store_true",
+        help="anyskin boards print text at the start and now and then between their frames",
+    )  # fmt: skip
     who.add_argument(
         "--rate", type=_number(0.1, 1000), metavar="HZ",
         help="sample rate after power-on in Hz (default 100; anyskin: its loop, 115)",
@@ -236,6 +252,10 @@ def _add_identity(group: argparse._ActionsContainer) -> None:
         help="finger: 80 taxels, our protocol; anyskin: 5 magnetometers, floats (default finger)",
     )  # fmt: skip
     group.add_argument(
+        "--arrays", type=_arrays, metavar="N+N",
+        help="magnetometers of each board on one anyskin controller, as in 5+5 (default 5)",
+    )  # fmt: skip
+    group.add_argument(
         "--seed", type=_whole, default=0, metavar="N",
         help="which board: tolerances, noise and faults follow from it (default 0)",
     )  # fmt: skip
@@ -310,6 +330,17 @@ def _parse_serial(text: str) -> bytes:
     return parse_serial(text)
 
 
+def _parse_arrays(text: str) -> tuple[int, ...]:
+    words = text.split("+")
+    if not all(word.isdecimal() and int(word) for word in words):
+        raise ValueError(f"{text!r} given; allowed: numbers above 0 joined by +, as in 5+5")
+    sizes = tuple(int(word) for word in words)
+    if sum(sizes) > MAX_MAGNETOMETERS:
+        raise ValueError(f"{text!r} given; allowed: at most {MAX_MAGNETOMETERS} magnetometers")
+    return sizes
+
+
+_arrays = _checked(_parse_arrays)
 _whole = _checked(_parse_whole)
 _node = _checked(lambda text: _parse_whole(text, 126))
 _bus = _checked(_parse_bus)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -13,7 +13,15 @@ from sim_device.controller import Identity
 from sim_device.parameters import SkinParameters, anyskin_parameters
 from sim_device.skin import SkinModel, nominal_calibration
 from tactile_bus.calibration import BoardCalibration
-from tactile_bus.geometry import SkinGeometry, anyskin, finger
+from tactile_bus.geometry import (
+    ANYSKIN_CHIPS,
+    MOUNTS,
+    SkinGeometry,
+    anyskin,
+    anyskin_jaws,
+    finger,
+)
+from tactile_bus.nominal import nominal as nominal_calibration_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,12 +38,27 @@ MODELS = {
 }
 
 
-def build_skin(model: str, seed: int) -> SkinModel:
-    """Skin number ``seed`` of ``model``: its tolerances and its noise follow from the seed."""
+def build_skin(model: str, seed: int, arrays: tuple[int, ...] | None = None) -> SkinModel:
+    """Skin number ``seed`` of ``model``: its tolerances and its noise follow from the seed.
+
+    ``arrays``: magnetometers of each board of an ``anyskin`` controller, None for one board of
+    five; ValueError for another model, and for more than 20.
+    """
     if model not in MODELS:
         raise ValueError(f"there is no model {model!r}; allowed: {', '.join(MODELS)}")
     kind = MODELS[model]
-    return SkinModel(kind.geometry(), kind.parameters(), np.random.default_rng([seed, 0]))
+    geometry = kind.geometry() if arrays is None else controller(model, arrays)
+    return SkinModel(geometry, kind.parameters(), np.random.default_rng([seed, 0]))
+
+
+def controller(model: str, arrays: tuple[int, ...]) -> SkinGeometry:
+    """AnySkin boards of one controller, on different sides of the finger where all have five."""
+    if model != "anyskin":
+        raise ValueError(f"the arrays of a {model} are what they are; they are for anyskin boards")
+    if set(arrays) == {ANYSKIN_CHIPS} and len(arrays) <= len(MOUNTS):
+        return anyskin_jaws(len(arrays))
+    geometry = nominal_calibration_of("anyskin", "", None, arrays).geometry
+    return replace(geometry, arrays=tuple(replace(a, posed=True) for a in geometry.arrays))
 
 
 def identity(model: str, seed: int) -> Identity:
@@ -45,6 +68,9 @@ def identity(model: str, seed: int) -> Identity:
 
 
 @lru_cache(maxsize=8)
-def factory_calibration(model: str, seed: int) -> BoardCalibration:
+def factory_calibration(
+    model: str, seed: int, arrays: tuple[int, ...] | None = None
+) -> BoardCalibration:
     """Calibration that belongs to that very board, as its maker would supply it."""
-    return nominal_calibration(build_skin(model, seed), identity(model, seed).unique_id.hex())
+    skin = build_skin(model, seed, arrays)
+    return nominal_calibration(skin, identity(model, seed).unique_id.hex())

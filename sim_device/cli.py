@@ -77,7 +77,11 @@ def _request(arguments: argparse.Namespace) -> BoardsRequest:
         cans=tuple(arguments.can),
         nodes=tuple(dict.fromkeys(arguments.node)) or (1,),
         fd=arguments.fd,
+        adapter=arguments.adapter,
         board=arguments.board,
+        arrays=arguments.arrays,
+        format=arguments.format,
+        banner=arguments.banner,
         seed=arguments.seed,
         serials=tuple(arguments.serial),
         rate=arguments.rate,
@@ -188,7 +192,10 @@ def _calibration(arguments: argparse.Namespace) -> int:
                 "or --force",
             )
     print(f"pressing every taxel of {arguments.board} {serial_number} …", file=sys.stderr)
-    calibration = factory_calibration(arguments.board, arguments.seed)
+    try:
+        calibration = factory_calibration(arguments.board, arguments.seed, arguments.arrays)
+    except ValueError as error:
+        raise _Refusal(BAD_ARGUMENT, error) from error
     try:
         save(replace(calibration, serial_number=serial_number), out)
     except CalibrationError as error:

@@ -172,12 +172,12 @@ class SlcanPort:
     """A simulated USB-CAN adapter on a pseudo-terminal, with a bus behind it.
 
     Frames take their time on the bus, and the lowest identifier goes first. ``fd``: the adapter
-    takes CAN FD.
+    takes CAN FD. ``dialect``: of its firmware, see `sim_device.slcan.DIALECTS`.
     """
 
-    def __init__(self, link: str | Path, fd: bool = True) -> None:
+    def __init__(self, link: str | Path, fd: bool = True, dialect: str = "lawicel") -> None:
         self.pty = PtyPort(link)
-        self.adapter = SlcanAdapter(fd=fd)
+        self.adapter = SlcanAdapter(fd=fd, dialect=dialect)
         self.bus = TimedBus()
 
     @property
@@ -227,6 +227,7 @@ class SlcanPort:
         frames = self.bus.pop(now, bitrate, self.adapter.data_bitrate)
         if frames:
             self.adapter.deliver(frames, now)
+        self.adapter.pass_time(now)
         self._answer()
 
     def set_bus_off(self, fault: bool) -> None:

@@ -7,7 +7,8 @@ adds them, state and error lines (``sb128256``, ``e1a``) as the Linux slcan driv
 from __future__ import annotations
 
 import re
-from collections import Counter
+from collections import Counter, deque
+from dataclasses import dataclass
 
 from sensor_proto.can_errors import BusState
 from sensor_proto.canseg import CanFrame
@@ -24,7 +25,7 @@ from sensor_proto.slcan import (
     decode_frame,
     encode_frame,
 )
-from tactile_bus.instant import Instant
+from tactile_bus.instant import Instant, after
 
 VERSION = b"V1013"
 """Hardware 1.0, software 1.3: two digits each, LAWICEL manual."""
@@ -36,8 +37,52 @@ SJA1000_CLOCK = 8_000_000
 
 TIMESTAMP_WRAP_MS = 60_000
 
+MAX_HELD = 1000
+"""Late answers that wait; a host that sends commands faster gets the others at once."""
+
 MAX_OUTPUT = 65_536
 """Bytes kept for a host that does not read: half a second of a full bus."""
+
+
+@dataclass(frozen=True, slots=True)
+class Dialect:
+    """What differs from one adapter's firmware to the next.
+
+    ``answers``: whether it answers commands. ``end``: of every line. ``late_s``: s until an answer.
+    ``letter``: of frames with 29-bit identifiers. ``lower``: hex digits in lower case. ``stamps``:
+    time stamps on although nobody asked. ``number``: whether it knows the command ``N``.
+    ``reports``: ``#`` for answers, ``E`` and ``L`` lines once a second. ``flags``: added to the
+    answer to ``F``.
+    """
+
+    answers: bool = True
+    end: bytes = CR
+    late_s: float = 0.0
+    letter: bytes = b"T"
+    lower: bool = False
+    stamps: bool = False
+    number: bool = True
+    reports: bool = False
+    flags: int = 0
+
+
+DIALECTS = {
+    "lawicel": Dialect(),
+    "canable": Dialect(answers=False),
+    "println": Dialect(end=b"\r\n"),
+    "late": Dialect(late_s=1.0),
+    "candapter": Dialect(letter=b"x"),
+    "lower": Dialect(lower=True),
+    "stamps": Dialect(stamps=True),
+    "plain": Dialect(number=False),
+    "canable2.5": Dialect(reports=True),
+    "overrun": Dialect(flags=0x08),
+    "buserror": Dialect(flags=0x80),
+}
+"""Adapters by name: the LAWICEL manual's, and what is sold."""
+
+REPORT_EVERY = 1.0
+"""s between ``E`` and ``L`` lines of firmware that reports by itself."""
 
 _RATE_OF = {command: rate for rate, command in BITRATES.items()}
 _DATA_RATE_OF = {command: rate for rate, command in DATA_BITRATES.items()}
@@ -60,16 +105,22 @@ class SlcanAdapter:
     """One adapter. ``fd``: it takes FD frames. ``tells_state``: it sends ``s`` lines by itself.
 
     ``bitrate`` and ``data_bitrate`` in bit/s as the host set them. Nothing a host sends raises.
+    ``dialect``: a name from `DIALECTS`; ValueError for another.
     """
 
-    def __init__(self, fd: bool = True, tells_state: bool = True) -> None:
+    def __init__(self, fd: bool = True, tells_state: bool = True, dialect: str = "lawicel") -> None:
+        if dialect not in DIALECTS:
+            raise ValueError(f"adapter {dialect!r} given; allowed: {', '.join(DIALECTS)}")
+        self.dialect = DIALECTS[dialect]
+        self._held: deque[tuple[Instant | None, bytes]] = deque()
+        self._report_due: Instant | None = None
         self._fd = fd
         self._tells_state = tells_state
         self.bitrate: int | None = None
         self.data_bitrate = min(DATA_BITRATES)
         self.is_open = False
         self._listen_only = False
-        self._timestamps = False
+        self._timestamps = self.dialect.stamps
         self._state = BusState.ACTIVE
         self._fault = False
         self._line = bytearray()
@@ -101,9 +152,9 @@ class SlcanAdapter:
             self._line.clear()
             if self._overlong:
                 self._overlong = False
-                self._put(BEL)
+                self._answer(BEL)
             else:
-                self._put(self._carry_out(line, frames))
+                self._answer(self._carry_out(line, frames))
         return frames
 
     def deliver(self, frames: tuple[CanFrame, ...], now: Instant) -> None:
@@ -113,8 +164,12 @@ class SlcanAdapter:
             return
         stamp = b"%04X" % (now // 1_000_000 % TIMESTAMP_WRAP_MS) if self._timestamps else b""
         for frame in frames:
-            line = encode_frame(frame)
-            self._put(line[:-1] + stamp + CR if stamp else line)
+            line = encode_frame(frame)[:-1]
+            if line[:1] == b"T":
+                line = self.dialect.letter + line[1:]
+            if self.dialect.lower:
+                line = line[:1] + line[1:].lower()
+            self._put(line + stamp + CR)
 
     def set_bus_off(self, fault: bool) -> None:
         """Begin or end a fault that keeps the controller in bus-off.
@@ -142,7 +197,34 @@ class SlcanAdapter:
         self._output.clear()
         return taken
 
+    def pass_time(self, now: Instant) -> None:
+        """Give the answers that are due, and report by itself where the firmware does."""
+        late = after(now, self.dialect.late_s)
+        self._held = deque((late if due is None else due, answer) for due, answer in self._held)
+        while self._held and (self._held[0][0] or now) <= now:
+            self._put(self._held.popleft()[1])
+        if not (self.dialect.reports and self.is_open):
+            return
+        if self._report_due is None or now >= self._report_due:
+            self._report_due = after(now, REPORT_EVERY)
+            state = list(_STATE_LINES).index(self._state)
+            self._put(b"E%d0000000\r" % state + b"L34\r")
+
+    def _answer(self, data: bytes) -> None:
+        """Answer to a command, as the dialect has it."""
+        dialect = self.dialect
+        if not data or not dialect.answers:
+            return
+        if dialect.reports and data in (CR, BEL):
+            data = b"#\r" if data == CR else b"#1\r"
+        if dialect.late_s and len(self._held) < MAX_HELD:
+            self._held.append((None, data))
+        else:
+            self._put(data)
+
     def _put(self, data: bytes) -> None:
+        if self.dialect.end != CR:
+            data = data.replace(CR, self.dialect.end)
         if len(self._output) + len(data) > MAX_OUTPUT:
             self._counts["tx_host_stalled_bytes"] += len(data)
         else:
@@ -159,7 +241,7 @@ class SlcanAdapter:
         letter = line[:1]
         if not line:
             return CR
-        if letter in b"tTrRdDbB":
+        if letter in b"tTrRdDbBx":
             return self._transmit(line, frames)
         if letter in b"SsYZ":
             return CR if not self.is_open and self._configure(line) else BEL
@@ -169,8 +251,9 @@ class SlcanAdapter:
             was_open, self.is_open = self.is_open, False
             return CR if was_open else BEL
         if line == b"F":
-            return b"F%02X\r" % _STATE_FLAGS[self._state] if self.is_open else BEL
-        if line in (b"V", b"v", b"N"):
+            flags = _STATE_FLAGS[self._state] | self.dialect.flags
+            return b"F%02X\r" % flags if self.is_open else BEL
+        if line in (b"V", b"v") or (line == b"N" and self.dialect.number):
             return {b"V": VERSION, b"v": b"v1013", b"N": SERIAL}[line] + CR
         self._counts["unknown_command"] += 1
         return BEL

@@ -23,12 +23,13 @@ from sim_device.environment import (
 )
 from sim_device.faults import FaultPlan, Window
 from sim_device.firmware import BoardOptions, CanBoard, SerialBoard
+from sim_device.formats import writer_of
 from sim_device.indenter import Indenter, load_script
 from sim_device.ports import PtyPort, PythonCanPort, SlcanPort
 from sim_device.runner import Board, CanStation, MakeBoard, SerialStation, Station
 from sim_device.skin import Contact
 from tactile_bus.can_bus import DEFAULT_BITRATE, CanSpec
-from tactile_bus.geometry import SkinGeometry
+from tactile_bus.geometry import ANYSKIN_CHIPS, SkinGeometry
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -56,7 +57,11 @@ class BoardsRequest:
     cans: tuple[CanSpec, ...] = ()
     nodes: tuple[int, ...] = (1,)
     fd: bool = False
+    adapter: str = "lawicel"
     board: str = "finger"
+    arrays: tuple[int, ...] | None = None
+    format: str = ""
+    banner: bool = False
     seed: int = 0
     serials: tuple[bytes, ...] = ()
     rate: float | None = None
@@ -103,10 +108,18 @@ def parse_serial(text: str) -> bytes:
 def plan_boards(request: BoardsRequest) -> list[Planned]:
     """Stations for a request, all boards made; ValueError for what does not fit together."""
     buses: list[tuple[SlcanPort | PythonCanPort, CanSpec]] = [
-        (SlcanPort(link), CanSpec("slcan", str(link), DEFAULT_BITRATE, fd=request.fd))
+        (
+            SlcanPort(link, dialect=request.adapter),
+            CanSpec("slcan", str(link), DEFAULT_BITRATE, fd=request.fd),
+        )
         for link in request.slcans
     ]
     buses += [(PythonCanPort(spec), spec) for spec in request.cans]
+    if request.board != "anyskin" and (request.arrays or request.format or request.banner):
+        raise ValueError(
+            f"--arrays, --format and --banner with --board {request.board}; they are for boards "
+            "that send floats: --board anyskin"
+        )
     count = len(request.ptys) + len(buses) * len(request.nodes)
     if not count:
         raise ValueError("no port given; allowed: --pty, --slcan and --can, each more than once")
@@ -130,6 +143,8 @@ def _plan_serial(maker: _Maker, number: int, link: Path) -> Planned:
     anyskin = request.board == "anyskin"
     make: MakeBoard[bytes] = maker.anyskin(number) if anyskin else maker.serial(number)
     connect = f"tactiled --port {link}" + (" --board anyskin" if anyskin else "")
+    if request.format and not request.format.endswith("-text"):
+        connect = f"tactiled --port {link} --board {request.format}"
     station = SerialStation(PtyPort(link), make, request.unplugged)
     return Planned(station, str(link), connect, (maker.describe(number),))
 
@@ -202,16 +217,22 @@ class _Maker:
     def anyskin(self, number: int) -> MakeBoard[bytes]:
         """Board that sends unframed floats."""
         loop = self.request.rate or LOOP_RATE
+        request = self.request
+        chips = sum(request.arrays or (ANYSKIN_CHIPS,))
+        write = writer_of(request.format or "anyskin", chips)
+        build_skin("anyskin", 0, request.arrays)  # what is wrong shows now
 
         def make(powered: float) -> Board[bytes]:
             options = self._options(number, powered)
             return AnySkinBoard(
-                build_skin("anyskin", self.seed(number)),
+                build_skin("anyskin", self.seed(number), request.arrays),
                 options["environment"],
                 options["contacts"],
                 options["plan"],
                 loop_rate=loop,
                 conversion_rate=loop * CONVERSION_RATE / LOOP_RATE,
+                write=write,
+                banner=request.banner,
             )
 
         return make
@@ -234,7 +255,9 @@ class _Maker:
         if self.request.press is None:
             return ()
         if self._indenter is None:
-            geometry = build_skin(self.request.board, self.request.seed).geometry
+            geometry = build_skin(
+                self.request.board, self.request.seed, self.request.arrays
+            ).geometry
             self._indenter = load_script(self.request.press, geometry)
         indenter = self._indenter
         return lambda seconds: indenter.contacts(seconds + powered)

@@ -94,13 +94,14 @@ def test_any_chunking_of_the_adapters_bytes_gives_the_same(cuts: list[int]) -> N
         frames += decoder.feed(STREAM[start:end])
     assert frames[:2] == [FRAME, FD_FRAME]
     assert can_errors.told_state(frames[2]) is BusState.WARNING
-    assert can_errors.told_state(frames[3]) is BusState.BUS_OFF
-    assert can_errors.names(frames[4]) == (
+    assert can_errors.names(frames[3]) == ("bus-error",)
+    assert can_errors.told_state(frames[4]) is BusState.BUS_OFF
+    assert can_errors.names(frames[5]) == (
         "protocol-violation",
         "no-acknowledgement",
         "bus-error",
     )
-    assert len(frames) == 5
+    assert len(frames) == 6
     assert list(decoder.answers) == [b"", b"\a", b"F84"]
     assert decoder.counters == {"standard_id": 1, "malformed_line": 1}
 
@@ -189,7 +190,8 @@ def test_socketcan_error_frames_have_their_kernel_names() -> None:
         (b"\r", b"\r"),
         (b"C\r", b"\a"),  # it is not open
         (b"O\r", b"\a"),  # no bit rate yet
-        (b"S9\r", b"\a"),
+        (b"S9\r", b"\r"),
+        (b"SA\r", b"\a"),
         (b"S6\r", b"\r"),
         (b"s031C\r", b"\r"),
         (b"F\r", b"\a"),  # only while open

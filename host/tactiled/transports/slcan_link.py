@@ -9,6 +9,7 @@ once when closed or unplugged.
 from __future__ import annotations
 
 import logging
+from collections import deque
 
 from sensor_proto import can_errors, slcan
 from sensor_proto.can_errors import BusState
@@ -23,6 +24,13 @@ log = logging.getLogger(__name__)
 
 ANSWER_TIME = 0.15
 """s an adapter has to answer a command; those over USB take a few milliseconds."""
+
+MARK = b"N\r"
+"""Question whose answer is like no other: whatever comes before it belongs to earlier commands,
+however late it comes and however many lines the adapter makes of it."""
+
+MARK_TIME = 0.3
+"""s to wait for the first answer. Some firmware never answers; the bus then shows what is there."""
 
 SILENCE = 0.08
 """s without a frame after which the adapter is asked for its flags: bus-off is known in 0.1 s even
@@ -60,6 +68,9 @@ class SlcanLink:
         self._told = BusState.ACTIVE
         self._last = Instant(0)
         self._pending: list[CanFrame] = []
+        self._asked = Instant(0)
+        self._unanswered: deque[bytes] = deque()
+        self._marked = False
 
     @property
     def losses(self) -> dict[str, int]:
@@ -67,10 +78,15 @@ class SlcanLink:
         return self.port.losses | self._decoder.counters
 
     def open(self) -> None:
-        """Open port and channel; raises `TransportError`, also when no adapter answers."""
+        """Open port and channel; raises `TransportError`, also for what is not an adapter.
+
+        An adapter that answers nothing is opened all the same.
+        """
         self.port.open()
         self._decoder.reset()
         self._pending.clear()
+        self._unanswered.clear()
+        self._tells_flags = self._marked = False
         self._told = BusState.ACTIVE
         try:
             self._open_channel()
@@ -97,6 +113,8 @@ class SlcanLink:
             chunk = self.port.read(max(0.0, wait))
             if chunk is not None:
                 frames = self._decode(chunk)
+                if self._unanswered:
+                    self._hear_late(chunk.received)
                 if frames:
                     self._last = chunk.received
                     return chunk.received, frames
@@ -130,37 +148,84 @@ class SlcanLink:
         return frames
 
     def _open_channel(self) -> None:
+        known = self._decoder.counters
         # Empty lines end whatever a previous owner left half-written; a closed channel refuses C.
-        answered = self._ask(b"\r\rC\r") is not None
-        for command in (*self._setup, b"O"):
-            answer = self._ask(command + slcan.CR)
-            answered |= answer is not None
-            if answer == slcan.BEL:
-                raise PortUnsuitable(
-                    f"the adapter on {self._spec.channel} refuses the command "
-                    f"{command.decode('ascii')} of {self._spec}",
-                    "give a bit rate it has"
-                    + (", or leave +fd out" if self._spec.fd else "")
-                    + "; plug it out and in when it hangs",
-                )
-        answer = self._ask(b"F\r")
-        self._tells_flags = answer is not None and answer.startswith(b"F")
-        if not answered and answer is None and not self._pending:
+        self._asked = monotonic_now()
+        answers = self._collect(b"\r\rC\r" + MARK, MARK_TIME)
+        commands = (*self._setup, b"O")
+        if answers and answers[-1][:1] == MARK[:1]:
+            wait = MARK_TIME + 2 * seconds_between(self._asked, monotonic_now())
+            for command in commands:
+                self._judge(command, self._collect(command + slcan.CR + MARK, wait))
+            answers = self._collect(b"F\r" + MARK, wait)
+        elif answers:
+            # It knows no serial number: then only prompt answers can be matched.
+            while self._collect(b"", ANSWER_TIME):
+                pass
+            for command in commands:
+                self._judge(command, self._collect(command + slcan.CR, ANSWER_TIME, 1))
+            answers = self._collect(b"F\r", ANSWER_TIME, 1)
+        elif self._pending or self._decoder.counters == known:
+            log.warning(
+                "the adapter on %s answers no command, as some firmware never does; opened as %s "
+                "all the same",
+                self._spec.channel,
+                self._spec,
+            )
+            self._unanswered.extend(commands)
+            for command in commands:
+                self.port.write(command + slcan.CR)
+        else:
             raise PortUnsuitable(
-                f"nothing on {self._spec.channel} answers as an slcan adapter",
+                f"{self._spec.channel} sends what no slcan adapter sends",
                 "give the adapter's port; a board on a serial line is opened with --port",
             )
+        self._tells_flags = any(slcan.flags_of(answer) is not None for answer in answers)
 
-    def _ask(self, command: bytes) -> bytes | None:
-        """Send ``command``, return its last answer; None when none came in `ANSWER_TIME`."""
+    def _judge(self, command: bytes, answers: list[bytes]) -> None:
+        """Refuse the adapter when it refused ``command``."""
+        if slcan.BEL in answers:
+            raise PortUnsuitable(self._refused(command), self._remedy())
+
+    def _refused(self, command: bytes) -> str:
+        return (
+            f"the adapter on {self._spec.channel} refuses the command "
+            f"{command.decode('ascii')} of {self._spec}"
+        )
+
+    def _remedy(self) -> str:
+        fd = ", or leave +fd out" if self._spec.fd else ""
+        return f"give a bit rate it has{fd}; plug it out and in when it hangs"
+
+    def _collect(self, command: bytes, wait: float, wanted: int | None = None) -> list[bytes]:
+        """Send ``command``; answers up to that of `MARK`, or ``wanted``, or all in ``wait`` s."""
         self._decoder.answers.clear()
-        self.port.write(command)
-        wanted = command.count(slcan.CR)
+        if command:
+            self.port.write(command)
+        answers: list[bytes] = []
         start = monotonic_now()
-        while len(self._decoder.answers) < wanted:
-            left = ANSWER_TIME - seconds_between(start, monotonic_now())
+        while True:
+            while self._decoder.answers:
+                answers.append(self._decoder.answers.popleft())
+                if answers[-1][:1] == MARK[:1] or len(answers) == wanted:
+                    return answers
+            left = wait - seconds_between(start, monotonic_now())
             chunk = self.port.read(left) if left > 0 else None
             if chunk is None:
-                break
+                return answers
             self._pending += self._decode(chunk)
-        return self._decoder.answers[-1] if self._decoder.answers else None
+
+    def _hear_late(self, now: Instant) -> None:
+        """Match what an adapter answers after it was opened: the mark first, then its commands."""
+        answers = self._decoder.answers
+        while answers and self._unanswered:
+            answer = answers.popleft()
+            if not self._marked:
+                self._marked = answer[:1] == MARK[:1]
+                if self._marked:
+                    late = seconds_between(self._asked, now)
+                    log.warning("the adapter on %s answers %.1f s late", self._spec.channel, late)
+                continue
+            command = self._unanswered.popleft()
+            if answer == slcan.BEL:
+                log.error("%s; %s", self._refused(command), self._remedy())
