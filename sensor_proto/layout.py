@@ -174,7 +174,8 @@ class Layout:
             words.append("big")
         if self.scale != (COUNT_UT if self.kind in COUNTS else (1.0, 1.0, 1.0)):
             x, y, z = (f"{value:g}" for value in self.scale)
-            words.append(f"scale={x}" if x == y == z else f"scale={x}/{y}/{z}")
+            scale = [x] if x == y == z else [x, z] if x == y else [x, y, z]
+            words.append(f"scale={'/'.join(scale)}")
         if self.lead:
             words.append(f"lead={self.lead}")
         if self.lines > 1:

@@ -46,6 +46,7 @@ class LayoutDecoder:
         marks = len(self._framing.start) + bool(self._framing.check) + len(self._framing.end)
         self._alone = marks >= SURE_BYTES
         framing = self._framing
+        self._weak = layout.kind in COUNTS and not self._alone
         self._open_ended = bool(framing.start) and not (framing.end or framing.check)
         self._tally = Tally((Reject.LOST_LOCK, Reject.DISCARDED_BYTES, Reject.CRC))
         self.reset()
@@ -59,16 +60,17 @@ class LayoutDecoder:
         """Forget boundary and unfinished input."""
         self._buffer = b""
         self._locked = self._known = False
-        self._suspect = 0
+        self._suspect = self._astray = 0
 
     def feed(self, data: bytes, /) -> list[Received]:
         """Frames that ``data`` completed; on a fresh lock also those held back until then."""
         out: list[Received] = []
-        if self._bare:
+        if self._bare or self._weak:
             self._look_at_read(data)
-        for begin in range(0, len(data), PIECE):
-            piece = data[begin : begin + PIECE]
-            self._feed(piece, max(0, len(data) - begin - PIECE), len(data), out)
+        step = max(len(data), 1) if self._bare else PIECE  # only whole reads tell anything
+        for begin in range(0, len(data), step):
+            piece = data[begin : begin + step]
+            self._feed(piece, max(0, len(data) - begin - step), len(data), out)
         return out
 
     def _feed(self, piece: bytes, later: int, fed: int, out: list[Received]) -> None:
@@ -79,9 +81,9 @@ class LayoutDecoder:
                 at += self._take(buffer, at, later, fed, out)
                 if self._locked:
                     break
-            start = self._search(buffer, at)
+            start = self._search(buffer, at, whole_read=not later)
             if start is None:
-                surplus = len(buffer) - at - (LOCK_FRAMES + 2) * self._size
+                surplus = len(buffer) - at - (2 * LOCK_FRAMES + 2) * self._size
                 if surplus > 0:
                     self._tally[Reject.DISCARDED_BYTES] += surplus
                     at += surplus
@@ -93,10 +95,16 @@ class LayoutDecoder:
         self._buffer = buffer[at:]
 
     def _look_at_read(self, data: bytes) -> None:
-        """Without marks only reads tell where frames begin: one that holds whole frames only."""
+        """Let reads that hold whole frames tell where these begin, where marks do not.
+
+        Without marks one is enough: what came before it has lost bytes. With one byte of marks,
+        which the numbers may hold as well, some in a row are.
+        """
         whole = bool(data) and len(data) % self._size == 0
-        if self._buffer and whole and len(self._buffer) % self._size:
-            # What came before has lost bytes, or is the end of a frame that was under way.
+        astray = whole and len(self._buffer) % self._size > 0
+        self._astray = self._astray + 1 if astray else 0
+        if self._astray >= (1 if self._bare else LOCK_FRAMES):
+            self._astray = 0
             self._tally[Reject.LOST_LOCK] += self._locked
             self._tally[Reject.DISCARDED_BYTES] += len(self._buffer)
             self._buffer, self._locked = b"", False
@@ -207,8 +215,12 @@ class LayoutDecoder:
                 good &= (temperature >= COLDEST_C) & (temperature <= HOTTEST_C)
         return np.where(good, TaxelStatus.OK, TaxelStatus.READ_FAILED).astype(np.uint8)
 
-    def _search(self, buffer: bytes, at: int) -> int | None:
-        """Where the first believable frame begins; None: wait for more."""
+    def _search(self, buffer: bytes, at: int, whole_read: bool) -> int | None:
+        """Where the first believable frame begins; None: wait for more.
+
+        Among frames that overlap the best supported wins: by those that follow it, by the end of
+        one before it, and by the end of the read where the buffer ends with it (``whole_read``).
+        """
         size = self._size
         if self._bare:
             enough = len(buffer) - at >= LOCK_FRAMES * size and (len(buffer) - at) % size == 0
@@ -235,14 +247,18 @@ class LayoutDecoder:
                 if start + (run + 1) * size > len(buffer):
                     return None if best is None else best[1]
                 continue
-            score = run + 0.5 * follows
+            closes = whole_read and (len(buffer) - start) % size == 0
+            if self._weak and not closes and run < 2 * LOCK_FRAMES:
+                continue  # a byte of the numbers may be like the end
+            score = run + 0.5 * follows + 0.75 * closes
             if best is None or score > best[0]:
                 best = score, start
         return None if best is None else best[1]
 
     def _run(self, buffer: bytes, start: int) -> int:
-        """Consecutive frames from ``start`` on that fit and are likely, at most `LOCK_FRAMES`."""
-        whole = min((len(buffer) - start) // self._size, LOCK_FRAMES)
+        """Consecutive frames from ``start`` on that fit and are likely, so many as matter."""
+        most = 2 * LOCK_FRAMES if self._weak else LOCK_FRAMES
+        whole = min((len(buffer) - start) // self._size, most)
         if not whole:
             return 0
         raw = np.frombuffer(buffer, np.uint8, whole * self._size, start).reshape(whole, -1)

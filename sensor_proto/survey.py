@@ -184,7 +184,7 @@ def _framed(rows: NDArray[np.uint8]) -> list[_Frame]:
     still = (rows == rows[0]).all(axis=0)
     modes = rows[0]
     size = rows.shape[1]
-    out: list[tuple[int, _Frame]] = []
+    out: list[tuple[int, bool, _Frame]] = []  # how telling, and whether it breaks up a read
 
     def cut(at: int) -> NDArray[np.uint8]:
         """Rows that begin at column ``at``; the wrap costs one frame."""
@@ -203,11 +203,12 @@ def _framed(rows: NDArray[np.uint8]) -> list[_Frame]:
         begin = (at + len(end)) % size
         framed = [w for w, s in starts if s == begin and len(w) == 2]
         if framed:
-            out.append((len(end) + 2, _Frame(cut(begin), Framing(start=framed[0], end=end))))
-        out.append((len(end), _Frame(cut(begin), Framing(end=end))))
-    out += [(len(word), _Frame(cut(at), Framing(start=word))) for word, at in starts]
-    out.sort(key=lambda item: -item[0])
-    return [frame for _, frame in out[:40]] + [_Frame(rows, Framing())]
+            both = Framing(start=framed[0], end=end)
+            out.append((len(end) + 2, begin > 0, _Frame(cut(begin), both)))
+        out.append((len(end), begin > 0, _Frame(cut(begin), Framing(end=end))))
+    out += [(len(word), at > 0, _Frame(cut(at), Framing(start=word))) for word, at in starts]
+    out.sort(key=lambda item: (-item[0], item[1]))
+    return [frame for *_, frame in out[:40]] + [_Frame(rows, Framing())]
 
 
 def _around(frame: _Frame, payload: int | None = None) -> list[_Frame]:
