@@ -138,6 +138,7 @@ class TextDecoder:
         self._record_bytes = 0
         self._form: tuple[tuple[int, ...], int] | None = None
         self._wrong = 0
+        self._label = b""  # before the first number of a frame of several lines
 
     def feed(self, data: bytes, /) -> list[Received]:
         """Frames that ``data`` completed."""
@@ -164,9 +165,11 @@ class TextDecoder:
         if self.layout.lines > 1:
             if not part.numbers:
                 return  # a rule between two frames
-            first = axis_of(part.between[0])
-            if first and first == self.layout.fields[0] and self._begins(part):
+            if self._begins(part):
                 self._drop_record()
+            elif not self._record:
+                self._tally[Reject.DISCARDED_BYTES] += len(line)
+                return
             self._record.append(part)
             self._record_bytes += len(line)
             if sum(len(p.numbers) for p in self._record) < self._wanted:
@@ -187,9 +190,19 @@ class TextDecoder:
         out.append(Received(FloatSamples(field[0], temperature[0], status[0]), 0, trailing))
 
     def _begins(self, part: Tokens) -> bool:
-        """Whether a line that names the first axis can be the first of a frame."""
+        """Whether a line is the first of a frame: it names the first axis, of the first chip.
+
+        Where lines name no axis, any line may be.
+        """
         label = part.between[0].strip()
-        return not self._record or label == self._record[0].between[0].strip()
+        axis = axis_of(label)
+        if not axis:
+            return not self._record
+        if axis != self.layout.fields.lstrip("_")[:1]:
+            return False
+        if not self._label or label < self._label:
+            self._label = label
+        return label == self._label
 
     def _drop_record(self) -> None:
         self._tally[Reject.DISCARDED_BYTES] += self._record_bytes

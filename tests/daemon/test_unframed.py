@@ -1,0 +1,210 @@
+"""Boards without a protocol on a serial line: found, declared, or named for what they send."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sensor_proto.layout import Layout
+from sensor_proto.packets import FloatSamples
+from tactile_bus.calibration import nominal
+from tactile_bus.instant import Instant
+from tactiled.blocks import Chunk
+from tactiled.links.events import Diagnosed, Identified, Identity, Refusal, Sampled
+from tactiled.links.line import SerialLine
+from tactiled.sensing.pipeline import BoardPipeline
+
+At = Callable[[float], Instant]
+
+
+def welcome(node: int, identity: Identity) -> Refusal | None:
+    return None
+
+
+def frames(layout: str, count: int, seed: int = 0) -> list[bytes]:
+    """What a still board writes."""
+    parsed = Layout.parse(layout)
+    rng = np.random.default_rng(seed)
+    rest = rng.uniform(-1500, 1500, (parsed.chips, 3))
+    status = np.zeros(parsed.chips, np.uint8)
+    out = []
+    for number in range(count):
+        field = (rest + rng.normal(0, 2, rest.shape)).astype(np.float32)
+        celsius = (np.round(rng.normal(27, 0.05, parsed.chips) * 45.2) / 45.2).astype(np.float32)
+        out.append(parsed.encode(FloatSamples(field, celsius, status), number))
+    return out
+
+
+def play(
+    line: SerialLine, at: At, data: list[bytes], rate: float = 100.0, start: float = 0.0
+) -> list[Any]:
+    events: list[Any] = []
+    ticked = start
+    for k, chunk in enumerate(data):
+        now = start + k / rate
+        while ticked < now:
+            ticked += 0.05
+            events += [e.event for e in line.tick(at(ticked))]
+            line.outgoing()
+        events += [e.event for e in line.receive(Chunk(at(now), chunk))]
+    return events
+
+
+def of(events: list[Any], kind: type) -> list[Any]:
+    return [e for e in events if isinstance(e, kind)]
+
+
+@pytest.mark.parametrize(
+    ("board", "sent", "read"),
+    [
+        ("auto", "text:5xyzt", "text:5xyzt"),
+        ("anyskin", "text:5txyz", "text:5txyz"),
+        ("auto", "floats:5txyz,end=lf", "floats:5txyz,end=lf"),
+        ("reskin", "floats:5txyz,start=aa55,end=crlf", "floats:5txyz,start=aa55,end=crlf"),
+        ("auto", "floats:10txyz,end=crlf", ""),
+        ("floats:5xyz", "floats:5xyz,end=crlf", "floats:5xyz,end=crlf"),
+        ("floats:5xyz", "floats:5xyz,start=aa55,skip=1,check=xor,end=none", None),
+        ("int16:5txyz,big", "int16:5txyz,big,start=aa55,check=sum,end=none", None),
+        ("int16:5xyz,scale=0.3/0.484,end=crlf", "int16:5xyz,scale=0.3/0.484,end=crlf", None),
+        ("text:5xyz", "text:5xyz", "text:5xyz"),
+        ("floats:5txyz", "floats:5txyz,end=crlf", ""),
+    ],
+)
+def test_a_board_streams_that_is_plain_or_declared(
+    board: str, sent: str, read: str | None, instant: At
+) -> None:
+    line = SerialLine("p", welcome, board)
+    line.connect(instant(0.0), usb_serial="USB7")
+    events = play(line, instant, frames(sent, 300))
+    assert not of(events, Diagnosed)
+    identity = of(events, Identified)[0].identity
+    chips = Layout.parse(sent).chips
+    assert (identity.model, identity.serial_number) == ("anyskin", "USB7")
+    assert identity.shapes == ((1, chips),)
+    assert identity.layout == (sent if read is None else read)
+    blocks = [e.block for e in of(events, Sampled)]
+    assert len(blocks) > 180
+    mean = np.mean([b.field_ut for b in blocks], axis=0)
+    parsed = Layout.parse(sent)
+    rest = np.random.default_rng(0).uniform(-1500, 1500, (chips, 3))
+    np.testing.assert_allclose(mean, rest, atol=2 * max(parsed.scale))
+
+
+@pytest.mark.parametrize(
+    ("sent", "words", "board"),
+    [
+        ("floats:5xyz,end=crlf", "62 bytes ending in CR LF: 15 floats, no temperatures",
+         "--board floats:5xyz"),
+        ("floats:4xyz,end=crlf", "12 floats, no temperatures", "--board floats:4xyz"),
+        ("int16:5xyz,big,start=aa55,check=sum,end=none", "big-endian 16-bit integers",
+         "--board int16:5xyz,big,start=aa55,check=sum,end=none"),
+        ("text:5xyz", "lines of 15 numbers", "--board text:5xyz"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("uart", [False, True])
+def test_what_is_not_plain_is_named_once_and_never_put_down_to_the_baud_rate(
+    sent: str, words: str, board: str, uart: bool, instant: At
+) -> None:
+    line = SerialLine("/dev/ttyACM0", welcome)
+    line.connect(instant(0.0), byte_time=1e-5 if uart else 0.0)
+    events = play(line, instant, frames(sent, 600))
+    (diagnosed,) = of(events, Diagnosed)
+    assert words in diagnosed.problem
+    assert board in diagnosed.remedy
+    assert "baud" not in diagnosed.problem + diagnosed.remedy
+    assert not of(events, Sampled)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        [bytes(300)] * 400,
+        [np.random.default_rng(k).integers(1, 256, 80, np.uint8).tobytes() for k in range(400)],
+        [b"boot ok\r\n"] * 400,
+        [b""] * 800,
+    ],
+)
+def test_on_usb_the_baud_rate_is_never_blamed(data: list[bytes], instant: At) -> None:
+    line = SerialLine("/dev/ttyACM0", welcome)
+    line.connect(instant(0.0), byte_time=0.0)
+    (diagnosed,) = of(play(line, instant, data), Diagnosed)
+    assert "baud" not in diagnosed.problem + diagnosed.remedy
+
+
+def test_a_declared_board_is_not_second_guessed(instant: At) -> None:
+    """Twelve floats are four chips if the user says so, whatever they look like."""
+    line = SerialLine("p", welcome, "floats:4xyz")
+    line.connect(instant(0.0))
+    sent = [
+        struct.pack("<12f", *(r + np.random.default_rng(k).normal(0, 0.02, 12))) + b"\r\n"
+        for k, r in enumerate([np.full(12, 25.0)] * 200)
+    ]
+    events = play(line, instant, sent)
+    assert of(events, Identified)[0].identity.shapes == ((1, 4),)
+
+
+def test_a_board_that_comes_back_with_other_firmware_is_read_again(instant: At) -> None:
+    line = SerialLine("p", welcome)
+    line.connect(instant(0.0))
+    play(line, instant, frames("floats:5txyz,end=crlf", 200))
+    line.disconnect()
+    line.connect(instant(4.0))
+    events = play(line, instant, frames("text:5xyzt", 300), start=4.0)
+    assert of(events, Identified)[0].identity.layout == "text:5xyzt"
+    assert len(of(events, Sampled)) > 150
+
+
+def test_a_slow_board_is_given_time(instant: At) -> None:
+    line = SerialLine("p", welcome)
+    line.connect(instant(0.0))
+    lines = [
+        b"X: %.4f uT\r\nY: %.4f uT\r\nZ: %.4f uT\r\n" % (400 + k % 3, -30, 900) for k in range(20)
+    ]
+    events = play(line, instant, lines, rate=2.0)
+    assert not of(events, Diagnosed)
+    assert of(events, Sampled)[-1].block.field_ut[0].tolist() == [401.0, -30.0, 900.0]
+
+
+@pytest.mark.parametrize("text", ["skin", "floats", "floats:5", "auto:5xyz"])
+def test_a_kind_that_is_none_is_refused_with_those_there_are(text: str) -> None:
+    with pytest.raises(ValueError, match="floats:5xyz"):
+        SerialLine("p", welcome, text)
+
+
+def test_boards_of_one_controller_are_arrays_of_their_own(instant: At) -> None:
+    """The link knows of one array; the calibration says how it is shared."""
+    line = SerialLine("p", welcome)
+    line.connect(instant(0.0))
+    blocks = [
+        e.block for e in of(play(line, instant, frames("floats:10txyz,end=crlf", 300)), Sampled)
+    ]
+    pipeline = BoardPipeline(nominal("anyskin", "unknown", 10))
+    cycles = [cycle for block in blocks for cycle in pipeline.feed(block)]
+    assert len(cycles) == len(blocks)
+    assert pipeline.counters.incomplete_cycles == pipeline.counters.unknown_array == 0
+    assert cycles[-1].features.valid
+    assert cycles[-1].ambient.plane.shape[0] == 2
+    parts = blocks[0].split((5, 5))
+    assert [p.array for p in parts] == [0, 1]
+    np.testing.assert_array_equal(parts[1].field_ut, blocks[0].field_ut[5:])
+    np.testing.assert_array_equal(parts[1].temperature_c, blocks[0].temperature_c[5:])
+    assert blocks[0].split((10,)) == (blocks[0],)
+    assert parts[0].split((5, 5)) == (parts[0],)
+
+
+def test_a_board_without_temperatures_has_forces(instant: At) -> None:
+    line = SerialLine("p", welcome, "floats:5xyz")
+    line.connect(instant(0.0))
+    blocks = [
+        e.block for e in of(play(line, instant, frames("floats:5xyz,end=crlf", 300)), Sampled)
+    ]
+    assert np.isnan(blocks[0].temperature_c).all()
+    pipeline = BoardPipeline(nominal("anyskin", "unknown", 5))
+    cycles = [cycle for block in blocks for cycle in pipeline.feed(block)]
+    assert cycles[-1].features.valid
+    assert cycles[-1].features.taxels_masked == 0
+    assert np.isfinite(cycles[-1].force).all()
