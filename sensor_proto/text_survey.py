@@ -67,7 +67,8 @@ def _records(taken: list[Tokens]) -> tuple[list[Tokens], int]:
         same = sum(a == b for a, b in zip(seen, seen[period:], strict=False))
         if same < MOST * (len(seen) - period):
             continue
-        labels = sorted({f[1][0] for f in seen if axis_of(f[1][0]) in ("x", "t")})
+        named = Counter(f[1][0] for f in seen if axis_of(f[1][0]) in ("x", "t"))
+        labels = sorted(label for label, n in named.items() if 2 * n >= max(named.values()))
         begins = [i for i, f in enumerate(seen) if not labels or f[1][0] == labels[0]]
         groups = [with_numbers[a:b] for a, b in itertools.pairwise(begins) if b - a == period]
         joined = [join(group) for group in groups]

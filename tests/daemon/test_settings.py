@@ -167,3 +167,72 @@ def test_exit_status_of_the_command(capsys: pytest.CaptureFixture[str], tmp_path
     assert main(["--listen", "tcp/0.0.0.0:0", "--no-log", "--port", "a"]) == 3
     assert "--insecure" in capsys.readouterr().err
     assert main(["--list-ports"]) == 0
+
+
+def test_layouts_and_arrays_are_given_for_all_ports_or_for_each(make: Make, tmp_path: Path) -> None:
+    settings = make(
+        "--port", "a", "--board", "floats:5xyz", "--arrays", "5",
+        "--port", "b", "--board", "anyskin", "--arrays", "5+5",
+    )  # fmt: skip
+    assert [(p.kind, p.arrays) for p in settings.ports] == [
+        ("floats:5xyz", (5,)),
+        ("anyskin", (5, 5)),
+    ]
+    settings = make("--port", "a", "--port", "b", "--arrays", "5+5")
+    assert [p.arrays for p in settings.ports] == [(5, 5), (5, 5)]
+    file = tmp_path / "t.toml"
+    file.write_text("[[board]]\nport = 'a'\nkind = 'int16:5txyz,big'\narrays = '3+2'\n")
+    (port,) = make("--config", str(file)).ports
+    assert (port.kind, port.arrays) == ("int16:5txyz,big", (3, 2))
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("--port", "a", "--board", "skin"), "auto, tactile, anyskin"),
+        (("--port", "a", "--board", "floats:5xy"), "x, y and z once each"),
+        (("--port", "a", "--arrays", "5+x"), "as in 5+5"),
+        (("--port", "a", "--arrays", "15+10"), "at most 20"),
+    ],
+)
+def test_layouts_and_arrays_that_are_none_are_bad_arguments(
+    make: Make, words: tuple[str, ...], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        make(*words)
+    assert ended.value.code == 2
+    assert named in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("kind = 'floats:5xy'", "x, y and z once each"),
+        ("kind = 'skin'", "or a layout such as floats:5xyz"),
+        ("arrays = '5x5'", "joined by +"),
+        ("arrays = '15+10'", "at most 20"),
+    ],
+)
+def test_a_file_says_where_a_layout_or_an_array_is_wrong(
+    make: Make, tmp_path: Path, text: str, named: str
+) -> None:
+    file = tmp_path / "t.toml"
+    file.write_text(f"[[board]]\nport = 'a'\n{text}\n")
+    with pytest.raises(SettingsError, match=r"board\[0\]") as caught:
+        make("--config", str(file))
+    assert named in str(caught.value)
+
+
+@pytest.mark.parametrize("spec", ["slcan:/dev/x@123456", "slcan:/dev/x@1000000/7000000+fd"])
+def test_a_bit_rate_that_no_adapter_has_is_a_bad_argument(make: Make, spec: str) -> None:
+    with pytest.raises(SettingsError, match=r"an slcan adapter has .*000"):
+        make("--can", spec)
+    for good in ("slcan:/dev/x@83333", "slcan:/dev/x@1000000/8000000+fd", "socketcan:can0@123456"):
+        assert make("--can", good).ports[0].spec == good
+
+
+def test_arrays_are_of_serial_boards(make: Make) -> None:
+    with pytest.raises(SettingsError, match="boards on a CAN bus say it themselves"):
+        make("--can", "socketcan:can0", "--arrays", "5+5")
+    with pytest.raises(SettingsError, match="--arrays go with --port"):
+        make("--arrays", "5+5")

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sensor_proto.packets import Descriptor
 from tactile_bus.calibration import load, nominal, nominal_from_descriptor, save, saves
+from tactile_bus.geometry import anyskin_jaws
 from tactile_bus.recorder import Recorder
 from tactiled.links.events import Identity, Refusal
 from tactiled.shelf import Choice, Shelf
@@ -116,3 +118,43 @@ def test_reloading_reads_what_the_file_says_now(tmp_path: Path, descriptor: Desc
     second = shelf.choose(pad(descriptor))
     assert isinstance(second, Choice)
     assert second.calibration.hash != first.calibration.hash
+
+
+def controller(arrays: tuple[int, ...] | None = None, magnetometers: int = 10) -> Identity:
+    return Identity("USB1", "anyskin", "", ((1, magnetometers),), None, arrays=arrays)
+
+
+def test_a_controller_has_arrays_of_five_unless_told_otherwise() -> None:
+    for arrays, sizes in ((None, [5, 5]), ((5, 5), [5, 5]), ((6, 4), [6, 4]), ((10,), [10])):
+        chosen = Shelf([], strict=True).choose(controller(arrays))
+        assert isinstance(chosen, Choice)
+        geometry = chosen.calibration.geometry
+        assert [a.taxels for a in geometry.arrays] == sizes
+        assert geometry.posed == (len(sizes) == 1)
+    refusal = Shelf([], strict=True).choose(controller((5, 4)))
+    assert isinstance(refusal, Refusal)
+    assert "5+4 names 9 magnetometers" in refusal.problem
+    assert "5+5" in refusal.remedy
+
+
+def test_the_file_says_how_a_controller_is_shared_and_where_its_boards_are(tmp_path: Path) -> None:
+    path = tmp_path / "jaws.cal.toml"
+    jaws = anyskin_jaws(2)
+    typical = nominal("anyskin", "USB1", 10)
+    placed = tuple(
+        replace(array, geometry=geometry)
+        for array, geometry in zip(typical.arrays, jaws.arrays, strict=True)
+    )
+    save(replace(typical, nominal=False, arrays=placed), path)
+    chosen = Shelf([path], strict=True).choose(controller())
+    assert isinstance(chosen, Choice)
+    assert chosen.calibration.geometry.posed
+    np.testing.assert_array_equal(
+        chosen.calibration.arrays[1].geometry.position, jaws.arrays[1].position
+    )
+    assert isinstance(Shelf([path], strict=True).choose(controller((5, 5))), Choice)
+    for arrays, words in (((10,), "--arrays says 10"), ((4, 6), "--arrays says 4+6")):
+        refusal = Shelf([path], strict=True).choose(controller(arrays))
+        assert isinstance(refusal, Refusal)
+        assert words in refusal.problem
+    assert isinstance(Shelf([path], strict=True).choose(controller(magnetometers=15)), Refusal)

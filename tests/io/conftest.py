@@ -65,6 +65,20 @@ def adapter(tmp_path: Path) -> Iterator[AdapterThread]:
     thread.stop()
 
 
+@pytest.fixture
+def adapter_of(tmp_path: Path) -> Iterator[Callable[[str], AdapterThread]]:
+    """``adapter_of(dialect)``: an adapter with that firmware."""
+    made: list[AdapterThread] = []
+
+    def make(dialect: str) -> AdapterThread:
+        made.append(AdapterThread(SlcanPort(tmp_path / f"can{len(made)}", dialect=dialect)))
+        return made[-1]
+
+    yield make
+    for thread in made:
+        thread.stop()
+
+
 def read_payload(transport: Transport, wanted: int, seconds: float = 5.0) -> bytes:
     """``wanted`` bytes, or what came in ``seconds``."""
     data = b""

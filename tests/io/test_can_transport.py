@@ -15,6 +15,7 @@ from sensor_proto.can_errors import BusState
 from sensor_proto.canseg import CanDecoder, CanEncoder, CanFrame
 from sensor_proto.packets import ClockReply
 from sim_device.ports import PtyPort, VirtualCanPort
+from sim_device.slcan import DIALECTS
 from tactile_bus.can_bus import CanSpec, can_links
 from tactile_bus.instant import monotonic_now
 from tactiled.transports import PortBusy, PortClosed, PortGone, PortMissing, PortUnsuitable
@@ -293,3 +294,72 @@ def test_frames_go_through_socketcan(read_can: Any) -> None:
     assert read_can(transport, len(FRAMES)) == FRAMES
     transport.close()
     port.close()
+
+
+@pytest.mark.parametrize("dialect", [name for name in DIALECTS if name != "late"])
+def test_adapters_of_every_firmware_are_opened(
+    dialect: str, adapter_of: Any, read_can: Any, eventually: Any
+) -> None:
+    adapter = adapter_of(dialect)
+    transport = CanTransport(f"slcan:{adapter.port.pty.link}@500000")
+    transport.open()
+    try:
+        adapter.send(*FRAMES)
+        got = [frame for frame in read_can(transport, len(FRAMES)) if not frame.error]
+        assert got == FRAMES[: len(got)]
+        assert got
+        transport.write(tuple(FRAMES))
+        assert eventually(lambda: len(adapter.received) == len(FRAMES))
+        assert adapter.port.adapter.bitrate == 500_000
+        assert "malformed_line" not in transport.losses
+    finally:
+        transport.close()
+
+
+def test_an_adapter_that_answers_nothing_is_opened_and_said_to(
+    adapter_of: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    transport = CanTransport(f"slcan:{adapter_of('canable').port.pty.link}")
+    transport.open()
+    assert "answers no command" in caplog.text
+    transport.close()
+
+
+def test_late_answers_are_matched_and_taken_for_no_others(
+    adapter_of: Any, eventually: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The refusal of closing a closed channel comes when the bit rate has long been sent."""
+    adapter = adapter_of("late")
+    transport = CanTransport(f"slcan:{adapter.port.pty.link}@1000000")
+    transport.open()
+
+    def heard() -> bool:
+        transport.read(0.05)
+        return "s late" in caplog.text and not adapter.port.adapter._held
+
+    assert eventually(heard, 20)
+    for _ in range(10):
+        transport.read(0.02)
+    assert "refuses" not in caplog.text
+    transport.close()
+
+
+@pytest.mark.parametrize("dialect", ["lawicel", "println", "plain", "canable2.5"])
+def test_an_adapter_that_refuses_a_command_is_refused(dialect: str, adapter_of: Any) -> None:
+    adapter = adapter_of(dialect)
+    adapter.port.adapter._fd = False
+    with pytest.raises(PortUnsuitable, match=r"refuses the command Y2.*leave \+fd out"):
+        CanTransport(f"slcan:{adapter.port.pty.link}@1000000/2000000+fd").open()
+
+
+def test_flags_of_an_adapter_are_counted_as_bus_errors(adapter_of: Any, eventually: Any) -> None:
+    transport = CanTransport(f"slcan:{adapter_of('buserror').port.pty.link}")
+    transport.open()
+
+    def counted() -> bool:
+        transport.read(0.1)
+        return transport.losses.get("can_bus-error") == 1
+
+    assert eventually(counted)
+    assert transport.state is BusState.ACTIVE
+    transport.close()

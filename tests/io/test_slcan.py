@@ -300,3 +300,101 @@ def test_a_bus_that_is_too_slow_drops_whole_batches_and_counts_them() -> None:
     assert bus.waiting <= MAX_QUEUED + len(batch)
     assert bus.dropped_frames == 1000 - bus.waiting
     assert bus.waiting % 100 == 0
+
+
+# Dialects
+
+CRLF_STREAM = b"\r\n\a\r\n" + LINE + b"\r\n" + FD_LINE + b"\r\nF84\r\n\r\nsb128256\r\nz\r\n"
+
+
+@given(st.lists(st.integers(3, len(CRLF_STREAM)), max_size=8))
+@settings(max_examples=60, deadline=None)
+def test_lines_may_end_in_cr_lf_wherever_they_are_cut(cuts: list[int]) -> None:
+    decoder = slcan.SlcanDecoder()
+    frames = []
+    for start, end in pairwise([0, *sorted(cuts), len(CRLF_STREAM)]):
+        frames += decoder.feed(CRLF_STREAM[start:end])
+    assert [f for f in frames if not f.error] == [FRAME, FD_FRAME]
+    assert list(decoder.answers) == [b"", b"\a", b"F84", b""]
+    assert decoder.counters == {}
+
+
+def test_lines_may_end_in_lf_alone() -> None:
+    decoder = slcan.SlcanDecoder()
+    assert decoder.feed(LINE + b"\n" + LINE + b"\n") == [FRAME, FRAME]
+
+
+def test_x_stands_for_a_frame_with_a_long_identifier() -> None:
+    assert slcan.decode_frame(b"x" + LINE[1:]) == FRAME
+    adapter = opened()
+    assert adapter.feed(b"x" + LINE[1:] + b"\r") == [FRAME]
+
+
+def test_answers_of_other_firmware_are_answers() -> None:
+    decoder = slcan.SlcanDecoder()
+    decoder.feed(b"\x06\r\x15\r#\r#1\rL34\rz\r")
+    assert list(decoder.answers) == [b"", b"\a", b"", b"\a"]
+    assert decoder.counters == {}
+
+
+@pytest.mark.parametrize(
+    ("flags", "names", "state"),
+    [
+        (b"F01", ("rx-overflow",), None),
+        (b"F02", ("tx-overflow",), None),
+        (b"F08", ("rx-overflow",), None),
+        (b"F40", ("lost-arbitration",), None),
+        (b"F80", ("bus-error",), None),
+        (b"FE4", ("lost-arbitration", "bus-error"), BusState.BUS_OFF),
+        (b"FA0", ("bus-error",), BusState.PASSIVE),
+    ],
+)
+def test_flags_are_read_as_bus_errors(
+    flags: bytes, names: tuple[str, ...], state: BusState | None
+) -> None:
+    state_frame, errors = slcan.SlcanDecoder().feed(flags + b"\r")
+    assert can_errors.told_state(state_frame) is (state or BusState.ACTIVE)
+    assert can_errors.names(errors) == names
+    assert can_errors.told_state(errors) is None
+
+
+def test_a_flag_that_stays_is_told_once() -> None:
+    decoder = slcan.SlcanDecoder()
+    told = [len(decoder.feed(line)) for line in (b"F80\r", b"F80\r", b"F00\r", b"F80\r", b"F88\r")]
+    assert told == [2, 1, 1, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("line", "state", "names"),
+    [
+        (b"E00000000", BusState.ACTIVE, ()),
+        (b"E2310800C", BusState.PASSIVE, ("no-acknowledgement",)),
+        (b"E31000000", BusState.BUS_OFF, ("protocol-violation", "bus-error")),
+        (b"E16040000", BusState.WARNING, ("protocol-violation", "bus-error", "tx-overflow")),
+    ],
+)
+def test_error_reports_of_newer_firmware(
+    line: bytes, state: BusState, names: tuple[str, ...]
+) -> None:
+    first, *rest = slcan.SlcanDecoder().feed(line + b"\r")
+    assert can_errors.told_state(first) is state
+    assert [can_errors.names(f) for f in rest] == ([names] if names else [])
+
+
+def test_every_bit_rate_has_a_command() -> None:
+    adapter = SlcanAdapter()
+    for bitrate, command in slcan.BITRATES.items():
+        adapter.feed(command + b"\r")
+        assert adapter.bitrate is not None
+        assert abs(adapter.bitrate - bitrate) <= 50_000
+    for bitrate, command in slcan.DATA_BITRATES.items():
+        adapter.feed(command + b"\r")
+        assert adapter.data_bitrate == bitrate
+    assert set(adapter.take_output()) == {ord("\r")}
+    assert slcan.BITRATES[83_300] == b"S9"
+    assert slcan.DATA_BITRATES[8_000_000] == b"Y8"
+
+
+def test_an_unknown_dialect_is_refused_with_those_there_are() -> None:
+    with pytest.raises(ValueError, match="candapter"):
+        SlcanAdapter(dialect="brand")
