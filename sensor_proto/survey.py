@@ -76,7 +76,7 @@ class _Frame:
 
     @property
     def size(self) -> int:
-        return self.rows.shape[1]
+        return int(self.rows.shape[1])
 
     def body(self, layout: Layout) -> NDArray[np.generic]:
         before = self.framing.before
@@ -322,7 +322,7 @@ def _of_counts(frames: list[_Frame]) -> Finding | None:
             moves = []
             for big in (False, True):
                 probe = Layout(Kind.INT16, 1, "x" * count, big)
-                steps = np.diff(around.body(probe).astype(np.int32), axis=0)
+                steps: NDArray[np.int32] = np.diff(around.body(probe).astype(np.int32), axis=0)
                 moves.append(float(np.abs((steps + 32768) % 65536 - 32768).mean()) + 0.5)
             little, large = moves
             ratio = max(little, large) / min(little, large)

@@ -97,7 +97,8 @@ def join(parts: list[Tokens]) -> Tokens:
 
 def axis_of(before: bytes) -> str:
     """Axis that the text before a number names: x, y, z, t (temperature), or empty for none."""
-    for word in reversed(re.findall(_WORD, before)):
+    words: list[bytes] = re.findall(_WORD, before)
+    for word in reversed(words):
         name = word.rstrip(b"0123456789_").decode("latin-1")
         if name.lower() in ("t", "temp", "temperature", "tempc", "degc"):
             return "t"
@@ -218,7 +219,8 @@ class TextDecoder:
                             for _ in range(each if d < 0 else 1))  # fmt: skip
             decimals = tuple(d for d in decimals for _ in range(each if d < 0 else 1))
         if len(numbers) != self._wanted:
-            return self._wrong_form()
+            self._note_wrong_form()
+            return None
         form = self._form
         if form is None:
             if min(decimals) < 0:
@@ -232,9 +234,10 @@ class TextDecoder:
         if seen < 2:  # the first line may have been the odd one
             self._form = decimals, 1
             return None
-        return self._wrong_form()
+        self._note_wrong_form()
+        return None
 
-    def _wrong_form(self) -> None:
+    def _note_wrong_form(self) -> None:
         self._wrong += 1
         if self._wrong >= FORGET_AFTER and self._form is not None:
             self._tally[Reject.LOST_LOCK] += 1

@@ -79,7 +79,7 @@ def _records(taken: list[Tokens]) -> tuple[list[Tokens], int]:
     return [], 0
 
 
-def _lead(values: np.ndarray) -> tuple[int, int]:  # type: ignore[type-arg]
+def _lead(values: np.ndarray) -> tuple[int, int]:
     """Numbers before those of the chips: a clock or counter that only grows; and those left."""
     count = values.shape[1]
     first = values[:, 0]
@@ -91,7 +91,7 @@ def _lead(values: np.ndarray) -> tuple[int, int]:  # type: ignore[type-arg]
 
 def _of(
     records: list[Tokens],
-    values: np.ndarray,  # type: ignore[type-arg]
+    values: np.ndarray,
     lead: int,
     lines: int,
     numbers: int,
@@ -165,7 +165,7 @@ def _unit(between: tuple[bytes, ...]) -> float:
 
 def _grouped(
     between: tuple[bytes, ...],
-    values: np.ndarray,  # type: ignore[type-arg]
+    values: np.ndarray,
 ) -> tuple[int, int] | None:
     """Numbers of a group where other marks stand between groups than within, and how many of them
     only number the chips (0 or 1); None where no groups are to be seen."""

@@ -123,10 +123,10 @@ class SerialLine:
     @property
     def rejects(self) -> dict[str, int]:
         """Refusals of the decoder in use (of ours while the kind is not known)."""
-        decoder = self._own
+        counters = self._own.counters
         if isinstance(self._link, FloatLink) and self._floats is not None:
-            decoder = self._floats
-        return {reason: n for reason, n in decoder.counters.items() if reason != "accepted"}
+            counters = self._floats.counters
+        return {reason: n for reason, n in counters.items() if reason != "accepted"}
 
     def connect(self, now: Instant, usb_serial: str = "", byte_time: float = 0.0) -> None:
         """The port is open; see `Line.connect`."""
