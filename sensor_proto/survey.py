@@ -322,7 +322,8 @@ def _of_counts(frames: list[_Frame]) -> Finding | None:
             moves = []
             for big in (False, True):
                 probe = Layout(Kind.INT16, 1, "x" * count, big)
-                steps: NDArray[np.int32] = np.diff(around.body(probe).astype(np.int32), axis=0)
+                counts = around.body(probe).astype(np.int32)
+                steps = counts[1:] - counts[:-1]
                 moves.append(float(np.abs((steps + 32768) % 65536 - 32768).mean()) + 0.5)
             little, large = moves
             ratio = max(little, large) / min(little, large)
