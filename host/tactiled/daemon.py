@@ -11,8 +11,9 @@ import platform
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ from tactiled.outlet import Outlet
 from tactiled.port import Port, Trouble
 from tactiled.reader import PortReader
 from tactiled.replay.journal import Journal
-from tactiled.replay.recorded import describe
+from tactiled.replay.recorded import PORT_PREFIX, RecordedError, describe, recorded_port
 from tactiled.services import BoardServices
 from tactiled.settings import REPLAY_PREFIX, PortSettings, Settings
 from tactiled.shelf import Shelf
@@ -137,6 +138,7 @@ class Daemon:
         if isinstance(transport, McapTransport):
             name = reader.name = transport.board or "board0"
             self._shelf.adopt_from_log(Path(wanted.spec), name)
+            wanted = _as_recorded(wanted, name, transport.metadata)
 
         def admit(node: int, identity: Identity) -> Refusal | None:
             return port.admit(node, identity)
@@ -322,6 +324,21 @@ class Daemon:
             self.failure = (name, error)
             log.critical("thread %s failed", name, exc_info=error)
         self.done.set()
+
+
+def _as_recorded(
+    wanted: PortSettings, name: str, metadata: Mapping[str, Mapping[str, str]]
+) -> PortSettings:
+    """Settings of a replay, with what its log says of how the board was read."""
+    table = metadata.get(PORT_PREFIX + name)
+    if table is None:
+        return wanted
+    try:
+        then = recorded_port(name, table)
+    except RecordedError as error:
+        log.warning("%s: %s", wanted.spec, error)
+        return wanted
+    return replace(wanted, kind=then.kind, arrays=then.arrays)
 
 
 def _make_transport(port: PortSettings, speed: float) -> Transport:

@@ -12,7 +12,7 @@ from sensor_proto.can_errors import BusState
 from sensor_proto.canseg import CanFrame
 from tactile_bus.instant import Instant, after, monotonic_now, seconds_between
 from tactile_bus.log_reader import LogReader
-from tactile_bus.log_records import Block, ChannelRecord, LogError
+from tactile_bus.log_records import Block, ChannelRecord, LogError, MetadataRecord
 from tactile_bus.messages import DecodeError, codec
 from tactile_bus.topics import RAW
 from tactiled.blocks import Chunk
@@ -55,6 +55,8 @@ class McapTransport:
         self._next: Chunk | None = None
         self._first = self._start = Instant(0)
         self._medium = Medium.SERIAL
+        self.metadata: dict[str, dict[str, str]] = {}
+        """Metadata records read so far, by name: those before the first chunk once open."""
 
     @property
     def name(self) -> str:
@@ -146,6 +148,8 @@ class McapTransport:
     def _read_chunks(self) -> Iterator[Chunk]:
         with LogReader(self._path) as reader:
             for event in reader.events():
+                if isinstance(event, MetadataRecord):
+                    self.metadata[event.name] = event.values
                 if not isinstance(event, Block):
                     continue
                 for message in reader.messages(event):
