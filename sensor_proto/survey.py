@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sensor_proto.layout import MAX_CHIPS, Framing, Kind, Layout, check_of
+from sensor_proto.layout import COUNT_UT, MAX_CHIPS, Framing, Kind, Layout, check_of
 from sensor_proto.temperature import with_or_without
 from sensor_proto.text_survey import TextFinding, read_text
 
@@ -46,6 +46,12 @@ STARTS = tuple(
 
 MOSTLY = 0.9
 """Share of printable characters from which it is text."""
+
+MOST_COUNTS = 1 << 20
+"""No chip of these boards gives more; 16-bit integers in pairs nearly always make more."""
+
+UNSIGNED_FROM = 24_000
+"""Median size from which 16-bit integers are not fields with a sign."""
 
 MOST_UT, LEAST_UT = 1e5, 1e-3
 """Floats beyond these are no fields in microtesla, save nought."""
@@ -311,7 +317,10 @@ def _of_floats(frame: _Frame, kind: Kind, big: bool, values: NDArray[np.generic]
 
 
 def _of_counts(frames: list[_Frame]) -> Finding | None:
-    """Frames of 16-bit integers, by the order of bytes in which they move least."""
+    """Frames of integers: of 32 bits where these are small, of 16 in the order that moves least."""
+    wide = _of_wide_counts(frames)
+    if wide is not None:
+        return wide
     best: tuple[float, _Frame, bool, int] | None = None
     for frame in frames:
         for around in _around(frame):
@@ -335,13 +344,33 @@ def _of_counts(frames: list[_Frame]) -> Finding | None:
             return None
         return Finding(None, _words(frames[0], "numbers of a kind that is not known"))
     _, frame, big, count = best
-    fits = [f for f in ("txyz", "xyz") if count % len(f) == 0]
-    declared = [
-        str(Layout(Kind.INT16, count // len(f), f, big, (0.15, 0.15, 0.242), frame.framing))
-        for f in fits
-    ]
+    values = frame.body(Layout(Kind.INT16, 1, "x" * count, big)).astype(np.int32)
+    # Fields about 32768 are of a converter that knows no sign.
+    kind = Kind.UINT16 if float(np.median(np.abs(values))) > UNSIGNED_FROM else Kind.INT16
+    return _named_counts(frame, kind, big, count)
+
+
+def _of_wide_counts(frames: list[_Frame]) -> Finding | None:
+    """Frames of 32-bit integers: read as such all are small, which pairs of 16 bits never are."""
+    for frame in frames:
+        for around in _around(frame):
+            count, rest = divmod(around.size - around.framing.extra, 4)
+            if rest or count < 3 or (count % 3 and count % 4):
+                continue
+            for big in (False, True):
+                values = around.body(Layout(Kind.INT32, 1, "x" * count, big)).astype(np.int64)
+                if np.abs(values).max() < MOST_COUNTS and np.abs(values).max() > 1:
+                    return _named_counts(around, Kind.INT32, big, count)
+    return None
+
+
+def _named_counts(frame: _Frame, kind: Kind, big: bool, count: int) -> Finding:
+    fits = [f for f in ("txyz", "xyz") if count % len(f) == 0 and count // len(f) <= MAX_CHIPS]
+    declared = [str(Layout(kind, count // len(f), f, big, COUNT_UT, frame.framing)) for f in fits]
     order = "big-endian" if big else "little-endian"
-    return Finding(None, _words(frame, f"{count} {order} 16-bit integers"), tuple(declared))
+    words = {Kind.INT32: "32-bit integers", Kind.UINT16: "16-bit integers without sign"}
+    numbers = f"{count} {order} {words.get(kind, '16-bit integers')}"
+    return Finding(None, _words(frame, numbers), tuple(declared))
 
 
 def _words(frame: _Frame, numbers: str) -> str:

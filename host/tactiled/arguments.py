@@ -23,14 +23,19 @@ examples:
   tactiled --can socketcan:can0 --calibration left.cal.toml --calibration right.cal.toml
   tactiled --mcap tactile-logs/board0_20250101T120000Z_0000.mcap
 
-boards that write in a way of their own are declared with --board KIND:nFIELDS[,OPTION...]:
-  KIND     floats, doubles (IEEE), int16, uint16 (less 32768), int32 (counts), text
+boards that write in a way of their own are declared with
+--board KIND:nFIELDS[,OPTION...]:
+  KIND     floats, doubles (IEEE), int16, uint16 (less 32768), int32, text
   n        chips (magnetometers), 1 to 20
-  FIELDS   order of each chip's numbers: x y z in uT, t in C (may be left out), _ is not used
-  big      high byte first                       scale=XY/Z  uT a count (default 0.15/0.242)
+  FIELDS   order of each chip's numbers: x y z in uT, t in C (may be left
+           out), _ for one that is not used
+  big      high byte first
+  scale=XY/Z  uT a count (default 0.15/0.242)
   start=HEX, skip=BYTES, check=xor|sum, tail=BYTES, end=crlf|lf|cr|none|HEX
-           what stands round the numbers of a binary frame; without any of them it is found out
-  lead=N   numbers of a text line before those of the chips; lines=N  lines of one frame
+           what stands round the numbers of a binary frame; without any of
+           them it is found out
+  lead=N   numbers of a text line before those of the chips
+  lines=N  lines of one frame of text
 
 exit status: 0 done; 1 failed while running; 2 bad argument or configuration; 3 refused by the
 environment: port missing, busy or not permitted, no board or the wrong one, log not writable.

@@ -421,6 +421,17 @@ def test_what_is_plain_is_found(write: Write, layout: str) -> None:
             "frames of 42 bytes beginning with AA 55: 20 little-endian 16-bit integers",
             ("int16:5txyz,start=aa55,end=none",),
         ),
+        (
+            lambda r, n: b"\xaa\x55" + struct.pack("<15i", *counts(r)) + b"\r\n",
+            "frames of 64 bytes beginning with AA 55 and ending in CR LF: 15 little-endian 32-bit "
+            "integers",
+            ("int32:5xyz,start=aa55,end=crlf",),
+        ),
+        (
+            lambda r, n: b"\xaa\x55" + struct.pack(">15H", *(32768 + c // 10 for c in counts(r))),
+            "frames of 32 bytes beginning with AA 55: 15 big-endian 16-bit integers without sign",
+            ("uint16:5xyz,big,start=aa55,end=none",),
+        ),
         (commas, "text, lines of 15 numbers, no temperatures and no labels among them",
          ("text:5xyz",)),
     ],
