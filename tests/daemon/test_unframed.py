@@ -158,6 +158,16 @@ def test_a_board_that_comes_back_with_other_firmware_is_read_again(instant: At) 
     assert len(of(events, Sampled)) > 150
 
 
+def test_bytes_before_the_layout_was_known_are_counted(instant: At) -> None:
+    for board, sent in (("auto", "text:5xyzt"), ("floats:5xyz", "floats:5xyz,end=lf")):
+        line = SerialLine("p", welcome, board)
+        line.connect(instant(0.0))
+        data = frames(sent, 200)
+        used = len(of(play(line, instant, data), Sampled))
+        lost = line.rejects["discarded_bytes"]
+        assert lost > 0.5 * (len(data) - used - 10) * len(data[0])
+
+
 def test_a_slow_board_is_given_time(instant: At) -> None:
     line = SerialLine("p", welcome)
     line.connect(instant(0.0))

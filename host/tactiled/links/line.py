@@ -5,12 +5,14 @@ Pure: chunks and instants in; events, and payloads to write, out.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 from sensor_proto.anyskin import AnySkinDecoder
 from sensor_proto.canseg import CanFrame
+from sensor_proto.decoder import Reject
 from sensor_proto.framing import SerialDecoder, encode_serial
 from sensor_proto.layout import FORM, Framing, Kind, Layout
 from sensor_proto.layout_decoder import LayoutDecoder
@@ -33,6 +35,9 @@ FLOAT_MODEL = "anyskin"
 JUDGE_FIRST, JUDGE_SLOWEST = 0.25, 2.0
 """s between looks at bytes of which no decoder makes a frame; the time doubles while nothing is
 found, as a look takes some milliseconds."""
+
+PATIENCE = 30.0
+"""s for which the frames of a layout that was found are awaited; the slowest board sends ten."""
 
 REPEAT_DIAGNOSIS = 30.0
 """s between repetitions of a diagnosis that still holds."""
@@ -102,9 +107,11 @@ class SerialLine:
         self._floats: Unframed | None = AnySkinDecoder()
         self._survey = Survey(self._declared)
         self._settled = False  # whether the unframed decoder has given a frame since the opening
+        self._former: Counter[str] = Counter()  # counts of unframed decoders that were given up
         self._layout: Layout | None = None  # what the unframed decoder reads; None: usual floats
         self._finding: Finding | None = None
         self._judge_due, self._judge_wait = Instant(0), JUDGE_FIRST
+        self._patient_until = Instant(0)
         self._board = BoardLink(lambda identity: admit(0, identity), rate, listen_only)
         self._float = FloatLink(lambda identity: admit(0, identity), FLOAT_MODEL, "", arrays)
         self._link: Link | None = None
@@ -123,10 +130,10 @@ class SerialLine:
     @property
     def rejects(self) -> dict[str, int]:
         """Refusals of the decoder in use (of ours while the kind is not known)."""
-        counters = self._own.counters
-        if isinstance(self._link, FloatLink) and self._floats is not None:
-            counters = self._floats.counters
-        return {reason: n for reason, n in counters.items() if reason != "accepted"}
+        counts = Counter(self._own.counters)
+        if isinstance(self._link, FloatLink):
+            counts = self._former + Counter({} if self._floats is None else self._floats.counters)
+        return {reason: n for reason, n in counts.items() if reason != "accepted"}
 
     def connect(self, now: Instant, usb_serial: str = "", byte_time: float = 0.0) -> None:
         """The port is open; see `Line.connect`."""
@@ -138,6 +145,7 @@ class SerialLine:
             self._floats.reset()
         self._survey.reset()
         self._settled, self._finding = False, None
+        self._patient_until = after(now, PATIENCE)
         self._judge_due, self._judge_wait = after(now, JUDGE_FIRST), JUDGE_FIRST
         self._diagnosis.begin(now, uart=byte_time > 0)
         self._diagnose_from = now
@@ -178,8 +186,8 @@ class SerialLine:
         if was_served:
             # Should it go out of service, what is wrong is judged from here on.
             self._diagnosis.begin(now)
-        elif self._finding is not None and self._finding.layout is not None:
-            pass  # it is about to be read
+        elif self._about_to_read and now < self._patient_until:
+            pass
         elif link.state is not State.REFUSED and now >= self._diagnose_from:
             answered = isinstance(self._link, BoardLink)
             diagnosed = self._diagnosis.judge(now, answered, self._finding)
@@ -197,6 +205,11 @@ class SerialLine:
         """Whether a board has been found since the port was opened."""
         return self._link is not None and self._link.state in (State.CONFIGURING, State.STREAMING)
 
+    @property
+    def _about_to_read(self) -> bool:
+        """Whether it is known how the board writes, and its next frames are awaited."""
+        return self._finding is not None and self._finding.layout is not None
+
     def _decode(self, data: bytes, now: Instant) -> list[Received]:
         """Messages by whichever decoder fits; the first to find one is kept."""
         if isinstance(self._link, BoardLink):
@@ -208,7 +221,11 @@ class SerialLine:
                 return found
         if self._kind == "tactile":
             return []
-        found = [] if self._floats is None else self._floats.feed(data)
+        if self._floats is None:
+            self._former[Reject.DISCARDED_BYTES] += len(data)
+            found = []
+        else:
+            found = self._floats.feed(data)
         if found:
             self._settled = True
             if self._link is None:
@@ -239,9 +256,14 @@ class SerialLine:
             return  # give it time
         self._layout = layout
         usual = layout == replace(USUAL, chips=layout.chips, framing=layout.framing)
+        usual &= layout.framing in (None, USUAL.framing)
+        if usual and self._declared is None and isinstance(self._floats, AnySkinDecoder):
+            return  # it will come to see it
+        if self._floats is not None:
+            self._former.update(self._floats.counters)
         if layout.kind is Kind.TEXT:
             self._floats = TextDecoder(layout)
-        elif usual and layout.framing in (None, USUAL.framing):
+        elif usual:
             chips = None if self._declared is None else layout.chips
             self._floats = AnySkinDecoder(chips)
         else:
