@@ -46,6 +46,7 @@ class SampleBlock:
     ``field_ut``: (n, 3) float µT in chip axes. ``temperature_c``: (1,) or (n,) °C.
     ``status``: (n,) uint8 of `TaxelHealth`. ``captured``: start of the conversion, mapped from
     board ticks (or from arrivals where the board has no clock); ``uncertainty`` in s.
+    ``thermometer``: False where the board sends no temperatures, which are then NaN and no fault.
     """
 
     array: int
@@ -56,6 +57,7 @@ class SampleBlock:
     field_ut: Float
     temperature_c: Float
     status: NDArray[np.uint8]
+    thermometer: bool = True
 
     def split(self, sizes: Sequence[int]) -> tuple[SampleBlock, ...]:
         """One block an array, of a block that holds all ``sizes`` taxels of a board together.

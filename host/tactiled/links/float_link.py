@@ -37,7 +37,8 @@ class FloatLink:
     """State machine of one float board. ``serial_number``: of the USB port, for it has no other.
 
     ``model``: what calibrations call it. ``arrays``: magnetometers of each of its boards, where the
-    user said it. ``layout``: how it writes, empty for the usual floats.
+    user said it. ``layout``: how it writes, empty for the usual floats; ``thermometer``: whether
+    that holds temperatures.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class FloatLink:
         self._model = model
         self.serial_number = serial_number
         self.layout = ""
+        self.thermometer = True
         self._arrays = arrays
         self.state = State.DOWN
         self.identity: Identity | None = None
@@ -109,6 +111,7 @@ class FloatLink:
             field_ut=message.field_ut.astype(np.float64),
             temperature_c=message.temperature_c.astype(np.float64),
             status=message.status,
+            thermometer=self.thermometer,
         )
         events.append(Sampled(block))
         return events

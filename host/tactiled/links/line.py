@@ -268,6 +268,7 @@ class SerialLine:
             self._floats = AnySkinDecoder(chips)
         else:
             self._floats = None if layout.framing is None else LayoutDecoder(layout)
+        self._float.thermometer = "t" in layout.fields
         self._float.layout = "" if isinstance(self._floats, AnySkinDecoder) else str(layout)
 
 

@@ -263,8 +263,8 @@ class BoardPipeline:
             n = len(block.status)
             raw[a, :, :n] = block.field_ut.T
             # Boards that send none are taken to be as warm as at their calibration.
-            told = np.isfinite(block.temperature_c) | (block.status & TaxelHealth.READ_FAILED > 0)
-            temperature[a, :n] = np.where(told, block.temperature_c, self._reference_c[a])
+            told = block.temperature_c if block.thermometer else self._reference_c[a]
+            temperature[a, :n] = told
             status[a, :n] = block.status
         return raw, temperature, status, present
 
