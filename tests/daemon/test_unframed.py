@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from sensor_proto.layout import Layout
 from sensor_proto.packets import FloatSamples
 from tactile_bus.calibration import nominal
 from tactile_bus.instant import Instant
-from tactiled.blocks import Chunk
+from tactiled.blocks import Chunk, SampleBlock
 from tactiled.links.events import Diagnosed, Identified, Identity, Refusal, Sampled
 from tactiled.links.line import SerialLine
 from tactiled.sensing.pipeline import BoardPipeline
@@ -204,6 +205,34 @@ def test_boards_of_one_controller_are_arrays_of_their_own(instant: At) -> None:
     np.testing.assert_array_equal(parts[1].temperature_c, blocks[0].temperature_c[5:])
     assert blocks[0].split((10,)) == (blocks[0],)
     assert parts[0].split((5, 5)) == (parts[0],)
+
+
+@pytest.mark.parametrize("posed", [False, True])
+def test_arrays_whose_places_nobody_knows_lend_one_another_nothing(
+    posed: bool, instant: At
+) -> None:
+    """A field that changes over both is taken off a covered one only if their poses are known."""
+    calibration = nominal("anyskin", "unknown", 10)
+    calibration = replace(
+        calibration,
+        arrays=tuple(
+            replace(a, geometry=replace(a.geometry, posed=posed)) for a in calibration.arrays
+        ),
+    )
+    pipeline = BoardPipeline(calibration)
+    rng = np.random.default_rng(1)
+    reasons = set()
+    for k in range(300):
+        field = rng.normal(0, 1.5, (10, 3))
+        if k > 150:
+            field[:5, 2] += 900.0 * np.array([1.0, 0.4, -0.5, 0.3, 0.7])  # the first is pressed
+        block = SampleBlock(
+            0, k, instant(k / 100), instant(k / 100), 1e-3, field, np.full(10, 25.0),
+            np.zeros(10, np.uint8),
+        )  # fmt: skip
+        for cycle in pipeline.feed(block):
+            reasons |= {str(reason) for reason in cycle.features.reasons}
+    assert any("borrowed" in reason for reason in reasons) == posed
 
 
 def test_a_board_without_temperatures_has_forces(instant: At) -> None:

@@ -21,6 +21,7 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 class Layout:
     """Shapes and places of a board's taxels.
 
+    ``posed``: whether the arrays' poses relative to one another are known.
     ``real``: (A, n) bool, False in the padding. ``counts``: (A,) taxels of each array.
     ``design``: (A, 3, n), 1 and both coordinates on the unrolled skin about the array's centre,
     divided by ``scale`` (A,) m so that fits are well conditioned; zero in the padding.
@@ -30,6 +31,7 @@ class Layout:
     def __init__(self, geometry: SkinGeometry) -> None:
         arrays = geometry.arrays
         self.arrays = len(arrays)
+        self.posed = geometry.posed
         self.counts = np.array([a.taxels for a in arrays])
         self.width = int(self.counts.max())
         self.taxels = int(self.counts.sum())

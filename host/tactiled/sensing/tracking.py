@@ -43,7 +43,8 @@ class FieldTracker:
     def __init__(self, layout: Layout, method: str, borrows: bool) -> None:
         self._layout = layout
         self._method = method
-        self._borrows = borrows and layout.arrays > 1
+        # What another array sees says nothing where nobody knows how they lie to one another.
+        self._borrows = borrows and layout.arrays > 1 and layout.posed
         self._zero_age = np.zeros(layout.arrays)
         self._none = np.zeros(layout.arrays, dtype=bool)
         self.sample_sigma = 5.0
