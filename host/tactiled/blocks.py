@@ -44,6 +44,7 @@ class SampleBlock:
     ``field_ut``: (n, 3) float µT in chip axes. ``temperature_c``: (1,) or (n,) °C.
     ``status``: (n,) uint8 of `TaxelHealth`. ``captured``: start of the conversion, mapped from
     board ticks (or from arrivals where the board has no clock); ``uncertainty`` in s.
+    ``clock_usable``: False where the board's clock is so wrong that ``captured`` is of no use.
     """
 
     array: int
@@ -54,6 +55,7 @@ class SampleBlock:
     field_ut: Float
     temperature_c: Float
     status: NDArray[np.uint8]
+    clock_usable: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -104,6 +104,13 @@ class Reset:
 
 
 @dataclass(frozen=True, slots=True)
+class ClockJudged:
+    """The board's clock cannot be used, for the reason ``trouble``; empty: it can again."""
+
+    trouble: str
+
+
+@dataclass(frozen=True, slots=True)
 class BoardLog:
     """A line of text from the firmware, levels as in `sensor_proto.packets.Log`."""
 
@@ -151,6 +158,7 @@ Event = (
     | FellSilent
     | Resumed
     | Reset
+    | ClockJudged
     | BoardLog
     | Reported
     | Answered
