@@ -6,6 +6,7 @@ that is slow one way, loses polls and is read in bursts. Bytes keep their order 
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -268,7 +269,7 @@ def test_frames_read_at_once_after_a_stall_keep_the_instants_they_were_sampled_a
     for truth, block in burst:
         assert abs(block.captured - at(truth)) / NS_PER_S < 2e-3
     stamps = [block.captured for _, block in board.blocks]
-    assert all(a < b for a, b in zip(stamps, stamps[1:], strict=False))
+    assert all(a < b for a, b in itertools.pairwise(stamps))
 
 
 def test_steps_that_vary_are_usual_and_larger_ones_are_not() -> None:

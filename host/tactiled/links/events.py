@@ -143,6 +143,13 @@ class Diagnosed:
 
 
 @dataclass(frozen=True, slots=True)
+class Waiting:
+    """What is on the port cannot be told yet, and why that takes longer than usual."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class Found:
     """Boards on a bus, by node. ``late``: they came after the others had been gathered."""
 
@@ -163,5 +170,6 @@ Event = (
     | Reported
     | Answered
     | Diagnosed
+    | Waiting
     | Found
 )

@@ -132,13 +132,17 @@ class SerialLine:
         if not isinstance(data, bytes):
             raise TypeError("a serial line takes bytes")
         if not self._served:
-            self._diagnosis.feed(data)
+            self._diagnosis.feed(data, chunk.received)
         events: list[Event] = []
-        for received in self._decode(data):
-            arrival = Instant(chunk.received - round(received.trailing * self._byte_ns))
+        found = self._decode(data)
+        arrivals = [
+            Instant(chunk.received - round(each.trailing * self._byte_ns)) for each in found
+        ]
+        for place, (received, arrival) in enumerate(zip(found, arrivals, strict=True), start=1):
             message = received.message
             if isinstance(message, FloatSamples):
-                events += self._float.receive(message, arrival)
+                behind = len(found) - place
+                events += self._float.receive(message, arrival, behind, arrivals[-1])
             else:
                 events += self._board.receive(message, arrival)
         return [LineEvent(0, event) for event in events]
@@ -154,6 +158,9 @@ class SerialLine:
             # Should it go out of service, what is wrong is judged from here on.
             self._diagnosis.begin(now)
         elif link.state is not State.REFUSED and now >= self._diagnose_from:
+            waiting = self._diagnosis.waiting(now)
+            if waiting is not None:
+                out.append(LineEvent(None, waiting))
             diagnosed = self._diagnosis.judge(now, answered=self._link is not None)
             if diagnosed is not None:
                 self._diagnose_from = after(now, REPEAT_DIAGNOSIS)
