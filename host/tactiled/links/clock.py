@@ -176,6 +176,7 @@ class ClockMap:
         self.counters: Counter[str] = Counter()
         self._last = Instant(0)
         self._rate_trouble = False
+        self._delays = _Delays()
         self.restart(tick_hz)
 
     def restart(self, tick_hz: int | None = None) -> None:

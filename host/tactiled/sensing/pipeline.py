@@ -92,14 +92,15 @@ class BoardPipeline:
         """What the last tare that ended did; None before the first."""
         return self._rest.report
 
-    def tare(self) -> None:
+    def tare(self, force: bool = False) -> None:
         """Begin a tare: the mean field of the next cycles becomes the rest field.
 
         It ends by itself within ten times ``tare_s``; `tare_report` then says what it did. It is
         refused, and nothing changed, when the field moves or a taxel bears more than
         ``tare_limit_n``; less than that cannot be told from the drift that taring is there for.
+        With ``force`` it is refused only where nothing can be averaged.
         """
-        self._rest.begin(self._noise)
+        self._rest.begin(self._noise, force)
 
     def reset(self) -> None:
         """The board began anew: forget sequence, contacts and fits, keep the rest field."""
@@ -159,6 +160,8 @@ class BoardPipeline:
         force = layout.flat_vectors(forces)
         self._health = layout.flat(health)
         reasons, valid = self._reasons(estimate, healthy, present, known)
+        if not all(block.clock_usable for block in blocks):
+            reasons, valid = (*reasons, why.CLOCK_UNUSABLE), False
         tip_usable = valid or (known and self._tip_usable(estimate, present))
         features = self._features.update(force, masked, reasons, valid, tip_usable, captured)
         if rest.taring:

@@ -37,6 +37,7 @@ class RestField:
         self._tare: Tare | None = None
         self._peak = 0.0
         self._refused = 0
+        self._force = False
 
     @property
     def taring(self) -> bool:
@@ -48,8 +49,12 @@ class RestField:
         """Whether there is no rest field yet that could tell a contact."""
         return not self.known or self.rough
 
-    def begin(self, noise_ut: Float) -> None:
-        """Begin a tare; ``noise_ut`` (3,) µT rms is what one sample is expected to vary by."""
+    def begin(self, noise_ut: Float, force: bool = False) -> None:
+        """Begin a tare; ``noise_ut`` (3,) µT rms is what one sample is expected to vary by.
+
+        ``force``: its result is taken whatever speaks against it.
+        """
+        self._force = force
         shape = (self._layout.arrays, 3, self._layout.width)
         self._tare = Tare(shape, self._settings.tare_s, noise_ut)
         self._peak = 0.0
@@ -78,6 +83,8 @@ class RestField:
                 "like: lift the skin off everything"
             )
         self._tare = None
+        if self._force and tare.cycles and tare.healthy.any():
+            trouble = None
         if trouble is None:
             return self._accept(tare, sequence)
         self._refused += 1

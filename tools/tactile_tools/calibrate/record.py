@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -53,7 +54,8 @@ def _record(options: argparse.Namespace, board: LiveBoard) -> int:
         board.wait()
         board.attach(board.calibration(options.calibration))
         timing = Timing(options.rest, options.hold, options.turn)
-        wizard = Wizard(board, board.label, _ask, print, timing)
+        width = shutil.get_terminal_size().columns
+        wizard = Wizard(board, board.label, _ask, print, timing, width)
         return wizard.run()
     finally:
         board.close()
