@@ -1,7 +1,7 @@
 """What is said once, and what that happens again and again comes to: pure, time passed in.
 
-The first of a kind is told at once. What follows within `WINDOW_S` is counted, and told as one
-line at the end of it, so that a flood of one kind hides neither the rest nor its own size.
+The first few of a kind are told at once. What follows within `WINDOW_S` is counted, and told as
+one line at the end of it, so that a flood of one kind hides neither the rest nor its own size.
 """
 
 from __future__ import annotations
@@ -13,6 +13,9 @@ from tactile_bus.instant import Instant, seconds_between
 WINDOW_S = 10.0
 """s within which what happens again is only counted."""
 
+FEW = 3
+"""Of one kind that are told at once: a person who plugs and unplugs is not a flood."""
+
 KINDS = 64
 """Kinds that are followed at a time; others, from boards that make up ever new texts, are told."""
 
@@ -20,8 +23,10 @@ KINDS = 64
 @dataclass(slots=True)
 class _Window:
     begun: Instant
+    told: int = 1
     count: int = 0
     last: str = ""
+    level: int = 0
 
 
 class Repeats:
@@ -30,19 +35,22 @@ class Repeats:
     def __init__(self) -> None:
         self._windows: dict[str, _Window] = {}
 
-    def tell(self, kind: str, text: str, now: Instant) -> bool:
-        """Whether to say ``text`` now; else it is counted."""
+    def tell(self, kind: str, text: str, level: int, now: Instant) -> bool:
+        """Whether to say ``text`` now; else it is counted. ``level``: of the log."""
         window = self._windows.get(kind)
+        if window is not None and window.told < FEW:
+            window.told += 1
+            return True
         if window is not None:
             window.count += 1
-            window.last = text
+            window.last, window.level = text, level
             return False
         if len(self._windows) < KINDS:
             self._windows[kind] = _Window(now)
         return True
 
-    def due(self, now: Instant) -> list[str]:
-        """What to say of the windows that are over."""
+    def due(self, now: Instant) -> list[tuple[int, str]]:
+        """Level and text of what to say of the windows that are over."""
         said = []
         for kind, window in list(self._windows.items()):
             past = seconds_between(window.begun, now)
@@ -52,8 +60,8 @@ class Repeats:
                 del self._windows[kind]
                 continue
             times = "once" if window.count == 1 else f"{window.count} times"
-            said.append(f"{times} more in {past:.0f} s: {window.last}")
-            self._windows[kind] = _Window(now)
+            said.append((window.level, f"{times} more in {past:.0f} s: {window.last}"))
+            self._windows[kind] = _Window(now, told=FEW)
         return said
 
 

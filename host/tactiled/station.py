@@ -272,9 +272,11 @@ class Station:
     def each_second(self, now: Instant) -> None:
         """Work out rate and latency of the last second."""
         self._measure_rate(now)
-        for text in [*self._repeats.due(now), self._silences.due(now)]:
-            if text is not None:
-                self._say(logging.WARNING, text)
+        for level, text in self._repeats.due(now):
+            self._say(level, text)
+        said = self._silences.due(now)
+        if said is not None:
+            self._say(logging.WARNING, said)
         if self._latencies:
             ordered = sorted(self._latencies)
             last = len(ordered) - 1
@@ -355,5 +357,5 @@ class Station:
 
     def _say(self, level: int, text: str, kind: str = "") -> None:
         """Announce ``text``; of a ``kind``, only if the last of that is some time ago."""
-        if not kind or self._repeats.tell(kind, text, self._outlet.now()):
+        if not kind or self._repeats.tell(kind, text, level, self._outlet.now()):
             self._outlet.announce(self.name, level, text)

@@ -105,9 +105,9 @@ def line(seen: Glimpse, width: int = WIDTH) -> Text:
         text.append("  " + force_text(seen.forces), "green")
     elif seen.reasons:
         text.append(" not valid", "yellow")
-    if seen.state == "streaming":
+    if seen.state == "streaming" and seen.rate > 0:
         text.append(f"  {seen.rate:.3g} Hz")
-    if not math.isnan(seen.latency):
+    if seen.state == "streaming" and not math.isnan(seen.latency):
         text.append(f"  latency {_duration(seen.latency)}")
     text.append(f"  {seen.drops} dropped", "yellow" if seen.drops else "")
     room = width - text.cell_len - 2

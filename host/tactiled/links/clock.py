@@ -47,9 +47,6 @@ WIDEST = 0.6
 SLOPE_ERROR = 1 / (1 - WIDEST) - 1
 """Largest error of a slope of 1 (host s per board s at the nominal rate) on such a clock."""
 
-RATE_KNOWN = 0.02
-"""Error of the slope below which a rate beyond the limit is called so."""
-
 RATE_CHANGE = 2e-5
 """1/s, how fast the rate may drift: ±5 % over 125 K is 400 ppm/K, at 3 K a minute."""
 
@@ -175,7 +172,8 @@ class ClockMap:
     def __init__(self, tick_hz: int) -> None:
         self.counters: Counter[str] = Counter()
         self._last = Instant(0)
-        self._rate_trouble = False
+        self._rate_trouble = ""
+        self._tick_hz = tick_hz
         self._delays = _Delays()
         self.restart(tick_hz)
 
@@ -187,6 +185,8 @@ class ClockMap:
         if tick_hz is not None:
             if tick_hz <= 0:
                 raise ValueError(f"tick_hz is {tick_hz}: it must be above 0")
+            if tick_hz != self._tick_hz:
+                self._rate_trouble = ""
             self._tick_hz = tick_hz
         self._ticks = TickUnwrapper()
         self._seen = Instant(0)
@@ -201,7 +201,7 @@ class ClockMap:
         self._last_ticks: int | None = None
         self._line_delay = 0.0 if self._last == 0 else self._delays.greatest
         self._delays = _Delays()
-        self._doubt = 0.0
+        self._doubt, self._least = 0.0, math.inf
         self._doubted = Instant(0)
         self._jumps: deque[Instant] = deque(maxlen=JUMPS)
         self._bad_since: Instant | None = None
@@ -229,16 +229,18 @@ class ClockMap:
 
     def trouble(self, now: Instant) -> str | None:
         """Why the board's clock cannot be used; None while it can."""
-        off, known = self.rate_error, self._rate_known()
-        if known is not None:
-            beyond = abs(off) - known if not self._rate_trouble else abs(off) + known
-            self._rate_trouble = beyond > RATE_LIMIT
-            if self._rate_trouble:
-                way = "fast" if off > 0 else "slow"
-                return (
-                    f"it runs {abs(off):.0%} {way} of the {_frequency(self._tick_hz)} that the "
-                    f"board says, more than the {RATE_LIMIT:.0%} of a poor oscillator"
-                )
+        slowest, fastest = self._rates()
+        if slowest > RATE_LIMIT or fastest < -RATE_LIMIT:
+            off = self.rate_error
+            self._rate_trouble = (
+                f"it runs {abs(off):.0%} {'fast' if off > 0 else 'slow'} of the "
+                f"{_frequency(self._tick_hz)} that the board says, more than the "
+                f"{RATE_LIMIT:.0%} of a poor oscillator"
+            )
+        elif slowest >= -RATE_LIMIT and fastest <= RATE_LIMIT:
+            self._rate_trouble = ""
+        if self._rate_trouble:  # it stays while the map is too new to tell
+            return self._rate_trouble
         recent = [at for at in self._jumps if seconds_between(at, now) <= JUMPS_WITHIN_S]
         if len(recent) >= JUMPS:
             return f"it jumped {JUMPS} times in {seconds_between(recent[0], now):.0f} s"
@@ -277,9 +279,9 @@ class ClockMap:
         if self._contradicts(pair, received):
             return self._refuse("contradiction")
         if self._doubt and sent >= self._doubted:
-            if self._line is not None and self._doubt <= 2 * self._allowed(pair, self._line):
+            if self._line is not None and self._least <= 2 * self._allowed(pair, self._line):
                 self._begin_with(pair)  # too wide a poll to tell whether the clock jumped so far
-            self._doubt = 0.0
+            self._doubt, self._least = 0.0, math.inf
         self._delays.confirm()
         self._keep(pair)
         self.counters["used"] += 1
@@ -290,10 +292,12 @@ class ClockMap:
 
         Until then every stamp is that much less certain.
         """
-        slope = 1 + SLOPE_ERROR
+        low, high = 1 / (1 + WIDEST), 1 / (1 - WIDEST)
         if self._line is not None:
-            slope = min(slope, self._line.slope + self._line.slope_error)
-        self._suspect((ticks + 1) / self._tick_hz * slope, now)
+            low = max(low, self._line.slope - self._line.slope_error)
+            high = min(high, self._line.slope + self._line.slope_error)
+        jump = ticks / self._tick_hz
+        self._suspect((jump + 1 / self._tick_hz) * high, jump * low, now)
 
     def arrived(self, ticks: int, received: Instant) -> None:
         """Take the arrival of a message that carried ``ticks``."""
@@ -366,18 +370,20 @@ class ClockMap:
         oldest = next(iter(self._sent.values()), now)
         return max(self._slowest, seconds_between(oldest, now))
 
-    def _rate_known(self) -> float | None:
-        """Error of the rate; None while it says nothing."""
+    def _rates(self) -> tuple[float, float]:
+        """Least and greatest rate error that the clock may have."""
+        error = SLOPE_ERROR
         if self._line is not None:
             error = self._line.slope_error
         elif self._arrivals.span > SETTLING_S:
             error = (ONE_WAY_ALLOWANCE + self._arrivals.spread) / self._arrivals.span
-        else:
-            return None
-        return error if error < RATE_KNOWN else None
+        slope = self._slope
+        return 1 / (slope + error) - 1, 1 / max(slope - error, 1e-3) - 1
 
-    def _suspect(self, seconds: float, now: Instant) -> None:
+    def _suspect(self, seconds: float, least: float, now: Instant) -> None:
+        """The clock may have jumped, if so by ``least`` s and at most ``seconds``."""
         self._doubt += seconds
+        self._least = min(self._least, least)
         self._doubted = now
 
     def _refuse(self, reason: str) -> bool:
@@ -421,7 +427,7 @@ class ClockMap:
         if distance <= allowed:
             return False
         settled = self._doubt > 0 or self._doubted >= pair.sent
-        self._suspect(distance + allowed, received)
+        self._suspect(distance + allowed, distance - allowed, received)
         if settled:
             self.counters["jump"] += 1
             self._jumps.append(received)

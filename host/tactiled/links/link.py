@@ -255,7 +255,7 @@ class BoardLink:
         events: list[Event] = []
         in_service = self.state in (State.CONFIGURING, State.STREAMING)
         if in_service:
-            if message == self.descriptor and not self._silent:
+            if message == self.descriptor and not self._has_ceased(now):
                 return []  # answer to the keepalive, or to another host's question
             events = [Reset(self._what_is_new(message)), *self._drop_commands()]
         identity = self._take_on(message, now, rebooted=in_service)
@@ -264,6 +264,11 @@ class BoardLink:
             self.state, self._refusal, self._started = State.STREAMING, None, now
             events.append(Streaming(None))
         return events
+
+    def _has_ceased(self, now: Instant) -> bool:
+        """Whether a board that answers no longer streams; one whose pace is unknown may be slow."""
+        quiet = seconds_between(max(self._last_sample, self._started), now)
+        return self._silent and (self._pace.period is not None or quiet >= self.relink_limit)
 
     def _what_is_new(self, message: Descriptor) -> str:
         before = self.descriptor
