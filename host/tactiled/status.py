@@ -95,21 +95,26 @@ def side_forces(station: Station) -> dict[Side, float]:
     return peaks
 
 
-def line(seen: Glimpse, width: int = WIDTH) -> Text:
-    """One line of at most ``width`` columns: name, force or why there is none, then the rest."""
+def line(seen: Glimpse, width: int = WIDTH, name_width: int = 0) -> Text:
+    """One line of at most ``width`` columns: name, force or why there is none, then the rest.
+
+    ``name_width``: columns that the names of all boards need.
+    """
     text = Text(no_wrap=True)
-    text.append(f"{_cut_middle(seen.name, NAME_WIDTH):{NAME_WIDTH}}", "bold")
+    text.append(f"{_cut_middle(seen.name, NAME_WIDTH):{min(name_width, NAME_WIDTH)}}", "bold")
     if seen.state != "streaming":
-        text.append(f" {seen.state}", "red" if seen.state == "refused" else "yellow")
+        text.append(f"  {seen.state}", "red" if seen.state == "refused" else "yellow")
     elif seen.valid and seen.forces:
         text.append("  " + force_text(seen.forces), "green")
     elif seen.reasons:
-        text.append(" not valid", "yellow")
+        text.append("  not valid", "yellow")
     if seen.state == "streaming" and seen.rate > 0:
         text.append(f"  {seen.rate:.3g} Hz")
-    if seen.state == "streaming" and not math.isnan(seen.latency):
-        text.append(f"  latency {_duration(seen.latency)}")
     text.append(f"  {seen.drops} dropped", "yellow" if seen.drops else "")
+    if seen.state == "streaming" and not math.isnan(seen.latency):
+        latency = f"  latency {_duration(seen.latency)}"
+        if len(latency) <= width - text.cell_len:
+            text.append(latency)
     room = width - text.cell_len - 2
     if seen.reasons and room > 8:
         because = Text("  " + "; ".join(seen.reasons), "yellow")
@@ -124,7 +129,7 @@ def force_text(forces: Mapping[Side, float]) -> str:
     shown = [(name, forces[side]) for side, name in SIDES if side in forces]
     if len(shown) == 1:
         return f"{shown[0][1]:5.2f} N {bar(shown[0][1])}"
-    return "  ".join(f"{name} {force:4.1f} N {bar(force)}" for name, force in shown)
+    return "  ".join(f"{name} {force:.1f}{bar(force)}" for name, force in shown) + " N"
 
 
 def bar(force: float) -> str:
@@ -146,9 +151,10 @@ class StatusLines(LiveLines):
 
     def table(self) -> Table:
         """A row for each board."""
-        table, now = Table.grid(), monotonic_now()
-        for station in self._boards():
-            table.add_row(line(glimpse(station, now), self._console.width))
+        table, now, boards = Table.grid(), monotonic_now(), self._boards()
+        names = max((len(station.name) for station in boards), default=0)
+        for station in boards:
+            table.add_row(line(glimpse(station, now), self._console.width, names))
         return table
 
     def lines(self) -> list[str]:

@@ -151,6 +151,25 @@ def test_what_the_wizard_records_calibrates_the_simulated_board(tmp_path):
     assert np.sqrt((error**2).mean()) < 0.4 * np.std(predict(uncalibrated, other) - other.labels)
 
 
+def test_a_recording_with_equal_stamps_is_read_all_the_same(tmp_path):
+    recorder = Recorder(tmp_path / "rec.mcap")
+    bench = Bench(recorder, some_presses(0, 15))
+    sample = bench._sample
+
+    def stalled():
+        """Six frames in a hundred come in a burst, as older versions stamped it."""
+        at, field = sample()
+        late = at % (2 * NS_PER_S)
+        return at - late if late < 0.12 * NS_PER_S else at, field
+
+    bench._sample = stalled
+    Wizard(bench, bench.label, bench.ask, bench.said.append, Timing(2.0, 1.0, 2.0)).run()
+    assert recorder.close(10.0)
+    recording = read_log(tmp_path / "rec.mcap")
+    assert (np.diff(recording.time_s) > 0).all()
+    assert (np.diff(recording.label_time_s) > 0).all()
+
+
 class Silent:
     """A source that gives no frames."""
 

@@ -40,22 +40,13 @@ def a_glimpse(**values: object) -> Glimpse:
 
 def test_force_comes_first_and_then_rate_latency_and_losses() -> None:
     shown = line(a_glimpse()).plain
-    assert shown.split() == [
-        "board0",
-        "2.35",
-        "N",
-        "▂",
-        "99.9",
-        "Hz",
-        "latency",
-        "1.7",
-        "ms",
-        "0",
-        "dropped",
-    ]
+    assert " ".join(shown.split()) == "board0 2.35 N ▂ 99.9 Hz 0 dropped latency 1.7 ms"
     several = line(a_glimpse(forces={Side.LEFT: 1.0, Side.RIGHT: 0.0, Side.TIP: 11.0})).plain
-    assert several.index("left") < several.index("right") < several.index("tip 11.0 N █")
+    assert several.index("left") < several.index("right") < several.index("tip 11.0█ N")
+    assert several.endswith("latency 1.7 ms")
     assert cell_len(several) <= 80
+    longest = a_glimpse(name="n" * 64, forces=dict.fromkeys(Side, 99.9), drops=123_456)
+    assert "123456 dropped" in line(longest).plain
 
 
 def test_a_force_that_is_not_valid_is_not_shown_but_why_is() -> None:
