@@ -6,10 +6,9 @@ A line says first what the skin feels, or why that is not known, and fits 80 col
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -18,6 +17,7 @@ from tactile_bus.geometry import Side
 from tactile_bus.instant import Instant, monotonic_now, seconds_between
 from tactile_bus.recorder import Recorder
 from tactile_bus.terminal import LiveLines
+from tactiled.blocks import Features
 from tactiled.port import Port
 from tactiled.station import Station
 
@@ -46,9 +46,10 @@ SIDES = ((Side.LEFT, "left"), (Side.RIGHT, "right"), (Side.TIP, "tip"))
 
 @dataclass(frozen=True, slots=True)
 class Glimpse:
-    """What is shown of a board. ``forces``: N, the largest normal force of a taxel by side.
+    """What is shown of a board. ``forces``: N, the normal force of the contacts on each side.
 
-    ``rate``: Hz. ``latency``: s, median from the last byte to the features; NaN: none measured.
+    ``bound``: N that their sum may err by (95 %), inf where nothing says. ``rate``: Hz.
+    ``latency``: s, median from the last byte to the features; NaN: none measured.
     """
 
     name: str
@@ -59,6 +60,7 @@ class Glimpse:
     rate: float
     drops: int
     latency: float
+    bound: float = math.inf
 
 
 def glimpse(station: Station, now: Instant) -> Glimpse:
@@ -68,31 +70,29 @@ def glimpse(station: Station, now: Instant) -> Glimpse:
         limit = max(limit, STALE_PERIODS / station.rate)
     forces: dict[Side, float] = {}
     reasons: tuple[str, ...] = ()
-    valid = False
+    valid, bound = False, math.inf
     if cycle is not None and seconds_between(cycle.received, now) < limit:
-        valid = cycle.features.valid
-        reasons = tuple(reason.text for reason in cycle.features.reasons)
-        forces = side_forces(station)
+        features = cycle.features
+        valid, bound = features.valid, features.normal_force_bound
+        reasons = tuple(reason.text for reason in features.reasons)
+        if station.choice is not None:
+            arrays = station.choice.calibration.geometry.arrays
+            forces = side_forces(features, list(dict.fromkeys(a.side for a in arrays)))
     drops = sum(station.summary.get("drops", {}).values())
     return Glimpse(
         station.name, station.state, forces, valid, reasons, station.rate, drops,
-        station.latency.p50,
+        station.latency.p50, bound,
     )  # fmt: skip
 
 
-def side_forces(station: Station) -> dict[Side, float]:
-    """Largest normal force of a taxel on each side in the last cycle, N."""
-    cycle, choice = station.last, station.choice
-    peaks: dict[Side, float] = {}
-    if cycle is None or choice is None:
-        return peaks
-    geometry = choice.calibration.geometry
-    normal = -cycle.force[:, 2]
-    for array, taxels in zip(geometry.arrays, geometry.slices, strict=True):
-        seen = normal[taxels]
-        if np.isfinite(seen).any():
-            peaks[array.side] = max(peaks.get(array.side, 0.0), float(np.nanmax(seen)))
-    return peaks
+def side_forces(features: Features, sides: Sequence[Side]) -> dict[Side, float]:
+    """Normal force of the contacts on each of ``sides``, N."""
+    if len(sides) == 1:
+        return {sides[0]: features.normal_force}
+    return {
+        side: sum((p.normal_force for p in features.patches if p.side is side), 0.0)
+        for side in sides
+    }
 
 
 def line(seen: Glimpse, width: int = WIDTH, name_width: int = 0) -> Text:
@@ -105,7 +105,7 @@ def line(seen: Glimpse, width: int = WIDTH, name_width: int = 0) -> Text:
     if seen.state != "streaming":
         text.append(f"  {seen.state}", "red" if seen.state == "refused" else "yellow")
     elif seen.valid and seen.forces:
-        text.append("  " + force_text(seen.forces), "green")
+        text.append("  " + force_text(seen.forces, seen.bound), "green")
     elif seen.reasons:
         text.append("  not valid", "yellow")
     if seen.state == "streaming" and seen.rate > 0:
@@ -124,11 +124,13 @@ def line(seen: Glimpse, width: int = WIDTH, name_width: int = 0) -> Text:
     return text
 
 
-def force_text(forces: Mapping[Side, float]) -> str:
-    """Force of each side in N with a bar; of the only side, without its name."""
+def force_text(forces: Mapping[Side, float], bound: float = math.inf) -> str:
+    """Force of each side in N with a bar; of the only side, its bound instead of its name."""
     shown = [(name, forces[side]) for side, name in SIDES if side in forces]
-    if len(shown) == 1:
-        return f"{shown[0][1]:5.2f} N {bar(shown[0][1])}"
+    if len(shown) <= 1:
+        force = sum(forces.values())
+        within = f" ± {bound:.2f}" if math.isfinite(bound) else ""
+        return f"{force:5.2f}{within} N {bar(force)}"
     return "  ".join(f"{name} {force:.1f}{bar(force)}" for name, force in shown) + " N"
 
 

@@ -41,6 +41,8 @@ def a_glimpse(**values: object) -> Glimpse:
 def test_force_comes_first_and_then_rate_latency_and_losses() -> None:
     shown = line(a_glimpse()).plain
     assert " ".join(shown.split()) == "board0 2.35 N ▂ 99.9 Hz 0 dropped latency 1.7 ms"
+    bounded = line(a_glimpse(bound=0.25)).plain
+    assert "2.35 ± 0.25 N" in bounded
     several = line(a_glimpse(forces={Side.LEFT: 1.0, Side.RIGHT: 0.0, Side.TIP: 11.0})).plain
     assert several.index("left") < several.index("right") < several.index("tip 11.0█ N")
     assert several.endswith("latency 1.7 ms")

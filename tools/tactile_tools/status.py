@@ -67,11 +67,7 @@ def describe(name: str, values: Mapping[str, Any], width: int) -> list[str]:
 def matters(values: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Label and text of each thing to say; empty texts where there is nothing."""
     reasons = "; ".join(str(reason) for reason in values.get("reasons", ()))
-    force = values.get("peak_force_n")
-    felt = "" if force is None else f"{force:.2f} N on the taxel pressed most"
-    bound = values.get("peak_force_bound_n")
-    if felt and bound is not None:
-        felt += f", ± {bound:.2f} N"
+    felt = _force(values)
     valid = values.get("features_valid")
     drops: Mapping[str, int] = values.get("drops", {})
     listed = ", ".join(f"{n} {reason}" for reason, n in sorted(drops.items(), key=lambda i: -i[1]))
@@ -89,6 +85,15 @@ def matters(values: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("calibration", _calibration(values.get("calibration") or {})),
         ("log", _log(values.get("log"))),
     ]
+
+
+def _force(values: Mapping[str, Any]) -> str:
+    whole, peak = values.get("normal_force_n"), values.get("peak_force_n")
+    if whole is None or peak is None:
+        return ""
+    bound = values.get("normal_force_bound_n")
+    within = "" if bound is None else f" ± {bound:.2f}"
+    return f"{whole:.2f}{within} N, of it {peak:.2f} N on the taxel pressed most"
 
 
 def _rest(values: Mapping[str, Any]) -> str:

@@ -16,12 +16,13 @@ from tactile_bus.messages import MSG, DecodeError, codec, header, stamp_ns
 from tactile_bus.nominal import NOMINAL_MODELS
 from tactile_bus.recorder import Recorder
 from tactile_bus.services import ServiceError, call
-from tactile_bus.streams import BusSample, Tap
+from tactile_bus.streams import BusSample, Tap, list_alive
 from tactile_bus.topics import FIELD, REFERENCE, service_key
 from tactile_tools.calibrate.wizard import Stamps, TareRefusedError, WizardError
 
 FIRST_FRAME_S = 10.0
-"""s for tactiled to be found on the bus, identify the board and send a first frame."""
+"""s for tactiled to be found on the bus, identify the board and send a first frame; where it is
+there, `SLOW_S` more for a slow board."""
 TARE_S = 120.0
 """s for a tare of the slowest boards."""
 SLOW_S = 30.0
@@ -47,7 +48,10 @@ class LiveBoard:
 
     def wait(self) -> None:
         """Until frames come; `WizardError` when none do."""
-        if not self._heard.wait(FIRST_FRAME_S):
+        if self._heard.wait(FIRST_FRAME_S):
+            return
+        there = self._name in list_alive(self._session)
+        if not (there and self._heard.wait(SLOW_S)):
             raise WizardError(
                 f"no frames of board {self._name!r} on the bus in {FIRST_FRAME_S:g} s; start "
                 f"tactiled with --name {self._name}, or give --port"

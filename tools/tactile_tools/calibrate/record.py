@@ -46,7 +46,8 @@ def record(options: argparse.Namespace) -> None:
             recorder.close(10.0)
         if recorder.stats.dropped:
             raise ActionError(f"the log is not whole: {recorder.stats.dropped}", REFUSED)
-    print(f"wrote {out}: {presses} presses; next: tactile calibrate fit {out} --out FILE.cal.toml")
+    pressed = "1 press" if presses == 1 else f"{presses} presses"
+    print(f"wrote {out}: {pressed}; next: tactile calibrate fit {out} --out FILE.cal.toml")
 
 
 def _record(options: argparse.Namespace, board: LiveBoard) -> int:

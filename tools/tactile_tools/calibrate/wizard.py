@@ -134,7 +134,7 @@ class Wizard:
             if force is None and presses and presses < PRESSES and not warned:
                 warned = True
                 self._say(
-                    f"  {presses} of {PRESSES} presses: with few, the force of another press will "
+                    f"  {presses} of {PRESSES} presses: after few, the force of another press may "
                     "be wrong by as much as 40 %. Enter again to end all the same."
                 )
             elif force is None:
