@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 
 from tactile_bus.services import ServiceError, call
 from tactile_bus.topics import service_key
@@ -38,6 +39,8 @@ def tare(options: argparse.Namespace) -> None:
     """Tare and say what came of it; `BoardError` when it was refused."""
     with boards.bus(options) as session:
         name = boards.choose(options.board, boards.find(session, options))
+        if sys.stderr.isatty():  # a slow board takes a quarter of a minute
+            print(f"taring {name}: leave the skin untouched ...", file=sys.stderr)
         try:
             report = call(
                 session, service_key(name, "tare"), {"force": options.force}, timeout=TARE_S

@@ -243,7 +243,7 @@ class ClockMap:
             return self._rate_trouble
         recent = [at for at in self._jumps if seconds_between(at, now) <= JUMPS_WITHIN_S]
         if len(recent) >= JUMPS:
-            return f"it jumped {JUMPS} times in {seconds_between(recent[0], now):.0f} s"
+            return f"it jumped {JUMPS} times in {seconds_between(recent[0], now):.1f} s"
         if self._line is not None and self._delays.least > LATEST:
             return f"its samples come {self._delays.least:.1f} s after their instants, or later"
         if self._bad_for > WORST_FOR_S:
