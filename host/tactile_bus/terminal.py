@@ -76,7 +76,9 @@ class LiveLines(ABC):
         grid = Table.grid()
         grid.add_row(table)
         row = Text(describe_log(self._recorder), "" if good else "red")
-        grid.add_row(Text.assemble(("log ", "dim"), row))
+        text = Text.assemble(("log ", "dim"), row)
+        text.no_wrap, text.overflow = True, "ellipsis"
+        grid.add_row(text)
         return grid
 
 

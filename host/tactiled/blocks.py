@@ -47,6 +47,7 @@ class SampleBlock:
     ``status``: (n,) uint8 of `TaxelHealth`. ``captured``: start of the conversion, mapped from
     board ticks (or from arrivals where the board has no clock); ``uncertainty`` in s.
     ``thermometer``: False where the board sends no temperatures, which are then NaN and no fault.
+    ``clock_usable``: False where the board's clock is so wrong that ``captured`` is of no use.
     """
 
     array: int
@@ -58,6 +59,7 @@ class SampleBlock:
     temperature_c: Float
     status: NDArray[np.uint8]
     thermometer: bool = True
+    clock_usable: bool = True
 
     def split(self, sizes: Sequence[int]) -> tuple[SampleBlock, ...]:
         """One block an array, of a block that holds all ``sizes`` taxels of a board together.

@@ -57,6 +57,7 @@ def summary(port: Port, node: int, station: Station, now: Instant) -> dict[str, 
         values["clock_synchronised"] = link.clock.synchronised
         values["clock_rate_error"] = _finite(link.clock.rate_error)
         values["clock_polls"] = dict(link.clock.counters)
+        values["clock_trouble"] = link.clock_trouble
     cycle = station.last
     if cycle is not None:
         ambient, features = cycle.ambient, cycle.features

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from tactile_bus.instant import Instant
 from tactiled.blocks import Chunk
 from tactiled.inbox import Inbox, Item, PortLost, PortOpened
-from tactiled.links.events import Diagnosed, Found, Identity, Refusal
+from tactiled.links.events import Diagnosed, Found, Identity, Refusal, Waiting
 from tactiled.links.line import Line, LineEvent
 from tactiled.links.link import BoardLink
 from tactiled.replay import journal as kinds
@@ -196,6 +196,8 @@ class Port:
             elif isinstance(event, Found):
                 for node, name in self._names(event.nodes, event.late).items():
                     self.add_station(node, name)
+            elif isinstance(event, Waiting):
+                log.info("%s", event.text)
             elif isinstance(event, Diagnosed):
                 self.trouble = Trouble(event.problem, event.remedy)
                 log.error("%s; %s", event.problem, event.remedy)

@@ -34,6 +34,12 @@ PIPELINE_TIMEOUT = 1.0
 TARE_TIMEOUT = 15.0
 """s for a tare: ten times its usual half second, and the retries of a first one."""
 
+TARE_CYCLES = 40
+"""Cycles it may take at that, which on a slow board last longer."""
+
+SLOWEST_HZ = 0.5
+"""Rate of the slowest boards that are served."""
+
 COMMAND_TIMEOUT = 3.0
 """s for a board's answer: five tries of 0.2 s, after those of commands before it."""
 
@@ -45,6 +51,12 @@ Run = Callable[[Callable[[], T]], "Future[T]"]
 
 class Nothing(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """A request without parameters."""
+
+
+class TareRequest(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """``force``: take what the skin reads for its rest, whatever speaks against it."""
+
+    force: bool = False
 
 
 class RateRequest(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -73,7 +85,7 @@ class BoardServices:
         self._station = station
         handlers: dict[str, tuple[Callable[[Any], object], type]] = {
             "status": (self._status, Nothing),
-            "tare": (self._tare, Nothing),
+            "tare": (self._tare, TareRequest),
             "set_rate": (self._set_rate, RateRequest),
             "recalibrate": (self._recalibrate, Nothing),
             "geometry": (self._geometry, Nothing),
@@ -98,15 +110,17 @@ class BoardServices:
         result: dict[str, Any] = self._do(sum_up)
         return result
 
-    def _tare(self, _: Nothing) -> dict[str, Any]:
+    def _tare(self, request: TareRequest) -> dict[str, Any]:
         def begin() -> Future[dict[str, Any]]:
-            ending = self._station.tare()
-            self._port.note(journal.TARE, monotonic_now(), node=self._node)
+            ending = self._station.tare(request.force)
+            value = float(request.force)
+            self._port.note(journal.TARE, monotonic_now(), node=self._node, value=value)
             return ending
 
         future: Future[dict[str, Any]] = self._do(begin)
         stuck = "the tare did not end: no samples are coming"
-        report: dict[str, Any] = self._await(future, TARE_TIMEOUT, stuck)
+        timeout = TARE_TIMEOUT + TARE_CYCLES / max(self._station.rate, SLOWEST_HZ)
+        report: dict[str, Any] = self._await(future, timeout, stuck)
         if not report["accepted"]:
             raise ServiceError(report["message"])
         return report

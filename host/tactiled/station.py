@@ -18,6 +18,7 @@ from tactiled.blocks import Cycle, Features, SampleBlock
 from tactiled.links.events import (
     Answered,
     BoardLog,
+    ClockJudged,
     Event,
     FellSilent,
     Identified,
@@ -32,12 +33,17 @@ from tactiled.links.events import (
 )
 from tactiled.outgoing import MessageMaker
 from tactiled.outlet import Sink
+from tactiled.repeats import Repeats, Silences
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 from tactiled.shelf import Choice, Shelf
 from tactiled.skin_picture import SkinPicture
 
 LATENCIES = 512
 """Latencies kept for the percentiles: a second at the fastest rate of the chip (493 Hz)."""
+
+RATE_CYCLES, RATE_OVER = 20, 20
+"""Cycles that a rate is taken from, and s it may take until there are as many: one second counts
+too few of a slow board."""
 
 FIRMWARE_LEVELS = (10, 20, 30, 40)
 
@@ -77,7 +83,9 @@ class Station:
         self._picture: SkinPicture | None = None
         self._warned = ""
         self._latencies: deque[float] = deque(maxlen=LATENCIES)
-        self._rate_from: tuple[Instant, int] = (outlet.now(), 0)
+        self._rate_from: deque[tuple[Instant, int]] = deque([(outlet.now(), 0)], RATE_OVER)
+        self._repeats = Repeats()
+        self._silences = Silences()
         self._answers: dict[int, Future[Event]] = {}
         self._tares: list[Future[dict[str, Any]]] = []
 
@@ -168,26 +176,41 @@ class Station:
                     self.pipeline.reset()  # what it felt before it was out of sight is over
                 version = f", firmware {identity.firmware}" if identity.firmware else ""
                 written = f", read as {identity.layout}" if identity.layout else ""
-                self._say(logging.INFO, f"{identity}{version} found{written}")
+                self._say(logging.INFO, f"{identity}{version} found{written}", "found")
                 self._warn()
             case Streaming(rate):
                 self.state = "streaming"
-                self._say(logging.INFO, f"streaming at {rate:g} Hz" if rate else "streaming")
+                text = f"streaming at {rate:g} Hz" if rate else "streaming"
+                self._say(logging.INFO, text, "streaming")
             case Refused(refusal):
                 self.refusal, self.state = refusal, "refused"
-                self._say(logging.ERROR, f"refused: {refusal.problem}; {refusal.remedy}")
+                text = f"refused: {refusal.problem}; {refusal.remedy}"
+                self._say(logging.ERROR, text, "refused")
             case FellSilent(seconds):
                 self.state = "silent"
                 self.counters["silences"] += 1
-                self._say(logging.WARNING, f"no samples for {seconds:.2f} s")
+                said = self._silences.fell(seconds, self._outlet.now())
+                if said is not None:
+                    self._say(logging.WARNING, said)
             case Resumed(seconds):
                 self.state = "streaming"
-                self._say(logging.INFO, f"samples again after {seconds:.2f} s")
+                said = self._silences.ended(seconds)
+                if said is not None:
+                    self._say(logging.INFO, said)
+            case ClockJudged(trouble):
+                if trouble:
+                    text = (
+                        f"clock unusable: {trouble}; features stay invalid until it is right: "
+                        "check the tick rate in the board's descriptor, and its oscillator"
+                    )
+                    self._say(logging.WARNING, text, "clock")
+                else:
+                    self._say(logging.INFO, "the board's clock can be used again", "clock")
             case Reset(reason):
                 self.counters["resets"] += 1
                 if self.pipeline is not None:
                     self.pipeline.reset()
-                self._say(logging.WARNING, f"the board restarted: {reason}")
+                self._say(logging.WARNING, f"the board restarted: {reason}", "restart")
             case BoardLog(level, captured, text):
                 known = max((n for n in FIRMWARE_LEVELS if n <= level), default=10)
                 self._outlet.firmware_text(
@@ -210,7 +233,8 @@ class Station:
     def port_lost(self, reason: str) -> None:
         """The port went away under the board."""
         self.state = "unplugged"
-        self._say(logging.WARNING, f"{reason}; waiting for it to come back")
+        self._silences.gone()
+        self._say(logging.WARNING, f"{reason}; waiting for it to come back", "lost")
 
     def await_answer(self, request: int) -> Future[Event]:
         """What the board answers to a request."""
@@ -218,13 +242,16 @@ class Station:
         self._answers[request] = future
         return future
 
-    def tare(self) -> Future[dict[str, Any]]:
-        """Begin a tare; the future holds its report when it ends. ValueError without a board."""
+    def tare(self, force: bool = False) -> Future[dict[str, Any]]:
+        """Begin a tare; the future holds its report when it ends. ValueError without a board.
+
+        ``force``: take what the skin reads for its rest, whatever speaks against it.
+        """
         if self.pipeline is None:
             raise ValueError("no board has been identified yet")
         if self.state != "streaming":
             raise ValueError(f"the board is {self.state}: there are no samples to tare on")
-        self.pipeline.tare()
+        self.pipeline.tare(force)
         future: Future[dict[str, Any]] = Future()
         self._tares.append(future)
         return future
@@ -245,11 +272,12 @@ class Station:
 
     def each_second(self, now: Instant) -> None:
         """Work out rate and latency of the last second."""
-        since, count = self._rate_from
-        elapsed = seconds_between(since, now)
-        if elapsed > 0:
-            self.rate = (self.sent - count) / elapsed
-        self._rate_from = (now, self.sent)
+        self._measure_rate(now)
+        for level, text in self._repeats.due(now):
+            self._say(level, text)
+        said = self._silences.due(now)
+        if said is not None:
+            self._say(logging.WARNING, said)
         if self._latencies:
             ordered = sorted(self._latencies)
             last = len(ordered) - 1
@@ -257,6 +285,20 @@ class Station:
             self._latencies.clear()
         else:
             self.latency = Latency()
+
+    def _measure_rate(self, now: Instant) -> None:
+        """Cycles a second over the shortest span that holds enough of them."""
+        marks = self._rate_from
+        if self.state != "streaming":
+            marks.clear()
+            self.rate = 0.0
+        for since, count in reversed(marks):
+            elapsed = seconds_between(since, now)
+            if elapsed > 0:
+                self.rate = (self.sent - count) / elapsed
+            if self.sent - count >= RATE_CYCLES:
+                break
+        marks.append((now, self.sent))
 
     def drops(self) -> dict[str, int]:
         """Cycles and blocks that did not make it through the pipeline, by reason."""
@@ -285,7 +327,7 @@ class Station:
         report = pipeline.tare_report
         if report is not None and report is not before:
             level = logging.INFO if report.accepted else logging.WARNING
-            self._say(level, report.message)
+            self._say(level, report.message, "" if report.accepted else "tare refused")
             result = {
                 "accepted": report.accepted,
                 "message": report.message,
@@ -314,5 +356,7 @@ class Station:
         self.features, self.last = cycle.features, cycle
         self.sent += 1
 
-    def _say(self, level: int, text: str) -> None:
-        self._outlet.announce(self.name, level, text)
+    def _say(self, level: int, text: str, kind: str = "") -> None:
+        """Announce ``text``; of a ``kind``, only if the last of that is some time ago."""
+        if not kind or self._repeats.tell(kind, text, level, self._outlet.now()):
+            self._outlet.announce(self.name, level, text)

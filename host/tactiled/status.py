@@ -1,33 +1,143 @@
-"""What people see while tactiled runs: a live line for each board, or plain lines now and then."""
+"""What people see while tactiled runs: a live line for each board, or plain lines now and then.
+
+A line says first what the skin feels, or why that is not known, and fits 80 columns.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from tactile_bus.geometry import Side
-from tactile_bus.instant import monotonic_now, seconds_between
+from tactile_bus.instant import Instant, monotonic_now, seconds_between
 from tactile_bus.recorder import Recorder
-from tactile_bus.terminal import LiveLines, drops_text
+from tactile_bus.terminal import LiveLines
+from tactiled.blocks import Features
 from tactiled.port import Port
 from tactiled.station import Station
 
 REFRESH = 0.2
 """s between refreshes of the live lines."""
 
+WIDTH = 80
+"""Columns of a plain line, and of a terminal that does not say."""
+
+NAME_WIDTH = 12
+"""Columns of a board's name; longer ones are cut in their middle."""
+
 FULL_BAR_N = 10.0
 """N at which a force bar is full: the paper's thresholds lie below."""
 
 BAR = " ▁▂▃▄▅▆▇█"
+
 STALE_AFTER = 0.5
 """s without data after which a board's figures are shown as old."""
 
-SIDES = ((Side.LEFT, "L"), (Side.RIGHT, "R"), (Side.TIP, "T"))
+STALE_PERIODS = 3
+"""Or so many of its periods, if that is longer."""
+
+SIDES = ((Side.LEFT, "left"), (Side.RIGHT, "right"), (Side.TIP, "tip"))
+
+
+@dataclass(frozen=True, slots=True)
+class Glimpse:
+    """What is shown of a board. ``forces``: N, the normal force of the contacts on each side.
+
+    ``bound``: N that their sum may err by (95 %), inf where nothing says. ``rate``: Hz.
+    ``latency``: s, median from the last byte to the features; NaN: none measured.
+    """
+
+    name: str
+    state: str
+    forces: Mapping[Side, float]
+    valid: bool
+    reasons: tuple[str, ...]
+    rate: float
+    drops: int
+    latency: float
+    bound: float = math.inf
+
+
+def glimpse(station: Station, now: Instant) -> Glimpse:
+    """What there is to be seen of a board at ``now``."""
+    cycle, limit = station.last, STALE_AFTER
+    if station.rate > 0:
+        limit = max(limit, STALE_PERIODS / station.rate)
+    forces: dict[Side, float] = {}
+    reasons: tuple[str, ...] = ()
+    valid, bound = False, math.inf
+    if cycle is not None and seconds_between(cycle.received, now) < limit:
+        features = cycle.features
+        valid, bound = features.valid, features.normal_force_bound
+        reasons = tuple(reason.text for reason in features.reasons)
+        if station.choice is not None:
+            arrays = station.choice.calibration.geometry.arrays
+            forces = side_forces(features, list(dict.fromkeys(a.side for a in arrays)))
+    drops = sum(station.summary.get("drops", {}).values())
+    return Glimpse(
+        station.name, station.state, forces, valid, reasons, station.rate, drops,
+        station.latency.p50, bound,
+    )  # fmt: skip
+
+
+def side_forces(features: Features, sides: Sequence[Side]) -> dict[Side, float]:
+    """Normal force of the contacts on each of ``sides``, N."""
+    if len(sides) == 1:
+        return {sides[0]: features.normal_force}
+    return {
+        side: sum((p.normal_force for p in features.patches if p.side is side), 0.0)
+        for side in sides
+    }
+
+
+def line(seen: Glimpse, width: int = WIDTH, name_width: int = 0) -> Text:
+    """One line of at most ``width`` columns: name, force or why there is none, then the rest.
+
+    ``name_width``: columns that the names of all boards need.
+    """
+    text = Text(no_wrap=True)
+    text.append(f"{_cut_middle(seen.name, NAME_WIDTH):{min(name_width, NAME_WIDTH)}}", "bold")
+    if seen.state != "streaming":
+        text.append(f"  {seen.state}", "red" if seen.state == "refused" else "yellow")
+    elif seen.valid and seen.forces:
+        text.append("  " + force_text(seen.forces, seen.bound), "green")
+    elif seen.reasons:
+        text.append("  not valid", "yellow")
+    if seen.state == "streaming" and seen.rate > 0:
+        text.append(f"  {seen.rate:.3g} Hz")
+    text.append(f"  {seen.drops} dropped", "yellow" if seen.drops else "")
+    if seen.state == "streaming" and not math.isnan(seen.latency):
+        latency = f"  latency {_duration(seen.latency)}"
+        if len(latency) <= width - text.cell_len:
+            text.append(latency)
+    room = width - text.cell_len - 2
+    if seen.reasons and room > 8:
+        because = Text("  " + "; ".join(seen.reasons), "yellow")
+        because.truncate(room + 2, overflow="ellipsis")
+        text.append_text(because)
+    text.truncate(width, overflow="ellipsis")
+    return text
+
+
+def force_text(forces: Mapping[Side, float], bound: float = math.inf) -> str:
+    """Force of each side in N with a bar; of the only side, its bound instead of its name."""
+    shown = [(name, forces[side]) for side, name in SIDES if side in forces]
+    if len(shown) <= 1:
+        force = sum(forces.values())
+        within = f" ± {bound:.2f}" if math.isfinite(bound) else ""
+        return f"{force:5.2f}{within} N {bar(force)}"
+    return "  ".join(f"{name} {force:.1f}{bar(force)}" for name, force in shown) + " N"
+
+
+def bar(force: float) -> str:
+    """One character for a force in N, full at `FULL_BAR_N`."""
+    level = round(min(max(force / FULL_BAR_N, 0.0), 1.0) * (len(BAR) - 1))
+    return BAR[level]
 
 
 class StatusLines(LiveLines):
@@ -36,77 +146,31 @@ class StatusLines(LiveLines):
     def __init__(self, console: Console, ports: list[Port], recorder: Recorder | None) -> None:
         super().__init__(console, recorder)
         self._ports = ports
+        self._console = console
 
     def _boards(self) -> list[Station]:
         return [station for port in self._ports for station in list(port.stations.values())]
 
     def table(self) -> Table:
         """A row for each board."""
-        table = Table.grid(padding=(0, 2))
-        for station in self._boards():
-            cells = describe(station)
-            style = {"streaming": "green", "refused": "red"}.get(station.state, "yellow")
-            table.add_row(
-                Text(station.name, "bold"),
-                Text(cells.pop("state"), style),
-                *(Text(f"{k} {v}" if v else "", no_wrap=True) for k, v in cells.items()),
-            )
+        table, now, boards = Table.grid(), monotonic_now(), self._boards()
+        names = max((len(station.name) for station in boards), default=0)
+        for station in boards:
+            table.add_row(line(glimpse(station, now), self._console.width, names))
         return table
 
     def lines(self) -> list[str]:
         """A line for each board."""
-        return [
-            f"{station.name}: " + ", ".join(f"{k} {v}" for k, v in describe(station).items() if v)
-            for station in self._boards()
-        ]
+        now = monotonic_now()
+        return [line(glimpse(station, now)).plain.rstrip() for station in self._boards()]
 
 
-def describe(station: Station) -> dict[str, str]:
-    """State of a board in a few short texts; empty where there is nothing to say."""
-    cycle = station.last
-    fresh = cycle is not None and seconds_between(cycle.received, monotonic_now()) < STALE_AFTER
-    latency = station.latency
-    cells = {
-        "state": station.state,
-        "rate": f"{station.rate:.1f} Hz",
-        "drops": drops_text(station.summary.get("drops", {})),
-        "latency": ""
-        if math.isnan(latency.p50)
-        else f"{latency.p50 * 1e3:.1f}/{latency.p99 * 1e3:.1f} ms",
-        "field": "",
-        "force": "",
-        "because": "",
-    }
-    if cycle is not None and fresh:
-        ambient = cycle.ambient
-        if ambient.method != "off":
-            good = "ok" if ambient.valid.all() else "INVALID"
-            worst = float(np.nanmin(ambient.support)) if ambient.support.size else 0.0
-            residual = float(np.nanmax(ambient.residual_ut)) if ambient.residual_ut.size else 0.0
-            cells["field"] = f"{good} {worst:.0%} ±{residual:.1f} µT"
-        cells["force"] = force_text(station)
-        cells["because"] = ", ".join(reason.text for reason in cycle.features.reasons)
-    return cells
+def _duration(seconds: float) -> str:
+    return f"{seconds * 1e3:.1f} ms" if seconds < 0.1 else f"{seconds:.1f} s"
 
 
-def force_text(station: Station) -> str:
-    """Peak normal force of each side as a bar and in N."""
-    cycle, choice = station.last, station.choice
-    if cycle is None or choice is None:
-        return ""
-    geometry = choice.calibration.geometry
-    normal = -cycle.force[:, 2]
-    peaks: dict[Any, float] = {}
-    for array, taxels in zip(geometry.arrays, geometry.slices, strict=True):
-        seen = normal[taxels]
-        if np.isfinite(seen).any():
-            peaks[array.side] = max(peaks.get(array.side, 0.0), float(np.nanmax(seen)))
-    return " ".join(
-        f"{letter}{bar(peaks[side])}{peaks[side]:4.1f} N" for side, letter in SIDES if side in peaks
-    )
-
-
-def bar(force: float) -> str:
-    """One character for a force in N, full at `FULL_BAR_N`."""
-    level = round(min(max(force / FULL_BAR_N, 0.0), 1.0) * (len(BAR) - 1))
-    return BAR[level]
+def _cut_middle(text: str, width: int) -> str:
+    if len(text) <= width:
+        return text
+    head = (width - 1) // 2
+    return f"{text[:head]}…{text[head + 1 - width :]}"

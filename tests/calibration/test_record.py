@@ -95,12 +95,12 @@ def prompt(process: subprocess.Popen[str]) -> str:
     """What is asked next; "" when nothing more is."""
     assert process.stdout is not None
     text = ""
-    while not text.endswith(("tare: ", "end: ", "Enter: ", "[y/N] ")):
+    while not text.endswith(("tare: ", "end: ", "1kg): ", "Enter: ", "[y/N] ")):
         letter = process.stdout.read(1)
         if not letter:
             return ""
         text += letter
-    return text.rpartition("\n")[2]
+    return " ".join(text.split())
 
 
 @pytest.mark.timeout(300)
@@ -114,18 +114,18 @@ def test_an_owner_records_fits_and_then_reads_the_force_that_is_there(tmp_path: 
             text=True,
         )
         assert process.stdin is not None
-        forces = [f"{FORCE_N}", f"{FORCE_N / 9.80665 * 1000:.1f} g", "4N", ""]
+        forces = [f"{FORCE_N}", f"{FORCE_N / 9.80665 * 1000:.1f} g", "4N", "", ""]
         while asked := prompt(process):
             answer = ""
-            if "tare" in asked:
-                person.wait_untouched()
+            if "Next press" in asked:
+                answer = forces.pop(0)
             elif "Take it off" in asked:
                 person.wait_for(pressed=False)
             elif "hold it steady" in asked:
                 assert "Put 4 N" in asked
                 person.wait_for(pressed=True)
-            elif "Next press" in asked:
-                answer = forces.pop(0)
+            elif "to tare" in asked:
+                person.wait_untouched()
             process.stdin.write(answer + "\n")
             process.stdin.flush()
         assert process.wait(SLOW_S) == 0

@@ -17,7 +17,14 @@ from tactile_tools.calibrate.evaluate import predict
 from tactile_tools.calibrate.fit import Choice, choose, fit
 from tactile_tools.calibrate.log_recording import read_log
 from tactile_tools.calibrate.recipes import FORCE_RECIPES
-from tactile_tools.calibrate.wizard import Timing, Wizard, WizardError, parse_force
+from tactile_tools.calibrate.wizard import (
+    PRESSES,
+    TareRefusedError,
+    Timing,
+    Wizard,
+    WizardError,
+    parse_force,
+)
 from tactile_tools.cli import main
 
 RATE_HZ = 50
@@ -56,11 +63,13 @@ class Bench:
             [np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y, z]
         )
 
-    def tare(self) -> str:
+    def tare(self, force: bool = False) -> str:
+        del force
         self.rest = np.mean([self._sample()[1] for _ in range(RATE_HZ)], axis=0)
         return "tared"
 
-    def collect(self, seconds: float) -> list[int]:
+    def collect(self, seconds: float, least: int = 0) -> list[int]:
+        del least
         stamps = []
         for _ in range(round(seconds * RATE_HZ)):
             at, field = self._sample()
@@ -107,6 +116,7 @@ def record(tmp_path, name, presses):
     bench = Bench(recorder, presses)
     wizard = Wizard(bench, bench.label, bench.ask, bench.said.append, Timing(2.0, 1.0, 2.0))
     assert wizard.run() == len(presses)
+    assert any("Enter again to end" in line for line in bench.said) == (len(presses) < PRESSES)
     assert recorder.close(10.0)
     assert not recorder.stats.dropped
     return read_log(tmp_path / name)
@@ -141,32 +151,121 @@ def test_what_the_wizard_records_calibrates_the_simulated_board(tmp_path):
     assert np.sqrt((error**2).mean()) < 0.4 * np.std(predict(uncalibrated, other) - other.labels)
 
 
+def test_a_recording_with_equal_stamps_is_read_all_the_same(tmp_path):
+    recorder = Recorder(tmp_path / "rec.mcap")
+    bench = Bench(recorder, some_presses(0, 15))
+    sample = bench._sample
+
+    def stalled():
+        """Six frames in a hundred come in a burst, as older versions stamped it."""
+        at, field = sample()
+        late = at % (2 * NS_PER_S)
+        return at - late if late < 0.12 * NS_PER_S else at, field
+
+    bench._sample = stalled
+    Wizard(bench, bench.label, bench.ask, bench.said.append, Timing(2.0, 1.0, 2.0)).run()
+    assert recorder.close(10.0)
+    recording = read_log(tmp_path / "rec.mcap")
+    assert (np.diff(recording.time_s) > 0).all()
+    assert (np.diff(recording.label_time_s) > 0).all()
+
+
 class Silent:
     """A source that gives no frames."""
 
-    def tare(self):
-        return ""
+    def tare(self, force=False):
+        return "tared"
 
-    def collect(self, seconds):
+    def collect(self, seconds, least):
         return []
 
 
+class Steady(Silent):
+    """A source that gives twenty frames a second; each tare but a forced one may be refused."""
+
+    def __init__(self, refusals=0):
+        self.refusals = refusals
+        self.forced = []
+
+    def tare(self, force=False):
+        self.forced.append(force)
+        if self.refusals and not force:
+            self.refusals -= 1
+            raise TareRefusedError("tare refused: the field moved by 9 µT: keep the skin still")
+        return "tared"
+
+    def collect(self, seconds, least):
+        return list(range(int(20 * seconds)))
+
+
+class Dialogue:
+    """Answers in their order; everything that was shown, and what was labelled."""
+
+    def __init__(self, *answers):
+        self.answers, self.shown, self.labels = list(answers), [], []
+
+    def ask(self, question):
+        self.shown.append(question)
+        return self.answers.pop(0)
+
+    def run(self, source, width=80):
+        def label(stamps, force):
+            self.labels.append(force)
+
+        presses = Wizard(source, label, self.ask, self.shown.append, Timing(), width).run()
+        assert not self.answers
+        return presses
+
+
 def test_questions_go_on_until_they_are_answered_well():
-    answers = iter(["", "heavy", "-3", "1e9", "nan", "200g", "", "", "", "n"])
-    said, labels = [], []
-
-    class Steady(Silent):
-        def collect(self, seconds):
-            return list(range(int(20 * seconds)))
-
-    wizard = Wizard(
-        Steady(), lambda s, f: labels.append(f), lambda q: next(answers), said.append, Timing()
-    )
-    assert wizard.run() == 1
-    assert labels == [0.0, pytest.approx(1.96133), 0.0]
-    assert sum("is no force" in line for line in said) == 4
+    talk = Dialogue("", "heavy", "-3", "1e9", "nan", "200g", "", "", "", "", "n")
+    assert talk.run(Steady()) == 1
+    assert talk.labels == [0.0, pytest.approx(1.96133), 0.0]
+    assert sum("is not a force" in line for line in talk.shown) == 4
+    said: list[str] = []
     with pytest.raises(WizardError, match="only 0 frames"):
         Wizard(Silent(), lambda s, f: None, lambda q: "", said.append, Timing()).run()
+
+
+def test_fifteen_presses_are_asked_for_and_counted():
+    press = ["2", "", ""]
+    talk = Dialogue("", *(press * PRESSES), "", "n")
+    assert talk.run(Steady()) == PRESSES == 15
+    asked = [line for line in talk.shown if "Next press" in line]
+    assert "(1 of 15)" in asked[0]
+    assert "(15 of 15)" in asked[-2]
+    assert "(16)" in asked[-1]
+
+
+def test_ending_early_takes_a_second_answer():
+    talk = Dialogue("", "2", "", "", "", "3", "", "", "", "", "n")
+    assert talk.run(Steady()) == 2
+    assert sum("Enter again to end" in line for line in talk.shown) == 2
+
+
+def test_the_last_press_can_be_undone_and_leaves_no_label():
+    talk = Dialogue("", "u", "2", "", "", "5", "", "", "u", "undo", "3", "", "", "", "", "n")
+    assert talk.run(Steady()) == 2
+    assert talk.labels == [0.0, 2.0, 0.0, 3.0, 0.0]
+    assert any("press of 5 N is undone" in line for line in talk.shown)
+    assert sum("nothing to undo" in line for line in talk.shown) == 2
+
+
+def test_a_tare_that_is_refused_is_tried_again_or_forced():
+    source = Steady(refusals=2)
+    assert Dialogue("", "", "f", "2", "", "", "", "", "n").run(source) == 1
+    assert source.forced == [False, False, True]
+
+
+@pytest.mark.parametrize("width", [40, 80])
+def test_no_line_is_wider_than_the_terminal_and_no_word_is_cut(width):
+    talk = Dialogue("", "f", "x" * 15, "2", "", "", "", "", "y", "")
+    talk.run(Steady(refusals=1), width)
+    whole = Dialogue("", "f", "x" * 15, "2", "", "", "", "", "y", "")
+    whole.run(Steady(refusals=1), 1000)
+    for text in talk.shown:
+        assert max(len(line) for line in text.split("\n")) <= width
+    assert " ".join(talk.shown).split() == " ".join(whole.shown).split()
 
 
 @pytest.mark.parametrize(

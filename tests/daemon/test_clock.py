@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sensor_proto.packets import ClockReply
 from tactile_bus.instant import NS_PER_S, Instant
-from tactiled.links.clock import CONTRADICTIONS, ClockMap, TickUnwrapper
+from tactiled.links.clock import ClockMap, TickUnwrapper
 
 TICK_HZ = 1_000_000
 START = 3_600 * NS_PER_S
@@ -95,7 +95,7 @@ def test_slow_polls_do_not_spoil_the_map() -> None:
     for token in range(80):
         delay = 0.1e-3 if token % 4 == 0 else rng.uniform(0.01, 0.1)
         poll(clock, board, token, token * 0.125, 0.1e-3, delay)
-    stamp = clock.stamp(board.ticks(10.0), at(10.1))
+    stamp = clock.stamp(board.ticks(10.0), at(10.01))
     assert abs(stamp.captured - at(10.0)) < 0.5e-3 * NS_PER_S
     assert stamp.uncertainty < 1e-3
 
@@ -114,7 +114,7 @@ def test_recovers_from_a_clock_that_jumps() -> None:
     for token in range(20):
         poll(clock, board, token, token * 0.25, 0.2e-3, 0.2e-3)
     board.phase += 30 * TICK_HZ
-    for token in range(20, 20 + CONTRADICTIONS + 2):
+    for token in range(20, 20 + 5):
         poll(clock, board, token, token * 0.25, 0.2e-3, 0.2e-3)
     stamp = clock.stamp(board.ticks(7.0), at(7.01))
     assert abs(stamp.captured - at(7.0)) / NS_PER_S <= stamp.uncertainty

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.cells import cell_len
 
+from tactile_bus.geometry import Side
 from tactile_bus.terminal import drops_text
 from tactiled.cli import can_networks
 from tactiled.links.lines import bus_names
-from tactiled.status import BAR, bar
+from tactiled.status import BAR, SIDES, Glimpse, bar, line
 
 
 def test_a_force_bar_fills_up_and_stays_full() -> None:
@@ -17,6 +22,66 @@ def test_a_force_bar_fills_up_and_stays_full() -> None:
     assert shown == sorted(shown)
     assert shown[:2] == [0, 0]
     assert shown[-2:] == [len(BAR) - 1] * 2
+
+
+def a_glimpse(**values: object) -> Glimpse:
+    usual: dict[str, object] = {
+        "name": "board0",
+        "state": "streaming",
+        "forces": {Side.TIP: 2.345},
+        "valid": True,
+        "reasons": (),
+        "rate": 99.94,
+        "drops": 0,
+        "latency": 0.0017,
+    }
+    return Glimpse(**(usual | values))  # type: ignore[arg-type]
+
+
+def test_force_comes_first_and_then_rate_latency_and_losses() -> None:
+    shown = line(a_glimpse()).plain
+    assert " ".join(shown.split()) == "board0 2.35 N ▂ 99.9 Hz 0 dropped latency 1.7 ms"
+    bounded = line(a_glimpse(bound=0.25)).plain
+    assert "2.35 ± 0.25 N" in bounded
+    several = line(a_glimpse(forces={Side.LEFT: 1.0, Side.RIGHT: 0.0, Side.TIP: 11.0})).plain
+    assert several.index("left") < several.index("right") < several.index("tip 11.0█ N")
+    assert several.endswith("latency 1.7 ms")
+    assert cell_len(several) <= 80
+    longest = a_glimpse(name="n" * 64, forces=dict.fromkeys(Side, 99.9), drops=123_456)
+    assert "123456 dropped" in line(longest).plain
+
+
+def test_a_force_that_is_not_valid_is_not_shown_but_why_is() -> None:
+    shown = line(a_glimpse(valid=False, reasons=("taring: leave the skin untouched",))).plain
+    assert " N " not in shown
+    assert "not valid" in shown
+    assert "taring: leave" in shown
+
+
+@pytest.mark.parametrize("state", ["waiting", "silent", "unplugged", "refused"])
+def test_a_board_that_does_not_stream_shows_its_state_instead(state: str) -> None:
+    shown = line(a_glimpse(state=state, drops=1234)).plain
+    assert state in shown
+    assert " N " not in shown
+    assert " Hz" not in shown
+    assert "1234 dropped" in shown
+
+
+@given(
+    name=st.text("abc_-", min_size=1, max_size=64),
+    state=st.sampled_from(["streaming", "waiting", "identified", "silent", "refused"]),
+    forces=st.dictionaries(st.sampled_from([side for side, _ in SIDES]), st.floats(-999, 999)),
+    valid=st.booleans(),
+    reasons=st.lists(st.text(min_size=1, max_size=90), max_size=4).map(tuple),
+    rate=st.floats(0, 99_999),
+    drops=st.integers(0, 10**12),
+    latency=st.one_of(st.just(math.nan), st.floats(0, 1000)),
+    width=st.sampled_from([40, 80, 120]),
+)
+@settings(max_examples=100, deadline=None)
+def test_a_line_fits_its_width(width: int, **values: object) -> None:
+    shown = line(a_glimpse(**values), width)
+    assert shown.cell_len <= width
 
 
 def test_drops_are_named_the_largest_first() -> None:

@@ -87,6 +87,14 @@ def test_the_example_works() -> None:
     assert any(indenter.contacts(t / 10) for t in range(120))
 
 
+def test_the_example_for_the_five_chip_board_leaves_time_to_tare() -> None:
+    example = Path(__file__).resolve().parents[2] / "docs" / "press-anyskin.toml"
+    indenter = load_script(example, anyskin())
+    assert not any(indenter.contacts(t / 10) for t in range(50))
+    pressed = [sum(-c.force[0] for c in indenter.contacts(t / 10)) for t in range(200)]
+    assert {1.0, 2.0, 3.0, 5.0} <= {round(force, 6) for force in pressed}
+
+
 @pytest.mark.parametrize(
     ("old", "new", "line", "message"),
     [

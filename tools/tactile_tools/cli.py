@@ -12,6 +12,8 @@ from importlib.metadata import version
 TOOLS = (
     "log",
     "plot",
+    "status",
+    "tare",
     "calibrate",
     "reach",
     "demo",
@@ -30,7 +32,8 @@ def build_parser(tools: Sequence[str] = TOOLS) -> argparse.ArgumentParser:
     """Return the parser with the subcommands of ``tools``."""
     parser = argparse.ArgumentParser(
         prog="tactile",
-        description="Inspect, recover and plot logs, run reaches, demos, benchmarks and fuzzers.",
+        description="Ask and tare boards, inspect, recover and plot logs, run reaches, demos, "
+        "benchmarks and fuzzers.",
     )
     parser.add_argument(
         "--version", action="version", version=f"tactile-reach {version('tactile-reach')}"

@@ -7,10 +7,20 @@ import numpy as np
 from sensor_proto.layout import COUNT_UT, COUNTS
 from sensor_proto.survey import Finding
 from tactile_bus.instant import Instant, seconds_between
-from tactiled.links.events import Diagnosed
+from tactiled.links.events import Diagnosed, Waiting
 
 GARBAGE_AFTER = 3.0
-"""s of bytes without a frame before they are called garbage: slower boards send twenty in it."""
+"""s of bytes without a frame before they are called garbage."""
+
+ENOUGH = 12
+"""Times that bytes came after a pause before they are called garbage: a board is known by the
+third of its frames, of which some may be cut."""
+
+PAUSE = 0.05
+"""s without a byte that part one frame of a slow board from the next."""
+
+PATIENCE = 30.0
+"""s after which they are called garbage however seldom they come: twelve frames at 0.5 Hz."""
 
 LITTLE, LITTLE_UNTIL = 400, 15.0
 """Bytes of which nothing can be said yet, and s until which more are awaited: five frames of a slow
@@ -18,6 +28,10 @@ board."""
 
 NOTHING_AFTER = 5.0
 """s without a byte before the port is called silent: boards that reset on opening boot in two."""
+
+MOST_OF_A_FRAME = 2000
+"""Bytes without a pause that are more than any frame: 322 bytes for twenty magnetometers, with
+room for several in a row."""
 
 SHOWN = 60
 """Characters of a foreign device's text that a message quotes."""
@@ -49,15 +63,54 @@ class Diagnosis:
         self._since = now
         self._total = self._zeros = self._printable = 0
         self._text = b""
+        self._bursts = 0
+        self._first_byte = self._last_byte = now
+        self._told = False
 
-    def feed(self, data: bytes) -> None:
-        """Count what came."""
+    def feed(self, data: bytes, now: Instant) -> None:
+        """Count what came at ``now``."""
+        if not self._total:
+            self._first_byte = now
+        if not self._total or seconds_between(self._last_byte, now) >= PAUSE:
+            self._bursts += 1
+        self._last_byte = now
         values = np.frombuffer(data, np.uint8)
         self._total += len(data)
         self._zeros += len(data) - int(np.count_nonzero(values))
         self._printable += int(_PRINTABLE[values].sum())
         if len(self._text) < 2 * SHOWN:
             self._text = (self._text + data)[: 2 * SHOWN]
+
+    @property
+    def _patience(self) -> float:
+        """s to wait in all before a judgement."""
+        if not self._total:
+            return NOTHING_AFTER
+        if self._bursts >= ENOUGH or self._is_text or self._is_zeros:
+            return GARBAGE_AFTER
+        # Seldom: bytes that pour in without a pause are one burst, and garbage.
+        pouring = self._total / self._bursts > MOST_OF_A_FRAME
+        return GARBAGE_AFTER if pouring else PATIENCE
+
+    @property
+    def _is_zeros(self) -> bool:
+        return self._zeros >= MOSTLY * self._total
+
+    @property
+    def _is_text(self) -> bool:
+        return self._printable >= MOSTLY * self._total
+
+    def waiting(self, now: Instant) -> Waiting | None:
+        """Said once: that bytes come too seldom to tell yet what they are."""
+        waited = seconds_between(self._since, now)
+        if self._told or self._bursts < 2 or not GARBAGE_AFTER <= waited < self._patience:
+            return None
+        self._told = True
+        period = seconds_between(self._first_byte, self._last_byte) / (self._bursts - 1)
+        return Waiting(
+            f"{self._port} sends {self._total // self._bursts} bytes every {period:.1f} s; waiting "
+            f"up to {PATIENCE:.0f} s for enough of them to tell which board this is"
+        )
 
     def judge(
         self, now: Instant, answered: bool, finding: Finding | None = None
@@ -67,7 +120,7 @@ class Diagnosis:
         ``answered``: frames of ours were decoded. ``finding``: what the bytes look like.
         """
         waited = seconds_between(self._since, now)
-        if waited < (GARBAGE_AFTER if self._total else NOTHING_AFTER):
+        if waited < self._patience:
             return None
         if 0 < self._total < LITTLE and waited < LITTLE_UNTIL:
             return None
@@ -84,7 +137,7 @@ class Diagnosis:
                 f"a board on {port} sends frames, but did not answer Identify in {asked}",
                 "check the line from host to board (TX), then power-cycle the board",
             )
-        if self._zeros >= MOSTLY * self._total:
+        if self._is_zeros:
             return Diagnosed(
                 f"{port} floods zeros ({self._total} bytes in {asked}, no frame among them)",
                 "the line is held low or the baud rate is far too high: check wiring, power and "
@@ -94,7 +147,7 @@ class Diagnosis:
             )
         if finding is not None:
             return Diagnosed(f"{port} sends {finding.what}", self._declare(finding))
-        if self._printable >= MOSTLY * self._total:
+        if self._is_text:
             return Diagnosed(
                 f"{port} sends text, not taxel frames: {_first_line(self._text)!r}",
                 "this seems to be another device or another firmware; give the board's port "

@@ -42,6 +42,16 @@ class LowerEnvelope:
         return len(self._points)
 
     @property
+    def span(self) -> float:
+        """Width of what the points cover, in units of x; 0 before the second."""
+        return self._points[-1][0] - self._points[0][0] if self._points else 0.0
+
+    @property
+    def middle(self) -> float:
+        """Where the line is best known, in x; 0 before the first point."""
+        return 0.0 if self._fit is None else self._fit.x
+
+    @property
     def slope(self) -> float:
         """Present slope, or the first guess."""
         return self._guess if self._fit is None else self._fit.slope

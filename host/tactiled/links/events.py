@@ -113,6 +113,13 @@ class Reset:
 
 
 @dataclass(frozen=True, slots=True)
+class ClockJudged:
+    """The board's clock cannot be used, for the reason ``trouble``; empty: it can again."""
+
+    trouble: str
+
+
+@dataclass(frozen=True, slots=True)
 class BoardLog:
     """A line of text from the firmware, levels as in `sensor_proto.packets.Log`."""
 
@@ -145,6 +152,13 @@ class Diagnosed:
 
 
 @dataclass(frozen=True, slots=True)
+class Waiting:
+    """What is on the port cannot be told yet, and why that takes longer than usual."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class Found:
     """Boards on a bus, by node. ``late``: they came after the others had been gathered."""
 
@@ -160,9 +174,11 @@ Event = (
     | FellSilent
     | Resumed
     | Reset
+    | ClockJudged
     | BoardLog
     | Reported
     | Answered
     | Diagnosed
+    | Waiting
     | Found
 )

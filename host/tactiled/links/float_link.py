@@ -21,13 +21,17 @@ from tactiled.links.events import (
     Sampled,
     Streaming,
 )
-from tactiled.links.link import RELINK, SILENCE, Admission, State
+from tactiled.links.link import RELINK, Admission, State
+from tactiled.links.pace import Pace
 
 BACKLOG_GAP = 1e-3
 """s between arrivals, `BACKLOG_GAPS` times running, that show that what had piled up before the
 port was opened has been read: no such board is faster than 500 Hz."""
 
 BACKLOG_GAPS = 3
+
+LONE_GAP = 0.1
+"""s before a frame, once, that show the same: what has piled up is read without a pause."""
 
 BACKLOG_LIMIT = 0.5
 """s after the first frame at which it is taken as read in any case."""
@@ -66,16 +70,19 @@ class FloatLink:
         self._heard = Instant(0)
         self._fresh = False
         self._gaps = 0
+        self._pace = Pace()
+        self._frames = 0
 
     @property
     def silence_limit(self) -> float:
         """s without frames that are no cause for concern."""
-        return max(SILENCE, 3 * self.clock.period)
+        return self._pace.silence_limit()
 
     def connect(self) -> None:
         """The line is up."""
         self.state = State.IDENTIFYING
         self.clock.restart()
+        self._pace.restart()
         self._silent = self._fresh = False
         self._first, self._gaps = None, 0
 
@@ -83,10 +90,23 @@ class FloatLink:
         """The line is down."""
         self.state = State.DOWN
 
-    def receive(self, message: FloatSamples, arrival: Instant) -> list[Event]:
-        """Take one frame whose last byte came at ``arrival``."""
+    def receive(
+        self,
+        message: FloatSamples,
+        arrival: Instant,
+        behind: int = 0,
+        newest: Instant | None = None,
+    ) -> list[Event]:
+        """Take one frame whose last byte came at ``arrival``.
+
+        ``behind``, ``newest``: frames that were read after it in one read, see `ArrivalClock`.
+        """
+        self._frames += 1
         if not self._fresh and self._is_backlog(arrival):
             self.counters["backlog"] += 1
+            self._pace.heard(arrival, self._frames)
+            if self._gaps:
+                self.clock.heard(arrival)
             return []
         events: list[Event] = []
         shape = (1, len(message.temperature_c))
@@ -98,10 +118,12 @@ class FloatLink:
         if self._silent:
             quiet = seconds_between(self._last_sample, arrival)
             events.append(Resumed(quiet))
-            if quiet >= RELINK:
+            if quiet >= max(RELINK, self.silence_limit):
                 self.clock.restart()
+            self._pace.restart()
         self._silent, self._last_sample = False, arrival
-        placed = self.clock.arrived(arrival)
+        self._pace.heard(arrival, self._frames)
+        placed = self.clock.arrived(arrival, behind, newest)
         block = SampleBlock(
             array=0,
             sequence=placed.sequence % (1 << 32),
@@ -138,9 +160,11 @@ class FloatLink:
         if first is None:
             self._first = arrival
             return True
-        self._gaps = self._gaps + 1 if seconds_between(heard, arrival) >= BACKLOG_GAP else 0
-        waited = seconds_between(first, arrival)
-        self._fresh = self._gaps >= BACKLOG_GAPS or waited >= BACKLOG_LIMIT
+        gap, waited = seconds_between(heard, arrival), seconds_between(first, arrival)
+        self._gaps = self._gaps + 1 if gap >= BACKLOG_GAP else 0
+        self._fresh = self._gaps >= BACKLOG_GAPS or gap >= LONE_GAP or waited >= BACKLOG_LIMIT
+        if self._fresh and self._gaps == 1:
+            self.clock.heard(heard)  # the one before it: what lies between is the period
         return not self._fresh
 
     def _introduce(self, shape: tuple[int, int]) -> list[Event]:

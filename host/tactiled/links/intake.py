@@ -7,7 +7,7 @@ import numpy as np
 from sensor_proto.packets import ArrayDescriptor, Samples
 from tactile_bus.instant import Instant, seconds_between
 from tactiled.blocks import SampleBlock
-from tactiled.links.clock import Stamp
+from tactiled.links.clock import Stamp, StepWatch
 from tactiled.links.sequence import SequenceTracker
 
 
@@ -16,6 +16,7 @@ class ArrayIntake:
 
     def __init__(self) -> None:
         self.tracker = SequenceTracker()
+        self.steps = StepWatch()
         self._index = self._taxels = 0
         self._scale = np.ones(3)
         self._captured = Instant(0)
@@ -29,12 +30,14 @@ class ArrayIntake:
         """Whether these are as many taxels as the board said."""
         return len(message.field) == self._taxels
 
-    def block(self, message: Samples, stamp: Stamp, arrival: Instant) -> SampleBlock:
-        """The samples in µT. Their stamp is never before that of earlier ones, whatever the ticks.
+    def block(
+        self, message: Samples, stamp: Stamp, arrival: Instant, clock_usable: bool = True
+    ) -> SampleBlock:
+        """The samples in µT. Their stamp is after that of earlier ones, whatever the ticks.
 
         What that moves the stamp by is added to its uncertainty.
         """
-        captured = Instant(max(stamp.captured, min(self._captured, arrival)))
+        captured = Instant(max(stamp.captured, min(self._captured + 1, arrival)))
         self._captured = captured
         return SampleBlock(
             array=self._index,
@@ -42,6 +45,7 @@ class ArrayIntake:
             captured=captured,
             received=arrival,
             uncertainty=stamp.uncertainty + seconds_between(stamp.captured, captured),
+            clock_usable=clock_usable,
             field_ut=message.field * self._scale,
             temperature_c=np.array([message.temperature_cc / 100]),
             status=message.status,

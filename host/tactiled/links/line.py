@@ -165,13 +165,17 @@ class SerialLine:
         if not isinstance(data, bytes):
             raise TypeError("a serial line takes bytes")
         if not self._served:
-            self._diagnosis.feed(data)
+            self._diagnosis.feed(data, chunk.received)
         events: list[Event] = []
-        for received in self._decode(data, chunk.received):
-            arrival = Instant(chunk.received - round(received.trailing * self._byte_ns))
+        found = list(self._decode(data, chunk.received))
+        arrivals = [
+            Instant(chunk.received - round(each.trailing * self._byte_ns)) for each in found
+        ]
+        for place, (received, arrival) in enumerate(zip(found, arrivals, strict=True), start=1):
             message = received.message
             if isinstance(message, FloatSamples):
-                events += self._float.receive(message, arrival)
+                behind = len(found) - place
+                events += self._float.receive(message, arrival, behind, arrivals[-1])
             else:
                 events += self._board.receive(message, arrival)
         return [LineEvent(0, event) for event in events]
@@ -189,6 +193,9 @@ class SerialLine:
         elif self._about_to_read and now < self._patient_until:
             pass
         elif link.state is not State.REFUSED and now >= self._diagnose_from:
+            waiting = self._diagnosis.waiting(now)
+            if waiting is not None:
+                out.append(LineEvent(None, waiting))
             answered = isinstance(self._link, BoardLink)
             diagnosed = self._diagnosis.judge(now, answered, self._finding)
             if diagnosed is not None:

@@ -29,12 +29,13 @@ from sensor_proto.packets import (
     Stop,
 )
 from tactile_bus.instant import Instant, after, seconds_between
-from tactiled.links.clock import ClockMap
+from tactiled.links.clock import WORST_ERROR_S, ClockMap
 from tactiled.links.commands import CommandQueue
 from tactiled.links.events import (
     RESET_CAUSES,
     Answered,
     BoardLog,
+    ClockJudged,
     Event,
     FellSilent,
     Identified,
@@ -48,6 +49,7 @@ from tactiled.links.events import (
     Streaming,
 )
 from tactiled.links.intake import ArrayIntake
+from tactiled.links.pace import Pace
 from tactiled.links.sequence import Verdict
 
 IDENTIFY_FIRST = 0.1
@@ -63,6 +65,9 @@ KEEPALIVE = 10.0
 """s between questions to a board in service: shows an exchanged board, and puts a descriptor into
 every log file so that each replays by itself."""
 
+POLL_AT_ONCE = 0.02
+"""s between clock polls while the map is new or in doubt; an answer settles most doubts."""
+
 POLL_FAST = 0.1
 """s between clock polls at first."""
 
@@ -72,11 +77,11 @@ POLL_FAST_FOR = 2.0
 POLL_SLOW = 0.25
 """s between clock polls afterwards: two for every bucket of the regression."""
 
-SILENCE = 0.2
-"""s without samples (or three periods, if longer) after which a board has fallen silent."""
-
 RELINK = 1.0
-"""s without samples after which the board is asked anew who it is."""
+"""s without samples (or three periods, if longer) after which the board is asked anew who it is."""
+
+JUDGE_CLOCK = 0.25
+"""s between looks at whether the clock can be used."""
 
 Admission = Callable[[Identity], Refusal | None]
 """Judges a board by what it says of itself; None: welcome."""
@@ -122,14 +127,25 @@ class BoardLink:
         self._last_sample = self._started = Instant(0)
         self._silent = False
         self._resuming = False
+        self._pace = Pace()
+        self._clock_trouble = ""
+        self._judge_due = Instant(0)
 
     @property
     def silence_limit(self) -> float:
         """s without samples that are no cause for concern."""
-        rate = self.rate
-        if rate is None and self.status is not None:
-            rate = self.status.rate_mhz / 1000
-        return max(SILENCE, 3 / rate) if rate else SILENCE
+        said = None if self.status is None else self.status.rate_mhz / 1000
+        return self._pace.silence_limit(self.rate, said)
+
+    @property
+    def relink_limit(self) -> float:
+        """s without samples after which the board is asked anew who it is."""
+        return max(RELINK, self._pace.silence_limit(self.rate))
+
+    @property
+    def clock_trouble(self) -> str:
+        """Why the board's clock cannot be used; empty while it can."""
+        return self._clock_trouble
 
     # What the outside tells
 
@@ -185,7 +201,7 @@ class BoardLink:
             case Log():
                 captured = arrival
                 if self.clock is not None:
-                    captured = self.clock.stamp(message.ticks, arrival).captured
+                    captured = self.clock.place(message.ticks, arrival)
                 return [BoardLog(message.level, captured, message.text)]
             case _:
                 self.counters["from_host"] += 1  # an echo: only hosts send these
@@ -203,7 +219,8 @@ class BoardLink:
             return []
         if self.clock is not None and now >= self._poll_due:
             fast = now < self._poll_fast_until
-            self._poll_due = after(now, POLL_FAST if fast else POLL_SLOW)
+            pause = POLL_FAST if fast else POLL_SLOW
+            self._poll_due = after(now, POLL_AT_ONCE if self.clock.unsettled else pause)
             self._token = (self._token + 1) % (1 << 32)
             self.clock.polled(self._token, now)
             self._out.append(ClockPoll(self._token))
@@ -238,17 +255,31 @@ class BoardLink:
         events: list[Event] = []
         in_service = self.state in (State.CONFIGURING, State.STREAMING)
         if in_service:
-            if message == self.descriptor and not self._silent:
+            if message == self.descriptor and not self._has_ceased(now):
                 return []  # answer to the keepalive, or to another host's question
-            same = message == self.descriptor
-            why = "it answers, but has ceased to stream" if same else "it describes itself anew"
-            events = [Reset(why), *self._drop_commands()]
+            events = [Reset(self._what_is_new(message)), *self._drop_commands()]
         identity = self._take_on(message, now, rebooted=in_service)
         events.append(Identified(identity, rebooted=in_service))
         if self._listen_only:
             self.state, self._refusal, self._started = State.STREAMING, None, now
             events.append(Streaming(None))
         return events
+
+    def _has_ceased(self, now: Instant) -> bool:
+        """Whether a board that answers no longer streams; one whose pace is unknown may be slow."""
+        quiet = seconds_between(max(self._last_sample, self._started), now)
+        return self._silent and (self._pace.period is not None or quiet >= self.relink_limit)
+
+    def _what_is_new(self, message: Descriptor) -> str:
+        before = self.descriptor
+        if message == before or before is None:
+            return "it answers, but has ceased to stream"
+        if message.tick_hz != before.tick_hz:
+            return (
+                f"it describes itself anew, its clock at {message.tick_hz} ticks a second "
+                f"(before: {before.tick_hz})"
+            )
+        return "it describes itself anew"
 
     def _judge(self, message: Descriptor) -> Refusal | None:
         serial = message.serial_number
@@ -281,12 +312,14 @@ class BoardLink:
         if self.clock is None:
             self.clock = ClockMap(message.tick_hz)
         else:
-            self.clock.restart()
+            self.clock.restart(message.tick_hz)
+        self._pace.restart()
         for number in set(self.arrays) - {a.array for a in message.arrays}:
             del self.arrays[number]
         for index, a in enumerate(message.arrays):
             intake = self.arrays.setdefault(a.array, ArrayIntake())
             intake.describe(index, a)
+            intake.steps.restart()
             if rebooted:
                 intake.tracker.restart()
             else:
@@ -325,6 +358,10 @@ class BoardLink:
         if not command.own:
             if good and isinstance(message, SetRate):
                 self.rate = message.rate_mhz / 1000
+                self._pace.restart()
+                self._started = now  # the first sample at a slow rate takes its time
+                for array in self.arrays.values():
+                    array.steps.restart()
             return [Answered(command.request, ack)]
         if good:
             if not isinstance(message, Start):
@@ -364,14 +401,34 @@ class BoardLink:
             return [reset, *self._identify(arrival)]
         if verdict is not Verdict.FRESH:
             return []
-        self.clock.arrived(message.ticks, arrival)
-        stamp = self.clock.stamp(message.ticks, arrival)
+        clock = self.clock
+        odd = array.steps.take(message.sequence, message.ticks)
+        if odd > 0:
+            clock.doubt(odd, arrival)
+        clock.arrived(message.ticks, arrival)
+        stamp = clock.stamp(message.ticks, arrival)
+        if clock.unsettled:
+            self._poll_due = min(self._poll_due, after(arrival, POLL_AT_ONCE))
         events: list[Event] = []
         if self._silent or self._resuming:
             events.append(Resumed(seconds_between(self._last_sample, arrival)))
+            self._pace.restart()
         self._silent, self._resuming, self._last_sample = False, False, arrival
-        events.append(Sampled(array.block(message, stamp, arrival)))
+        if message.array == next(iter(self.arrays)):
+            self._pace.heard(arrival, array.tracker.accepted + array.tracker.missing)
+        events += self._judge_clock(clock, arrival)
+        usable = not self._clock_trouble and stamp.uncertainty <= WORST_ERROR_S
+        events.append(Sampled(array.block(message, stamp, arrival, usable)))
         return events
+
+    def _judge_clock(self, clock: ClockMap, now: Instant) -> list[Event]:
+        """Say when the clock becomes unusable, or usable again."""
+        if now < self._judge_due:
+            return []
+        self._judge_due = after(now, JUDGE_CLOCK)
+        trouble = clock.trouble(now) or ""
+        before, self._clock_trouble = self._clock_trouble, trouble
+        return [ClockJudged(trouble)] if bool(trouble) != bool(before) else []
 
     def _on_status(self, message: Status, now: Instant) -> list[Event]:
         before, self.status = self.status, message
@@ -395,6 +452,6 @@ class BoardLink:
             self._silent = self._resuming = True
             events.append(FellSilent(quiet))
             self._ask(now)
-        if quiet >= max(RELINK, limit):
+        if quiet >= max(self.relink_limit, limit):
             events += self._identify(now)
         return events

@@ -193,7 +193,7 @@ class Rerun:
             case kinds.TICK if self._follow:
                 port.tick(now)
             case kinds.TARE if station is not None:
-                station.tare()
+                station.tare(bool(event.value))
             case kinds.SET_RATE:
                 link = port.line.links.get(event.node)
                 if isinstance(link, BoardLink) and self._follow:

@@ -213,6 +213,8 @@ class BoardPipeline:
         force = layout.flat_vectors(forces)
         self._health = layout.flat(health)
         reasons, valid = self._reasons(estimate, healthy, present, known)
+        if not all(block.clock_usable for block in blocks):
+            reasons, valid = (why.CLOCK_UNUSABLE, *reasons), False
         tip_usable = valid or (known and self._tip_usable(estimate, present))
         features = self._features.update(
             force, masked, reasons, valid, tip_usable, captured, layout.flat(estimate.loaded)

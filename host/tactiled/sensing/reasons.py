@@ -12,6 +12,10 @@ TARING = Reason("taring", "taring: leave the skin untouched")
 REST_UNCERTAIN = Reason(
     "rest_uncertain", "the skin was never still while it tared: leave it untouched, then tare"
 )
+CLOCK_UNUSABLE = Reason(
+    "clock_unusable",
+    "the board's clock cannot be used, so nothing says when this was: see tactile status",
+)
 MODEL_PAUSED = Reason(
     "model_paused", "fitted model paused: taxels masked; forces are the taxels' own"
 )

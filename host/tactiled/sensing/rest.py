@@ -206,7 +206,8 @@ class RestField:
         tare = self._tare
         if tare is None or not tare.add(field, healthy, whole, captured):
             return None
-        trouble = None if self._forced and tare.cycles else tare.trouble()
+        averaged = self._forced and tare.cycles and tare.healthy.any()
+        trouble = None if averaged else tare.trouble()
         limit = self._settings.tare_limit_n
         if trouble is None and not (self._first or self._forced) and self._peak > limit:
             trouble = (

@@ -16,7 +16,9 @@ MIN_CYCLES = 8
 """Fewest cycles of a tare: the mean then has a third of one sample's noise, and the spread of the
 samples says what that noise is."""
 MAX_WAIT_RATIO = 10.0
-"""A tare that has not got its cycles after this many times its length is refused."""
+"""A tare that has not got its cycles after this many times its length is refused,"""
+MAX_WAIT_CYCLES = 4 * MIN_CYCLES
+"""but not before so many came, whole or not: a slow board takes longer for them."""
 STILL_SIGMAS = 6.0
 """First and second half may differ by this many standard errors before the skin counts as moving:
 with 240 channels chance alone gives 4."""
@@ -52,6 +54,7 @@ class Tare:
         self._squares = np.zeros(shape)
         self._pivot = np.zeros(shape)  # the first cycle: sums of differences keep their digits
         self._counts = [0, 0]
+        self._offered = 0
         self._healthy = np.ones((shape[0], shape[2]), dtype=bool)
 
     def again(self) -> Tare:
@@ -79,6 +82,7 @@ class Tare:
         if self._start is None:
             self._start = captured
         elapsed = seconds_between(self._start, captured)
+        self._offered += 1
         if whole:
             if not self.cycles:
                 self._pivot = field.copy()
@@ -89,7 +93,8 @@ class Tare:
             self._counts[half] += 1
             self._healthy &= healthy
         enough = elapsed >= self._seconds and min(self._counts) >= MIN_CYCLES // 2
-        return enough or elapsed >= self._seconds * MAX_WAIT_RATIO
+        waited = elapsed >= self._seconds * MAX_WAIT_RATIO and self._offered >= MAX_WAIT_CYCLES
+        return enough or waited
 
     def trouble(self) -> str | None:
         """Why the cycles taken cannot be a rest field; None when they can."""

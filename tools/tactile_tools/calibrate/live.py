@@ -16,13 +16,20 @@ from tactile_bus.messages import MSG, DecodeError, codec, header, stamp_ns
 from tactile_bus.nominal import NOMINAL_MODELS
 from tactile_bus.recorder import Recorder
 from tactile_bus.services import ServiceError, call
-from tactile_bus.streams import BusSample, Tap
+from tactile_bus.streams import BusSample, Tap, list_alive
 from tactile_bus.topics import FIELD, REFERENCE, service_key
-from tactile_tools.calibrate.wizard import Stamps, WizardError
+from tactile_tools.calibrate.wizard import Stamps, TareRefusedError, WizardError
 
 FIRST_FRAME_S = 10.0
-"""s for tactiled to be found on the bus, identify the board and send a first frame."""
-TARE_S = 8.0
+"""s for tactiled to be found on the bus, identify the board and send a first frame; where it is
+there, `SLOW_S` more for a slow board."""
+TARE_S = 120.0
+"""s for a tare of the slowest boards."""
+SLOW_S = 30.0
+"""s that a recording may take longer than asked for, until a slow board has sent enough."""
+LOOK_S = 0.05
+REFUSED = "tare refused"
+"""Beginning of what tactiled says of a tare that it did not take."""
 STATUS_S = 3.0
 
 
@@ -41,7 +48,10 @@ class LiveBoard:
 
     def wait(self) -> None:
         """Until frames come; `WizardError` when none do."""
-        if not self._heard.wait(FIRST_FRAME_S):
+        if self._heard.wait(FIRST_FRAME_S):
+            return
+        there = self._name in list_alive(self._session)
+        if not (there and self._heard.wait(SLOW_S)):
             raise WizardError(
                 f"no frames of board {self._name!r} on the bus in {FIRST_FRAME_S:g} s; start "
                 f"tactiled with --name {self._name}, or give --port"
@@ -74,22 +84,30 @@ class LiveBoard:
         text = saves(calibration).encode()
         self._recorder.attach(f"{self._name}{SUFFIX}", "application/toml", text)
 
-    def tare(self) -> str:
+    def tare(self, force: bool = False) -> str:
         """Tare by tactiled's own service."""
+        key = service_key(self._name, "tare")
         try:
-            report = call(self._session, service_key(self._name, "tare"), timeout=TARE_S)
+            report = call(self._session, key, {"force": force}, timeout=TARE_S)
         except ServiceError as error:
-            raise WizardError(f"{error}; take everything off the skin and begin again") from error
+            kind = TareRefusedError if str(error).startswith(REFUSED) else WizardError
+            raise kind(str(error)) from error
         return f"  {report['message']}"
 
-    def collect(self, seconds: float) -> Stamps:
-        """Frames captured in the next ``seconds`` s."""
+    def collect(self, seconds: float, least: int) -> Stamps:
+        """Frames captured in the next ``seconds`` s, or in longer until they are ``least``."""
+        start = time.monotonic()
         begin = self._wall.wall_ns(monotonic_now())
         time.sleep(seconds)
-        end = self._wall.wall_ns(monotonic_now())
+        while True:
+            end = self._wall.wall_ns(monotonic_now())
+            with self._lock:
+                found = [stamp for stamp in self._stamps if begin <= stamp <= end]
+            if len(found) >= least or time.monotonic() - start > seconds + SLOW_S:
+                break
+            time.sleep(LOOK_S)
         with self._lock:
-            found = [stamp for stamp in self._stamps if begin <= stamp <= end]
-            self._stamps.clear()
+            self._stamps = [stamp for stamp in self._stamps if stamp > end]
         return found
 
     def label(self, stamps: Stamps, force: float) -> None:

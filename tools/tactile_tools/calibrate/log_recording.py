@@ -136,8 +136,9 @@ def _collect(path: Path) -> tuple[dict[str, _Board], dict[str, BoardCalibration]
 def _take_reference(board: _Board, message: Any) -> None:
     force = message.wrench.force
     vector = (float(force.x), float(force.y), float(force.z))
-    if np.isfinite(vector).all():
-        board.reference_ns.append(stamp_ns(message.header.stamp))
+    stamp = stamp_ns(message.header.stamp)
+    if np.isfinite(vector).all() and stamp not in board.reference_ns[-1:]:
+        board.reference_ns.append(stamp)
         board.force.append(vector)
 
 
@@ -146,9 +147,12 @@ def _take_field(board: _Board, message: Any, path: Path) -> None:
     if not np.isfinite(values).all():
         board.masked += 1
         return
+    stamp = stamp_ns(message.header.stamp)
+    if stamp in board.field_ns[-1:]:
+        return  # older logs gave frames that were read together one stamp: no other is known
     if len(board.field_ns) >= MAX_FRAMES:
         raise RecordingError(f"{path}: over {MAX_FRAMES} frames; `tactile log split` it")
-    board.field_ns.append(stamp_ns(message.header.stamp))
+    board.field_ns.append(stamp)
     board.field_ut.append(values)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -45,7 +46,8 @@ def record(options: argparse.Namespace) -> None:
             recorder.close(10.0)
         if recorder.stats.dropped:
             raise ActionError(f"the log is not whole: {recorder.stats.dropped}", REFUSED)
-    print(f"wrote {out}: {presses} presses; next: tactile calibrate fit {out} --out FILE.cal.toml")
+    pressed = "1 press" if presses == 1 else f"{presses} presses"
+    print(f"wrote {out}: {pressed}; next: tactile calibrate fit {out} --out FILE.cal.toml")
 
 
 def _record(options: argparse.Namespace, board: LiveBoard) -> int:
@@ -53,7 +55,8 @@ def _record(options: argparse.Namespace, board: LiveBoard) -> int:
         board.wait()
         board.attach(board.calibration(options.calibration))
         timing = Timing(options.rest, options.hold, options.turn)
-        wizard = Wizard(board, board.label, _ask, print, timing)
+        width = shutil.get_terminal_size().columns
+        wizard = Wizard(board, board.label, _ask, print, timing, width)
         return wizard.run()
     finally:
         board.close()

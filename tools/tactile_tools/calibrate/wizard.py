@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -17,8 +18,18 @@ from tactile_tools.calibrate.csv_pair import NEWTON_PER_GRAM_FORCE
 MAX_FORCE_N = 1000.0
 FORCE = re.compile(r"([0-9]*[.,]?[0-9]+)\s*(n|g|kg|)", re.IGNORECASE)
 NEWTON = {"n": 1.0, "": 1.0, "g": NEWTON_PER_GRAM_FORCE, "kg": 1000 * NEWTON_PER_GRAM_FORCE}
-LEAST_SHARE = 0.2
-"""Share of the frames expected at 10 Hz below which a window has no data worth a label."""
+
+PRESSES = 15
+"""Presses that are asked for: six, one of each force, left an error of 40 % at a seventh."""
+
+UNDO = ("u", "undo")
+FORCE_IT = ("f", "force")
+
+LEAST_FRAMES = 4
+"""Frames below which a window has no data worth a label."""
+
+WIDTH = 80
+"""Columns in which words are kept whole where a terminal does not say how wide it is."""
 
 Stamps = Sequence[int]
 
@@ -27,14 +38,21 @@ class WizardError(Exception):
     """Why the recording cannot go on; the text names the remedy."""
 
 
+class TareRefusedError(WizardError):
+    """The tare was refused; the text says why."""
+
+
 class Source(Protocol):
     """The board being calibrated; every frame of it is recorded, asked for or not."""
 
-    def tare(self) -> str:
-        """Tare; what came of it. `WizardError` when it was refused."""
+    def tare(self, force: bool = False) -> str:
+        """Tare; what came of it. `TareRefusedError` when it was refused, `WizardError` else."""
 
-    def collect(self, seconds: float) -> Stamps:
-        """Wait; the stamps, ns, of the frames that were captured meanwhile."""
+    def collect(self, seconds: float, least: int) -> Stamps:
+        """Wait; the stamps, ns, of the frames that were captured meanwhile.
+
+        For ``least`` frames it waits longer than ``seconds``: a slow board sends few.
+        """
 
 
 Sink = Callable[[Stamps, float], None]
@@ -51,7 +69,10 @@ class Timing:
 
 
 class Wizard:
-    """Asks, waits and labels. ``ask`` returns what was typed, EOFError at the end of input."""
+    """Asks, waits and labels. ``ask`` returns what was typed, EOFError at the end of input.
+
+    ``width``: columns of the terminal, for words to be kept whole.
+    """
 
     def __init__(
         self,
@@ -60,62 +81,150 @@ class Wizard:
         ask: Callable[[str], str],
         say: Callable[[str], None],
         timing: Timing,
+        width: int = WIDTH,
     ) -> None:
         self._source, self._sink, self._timing = source, sink, timing
-        self._ask, self._say = ask, say
+        self._ask_whole, self._say_whole, self._width = ask, say, width
+        self._last: list[tuple[Stamps, float]] = []
+        """Labels of the last press, which may still be undone."""
 
     def run(self) -> int:
         """All steps; the number of presses, at least one, or `WizardError`."""
         self._say(
             "Lay the board down as it will be used. Have known weights at hand, or a force gauge. "
-            "Press in several places and with several forces, the strongest you will meet included."
+            f"{PRESSES} presses are asked for: in several places and with several forces, the "
+            "strongest you will meet included. A press that went wrong can be undone."
         )
         self._ask("Take everything off the skin, then Enter to tare: ")
-        self._say(self._source.tare())
-        self._label(0.0, self._timing.rest, "resting")
-        presses = 0
-        while (force := self._ask_force()) is not None:
-            self._ask(f"Put {force:.3g} N on the skin, hold it steady, then Enter: ")
-            self._label(force, self._timing.hold, "holding")
-            self._ask("Take it off, then Enter: ")
-            self._label(0.0, self._timing.rest, "resting")
-            presses += 1
+        self._tare()
+        self._sink(self._record(self._timing.rest, "resting"), 0.0)
+        presses = self._press_all()
         if not presses:
             raise WizardError("no press was recorded; a calibration needs at least one")
+        self._keep()
         if self._yes(
             "Turn the untouched board every way, so that the earth's field is told from forces? "
             "[y/N] "
         ):
             self._ask("Enter to begin, then turn it slowly: ")
-            self._label(0.0, self._timing.turn, "turning")
+            self._sink(self._record(self._timing.turn, "turning"), 0.0)
         return presses
 
-    def _label(self, force: float, seconds: float, doing: str) -> None:
-        self._say(f"  {doing}, {seconds:g} s ...")
-        stamps = self._source.collect(seconds)
-        if len(stamps) < max(1.0, LEAST_SHARE * 10 * seconds):
-            raise WizardError(
-                f"only {len(stamps)} frames came in {seconds:g} s; see whether tactiled still "
-                "hears the board"
-            )
-        self._sink(stamps, force)
-
-    def _ask_force(self) -> float | None:
-        """Newtons of the next press; None when there is none."""
+    def _tare(self) -> None:
+        """Tare, again or by force where it is refused."""
+        force = False
         while True:
-            text = self._ask("Next press, in N or as a weight (3.2, 200g, 1kg); Enter to end: ")
-            if not text.strip():
+            try:
+                self._say(self._source.tare(force))
+            except TareRefusedError as error:
+                self._say(f"  {error}")
+                answer = self._ask(
+                    "Take everything off the skin and keep it still, then Enter to try again, or f "
+                    "to tare as it is: "
+                )
+                force = answer.strip().lower() in FORCE_IT
+            else:
+                return
+
+    def _press_all(self) -> int:
+        """Presses until the user ends them; how many are kept."""
+        presses, warned = 0, False
+        while True:
+            force = self._ask_force(presses)
+            if force is None and presses and presses < PRESSES and not warned:
+                warned = True
+                self._say(
+                    f"  {presses} of {PRESSES} presses: after few, the force of another press may "
+                    "be wrong by as much as 40 %. Enter again to end all the same."
+                )
+            elif force is None:
+                return presses
+            elif force == 0.0:
+                presses -= self._undo()
+            else:
+                warned = False
+                self._keep()
+                presses += self._press(force)
+
+    def _press(self, force: float) -> int:
+        """One press and the rest after it, kept back until the next: 1."""
+        self._ask(f"Put {force:.3g} N on the skin, hold it steady, then Enter: ")
+        pressed = self._record(self._timing.hold, "holding")
+        self._ask("Take it off, then Enter: ")
+        self._last = [(pressed, force), (self._record(self._timing.rest, "resting"), 0.0)]
+        return 1
+
+    def _keep(self) -> None:
+        """Hand over the labels of the last press."""
+        for stamps, force in self._last:
+            self._sink(stamps, force)
+        self._last = []
+
+    def _undo(self) -> int:
+        """Forget the last press; how many that were, 0 or 1."""
+        if not self._last:
+            self._say("  nothing to undo: only the last press can be, and only once")
+            return 0
+        self._say(f"  the press of {self._last[0][1]:.3g} N is undone")
+        self._last = []
+        return 1
+
+    def _record(self, seconds: float, doing: str) -> Stamps:
+        self._say(f"  {doing}, {seconds:g} s ...")
+        stamps = self._source.collect(seconds, LEAST_FRAMES)
+        if len(stamps) < LEAST_FRAMES:
+            raise WizardError(
+                f"only {len(stamps)} frames came in {seconds:g} s and some more; see whether "
+                "tactiled still hears the board (tactile status)"
+            )
+        return stamps
+
+    def _ask_force(self, presses: int) -> float | None:
+        """Newtons of the next press; 0 to undo the last, None when there is none."""
+        count = f"{presses + 1} of {PRESSES}" if presses < PRESSES else f"{presses + 1}"
+        undo = ", u to undo the last" if self._last else ""
+        end = ", Enter to end" if presses else ""
+        while True:
+            text = self._ask(
+                f"Next press ({count}), in N or as a weight (3.2, 200g, 1kg){undo}{end}: "
+            ).strip()
+            if not text:
                 return None
+            if text.lower() in UNDO:
+                return 0.0
             force = parse_force(text)
             if force is not None:
                 return force
             self._say(
-                f"  {text.strip()!r} is no force; allowed: a number above 0 and up to "
+                f"  {text[:WIDTH]!r} is not a force; allowed: a number above 0 and up to "
                 f"{MAX_FORCE_N:g} N, with N, g or kg after it"
             )
 
     def _yes(self, question: str) -> bool:
         return self._ask(question).strip().lower() in ("y", "yes")
+
+    def _ask(self, question: str) -> str:
+        # The answer needs room behind the question.
+        return self._ask_whole(wrap(question, self._width - 8) + " ")
+
+    def _say(self, text: str) -> None:
+        self._say_whole(wrap(text, self._width))
+
+
+def wrap(text: str, width: int) -> str:
+    """``text`` in lines of at most ``width`` columns, broken between words only.
+
+    Further lines are indented as the first is.
+    """
+    indent = text[: len(text) - len(text.lstrip())]
+    return textwrap.fill(
+        text.strip(),
+        max(width, 20),
+        initial_indent=indent,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def parse_force(text: str) -> float | None:
