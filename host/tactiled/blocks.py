@@ -35,6 +35,7 @@ class TaxelHealth(IntFlag):
     FROZEN = 8
     OUT_OF_RANGE = 16
     MISSING = 32
+    IMPLAUSIBLE = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,6 +45,7 @@ class SampleBlock:
     ``field_ut``: (n, 3) float µT in chip axes. ``temperature_c``: (1,) or (n,) °C.
     ``status``: (n,) uint8 of `TaxelHealth`. ``captured``: start of the conversion, mapped from
     board ticks (or from arrivals where the board has no clock); ``uncertainty`` in s.
+    ``lsb_ut``: µT a count of x and y, and of z, where the board tells.
     """
 
     array: int
@@ -54,6 +56,7 @@ class SampleBlock:
     field_ut: Float
     temperature_c: Float
     status: NDArray[np.uint8]
+    lsb_ut: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,7 +139,8 @@ class Cycle:
     in taxel axes after rest field and temperature, before compensation; NaN likewise.
     ``normal_bound``: (N,) N that hold the true normal force in 95 % of cycles; NaN likewise.
     ``health``: (N,) uint8 of `TaxelHealth`. ``features_due``: by the feature
-    rate, these features are to be sent; they are computed in every cycle.
+    rate, these features are to be sent; they are computed in every cycle. ``fault``: (N,) uint8 of
+    `readings.Fault`, what exactly is wrong with each taxel.
     """
 
     sequence: int
@@ -152,3 +156,4 @@ class Cycle:
     features: Features
     calibrated: bool
     features_due: bool = True
+    fault: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))

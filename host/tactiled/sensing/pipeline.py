@@ -19,6 +19,7 @@ from tactiled.sensing.layout import Layout
 from tactiled.sensing.methods import make_compensator
 from tactiled.sensing.net_stage import NetStage
 from tactiled.sensing.pipeline_settings import PipelineSettings
+from tactiled.sensing.readings import Fault
 from tactiled.sensing.rest import RestField
 from tactiled.sensing.tare import TareReport
 
@@ -43,7 +44,12 @@ class BoardPipeline:
         self._layout = layout = Layout(geometry)
         self._model = ForceModel(calibration, layout)
         self._grouper = Grouper(tuple(a.taxels for a in geometry.arrays))
-        self._monitor = HealthMonitor(layout, settings.frozen_after_s, settings.range_limit_ut)
+        self._monitor = HealthMonitor(
+            layout,
+            settings.frozen_after_s,
+            settings.range_limit_ut,
+            None if calibration.nominal else self._model.chip_rest(),
+        )
         self._compensator: Compensator = make_compensator(settings, layout, self._model)
         self._features = FeatureExtractor(geometry, settings)
         self._net = NetStage(calibration.nets, layout)
@@ -127,13 +133,18 @@ class BoardPipeline:
         blocks = [block for block in group.blocks if block is not None]
         captured = min(block.captured for block in blocks)
         health = self._monitor.update(raw, temperature, status, present, captured)
+        fault = self._monitor.fault
         rest = self._rest
+        monitor = self._monitor
+        if monitor.revived is not monitor.restored:  # both are one and the same mask, all False
+            rest.unrested = (rest.unrested | monitor.revived) & ~monitor.restored
         known = rest.known  # before: a first tare takes effect from the next cycle on
         field = model.taxel_field(raw, temperature)
         if rest.taring:
             self._advance_tare(field, health, bool(present.all()), captured, group.sequence)
         if known and np.count_nonzero(rest.unrested):
             health[rest.unrested] |= np.uint8(TaxelHealth.OUT_OF_RANGE)
+            fault = np.where(rest.unrested & (fault == 0), np.uint8(Fault.UNRESTED), fault)
         masked = int(np.count_nonzero(health))
         sick = masked > 0
         healthy = layout.real
@@ -180,6 +191,7 @@ class BoardPipeline:
             health=self._health,
             ambient=estimate.ambient,
             features=features,
+            fault=layout.flat(fault),
             calibrated=not self.calibration.nominal,
             features_due=self._due(captured),
         )
@@ -199,6 +211,8 @@ class BoardPipeline:
             raw[a, :, :n] = block.field_ut.T
             temperature[a, :n] = block.temperature_c
             status[a, :n] = block.status
+            if block.lsb_ut is not None:
+                self._monitor.told(a, block.lsb_ut)
         return raw, temperature, status, present
 
     def _reasons(
@@ -260,6 +274,7 @@ class BoardPipeline:
         if shift is None or report is None:
             return
         field -= shift
+        self._monitor.set_rest(self._model.chip_rest())
         self._compensator.reset()
         self._features.reset()
         self._net.reset()
@@ -269,6 +284,7 @@ class BoardPipeline:
     def _apply_noise(self, noise: Float) -> None:
         """Noise of one sample, (3,) µT in chip axes, sets the thresholds of contact and fit."""
         self._noise = np.maximum(noise, MIN_NOISE_UT)
+        self._monitor.set_noise(self._noise)
         self._features.set_noise(self._layout.flat(self._model.normal_sigma(self._noise)))
         self._compensator.set_noise(self._noise)
 
