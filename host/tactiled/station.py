@@ -15,6 +15,7 @@ from tactile_bus.instant import NS_PER_S, Instant, seconds_between
 from tactile_bus.recorder import Recorder
 from tactile_bus.topics import AMBIENT, CONTACTS, FEATURES, FIELD, FORCES, GEOMETRY
 from tactiled.blocks import Cycle, Features, SampleBlock
+from tactiled.chip_watch import ChipWatch
 from tactiled.links.events import (
     Answered,
     BoardLog,
@@ -68,6 +69,8 @@ class Station:
         """Cycles whose forces were published."""
         self.counters: Counter[str] = Counter()
         self.board_status: dict[str, int] = {}
+        self.chips: ChipWatch | None = None
+        """Which of the board's chips are masked; None before it was identified."""
         self.summary: dict[str, Any] = {}
         """`diagnostics.summary` of the last second; replaced as a whole, for other threads."""
         self._outlet = outlet
@@ -131,6 +134,7 @@ class Station:
             self.counters.update({k: v for k, v in asdict(before).items() if k not in ("cycles",)})
         self._maker = MessageMaker(calibration, self._outlet.wall)
         self._picture = SkinPicture(calibration.geometry)
+        self.chips = ChipWatch(calibration.geometry)
         recorder = self.recorder
         if recorder is not None:
             text = saves(calibration).encode()
@@ -243,12 +247,15 @@ class Station:
                 self._send(cycle)
 
     def each_second(self, now: Instant) -> None:
-        """Work out rate and latency of the last second."""
+        """Work out rate and latency of the last second; say which chips are masked."""
         since, count = self._rate_from
         elapsed = seconds_between(since, now)
         if elapsed > 0:
             self.rate = (self.sent - count) / elapsed
         self._rate_from = (now, self.sent)
+        if self.chips is not None:
+            for level, text in self.chips.each_second(now):
+                self._say(level, text)
         if self._latencies:
             ordered = sorted(self._latencies)
             last = len(ordered) - 1
@@ -301,6 +308,8 @@ class Station:
         if maker is None:
             return
         stamp_ns = outlet.wall.wall_ns(cycle.captured)
+        if self.chips is not None:
+            self.chips.observe(cycle.fault, cycle.captured)
         if cycle.features_due:
             outlet.send(FEATURES, name, maker.features(cycle), stamp_ns)
         self._latencies.append((outlet.now() - cycle.received) / NS_PER_S)

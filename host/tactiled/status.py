@@ -14,6 +14,7 @@ from tactile_bus.geometry import Side
 from tactile_bus.instant import monotonic_now, seconds_between
 from tactile_bus.recorder import Recorder
 from tactile_bus.terminal import LiveLines, drops_text
+from tactiled.chip_watch import MOST_NAMED, Masked
 from tactiled.port import Port
 from tactiled.station import Station
 
@@ -75,6 +76,7 @@ def describe(station: Station) -> dict[str, str]:
         else f"{latency.p50 * 1e3:.1f}/{latency.p99 * 1e3:.1f} ms",
         "field": "",
         "force": "",
+        "masked": "" if station.chips is None else masked_text(station.chips.masked),
         "because": "",
     }
     if cycle is not None and fresh:
@@ -87,6 +89,18 @@ def describe(station: Station) -> dict[str, str]:
         cells["force"] = force_text(station)
         cells["because"] = ", ".join(reason.text for reason in cycle.features.reasons)
     return cells
+
+
+def masked_text(chips: list[Masked]) -> str:
+    """Chips that are masked, by array: ``skin 2 4``."""
+    arrays: dict[str, list[int]] = {}
+    for one in chips:
+        arrays.setdefault(one.array, []).append(one.chip)
+    named = []
+    for array, which in arrays.items():
+        few = len(which) <= MOST_NAMED
+        named.append(f"{array} {' '.join(map(str, which)) if few else f'{len(which)} chips'}")
+    return ", ".join(named)
 
 
 def force_text(station: Station) -> str:

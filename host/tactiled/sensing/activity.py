@@ -60,6 +60,11 @@ class Activity:
             self._start = captured
         return self._cycles >= BLOCK_CYCLES and captured - self._start >= BLOCK_S * NS_PER_S
 
+    def forgive(self, moved: Bool) -> None:
+        """Chips of (A, n) ``moved`` by more than the last bits: they are alive."""
+        self.dead &= ~moved
+        self.stuck &= ~moved
+
     def judge(self, steps: Float) -> None:
         """End a block: find who is ``dead`` or has an axis ``stuck``.
 

@@ -210,6 +210,8 @@ class HealthMonitor:
         frozen = self._unchanging(unchanged, present, whole, captured)
         if activity.add(raw, captured):
             self._end_block(raw, fault)
+        if self._mute:
+            activity.forgive(moved > 2 * float(self._near.max()))
         if frozen is not None or self._mute:
             fault = fault.copy()
             if frozen is not None:

@@ -16,6 +16,7 @@ from tactiled.sensing.force_model import ForceModel
 from tactiled.sensing.grouping import CycleCounters, Group, Grouper, gather_temperature
 from tactiled.sensing.health import HealthMonitor
 from tactiled.sensing.layout import Layout
+from tactiled.sensing.masking import Masking
 from tactiled.sensing.methods import make_compensator
 from tactiled.sensing.net_stage import NetStage
 from tactiled.sensing.pipeline_settings import PipelineSettings
@@ -52,6 +53,7 @@ class BoardPipeline:
         )
         self._compensator: Compensator = make_compensator(settings, layout, self._model)
         self._features = FeatureExtractor(geometry, settings)
+        self._masking = Masking(geometry)
         self._net = NetStage(calibration.nets, layout)
         self._names = tuple(a.name for a in geometry.arrays)
         self._tip_arrays = [i for i, a in enumerate(geometry.arrays) if a.side.name == "TIP"]
@@ -113,6 +115,7 @@ class BoardPipeline:
         self._monitor.reset()
         self._compensator.reset()
         self._features.reset()
+        self._masking.reset()
         self._net.pause()
         self._theta = np.zeros_like(self._theta)
         self._last_captured = None
@@ -170,8 +173,13 @@ class BoardPipeline:
         force = layout.flat_vectors(forces)
         self._health = layout.flat(health)
         reasons, valid = self._reasons(estimate, healthy, present, known)
+        if sick and known:
+            normal = np.abs(force[:, 2])  # NaN where masked: not felt
+            more, enough = self._masking.judge(layout.flat(fault), normal > self._features.least_n)
+            reasons, valid = (*reasons, *more), valid and enough
         tip_usable = valid or (known and self._tip_usable(estimate, present))
         features = self._features.update(force, masked, reasons, valid, tip_usable, captured)
+        self._masking.touched = self._features.contact
         if rest.taring:
             rest.note_peak(features.peak_force)
         if self.settings.rest_tracking_s is not None and valid and not reasons:
@@ -277,6 +285,7 @@ class BoardPipeline:
         self._monitor.set_rest(self._model.chip_rest())
         self._compensator.reset()
         self._features.reset()
+        self._masking.reset()
         self._net.reset()
         self._theta = np.zeros_like(self._theta)
         self._apply_noise(report.noise_ut)
