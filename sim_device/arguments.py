@@ -194,10 +194,10 @@ def _add_replay(commands: Commands) -> argparse.ArgumentParser:
     replay = commands.add_parser(
         "replay",
         help="send a recording of a real board again",
-        description="Send a recorded CSV (plain or .gz: time in s, then x, y, z in µT for each of "
-        "1 to 20 magnetometers) as the frames of an AnySkin board, at the recorded times. It "
-        "begins when a host reads, so that nothing is lost. Recordings hold no temperatures: 25 °C "
-        "is sent for all.",
+        description="Send a recorded CSV (plain or .gz: time in s, then x, y, z in µT for each of\n"
+        "1 to 20 magnetometers) as the frames of an AnySkin board, at the recorded times. It\n"
+        "begins when a host reads, so that nothing is lost. Recordings hold no temperatures:\n"
+        "25 °C is sent for all.",
         epilog=FAULTS_HELP,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -217,7 +217,8 @@ def _add_replay(commands: Commands) -> argparse.ArgumentParser:
     replay.add_argument("--loop", action="store_true", help="begin again at the end (default: end)")
     replay.add_argument(
         "--faults", default="", metavar="SPEC",
-        help="faults to inject, at times of the recording; its chips are skin:0 and so on, see below",
+        help="faults to inject, at times of the recording, see below; its chips are skin:0 and so "
+        "on",
     )  # fmt: skip
     _add_duration(replay)
     return replay

@@ -155,8 +155,8 @@ def _replay(arguments: argparse.Namespace) -> int:
             BAD_ARGUMENT, f"{arguments.recording}: cannot be read ({error.strerror})"
         ) from error
     try:
-        plan = FaultPlan.parse(arguments.faults)
-        board = ReplayBoard(recording, arguments.speed, arguments.loop, plan)
+        faults = FaultPlan.parse(arguments.faults)
+        board = ReplayBoard(recording, arguments.speed, arguments.loop, faults)
     except ValueError as error:
         raise _Refusal(BAD_ARGUMENT, error) from error
     seconds = float(recording.seconds[-1]) / arguments.speed
