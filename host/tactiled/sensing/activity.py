@@ -23,6 +23,8 @@ LEARNT_BLOCKS = 4
 DEAD_RATIO = 12.0
 """A span this many times smaller than a live one is dead. Noise alone varies the span of sixteen
 samples by a factor of two."""
+MUTE_RATIO = 16.0
+"""The same where the other chips have gone just as still: a motion that ends does that too."""
 STEPS = 6.0
 """Counts that a live axis spans at least, if one that repeats a value is to be called stuck: noise
 below half a count makes axes of coarse chips repeat for seconds."""
@@ -82,7 +84,7 @@ class Activity:
         mute = (span * DEAD_RATIO <= own).all(axis=1)
         beside = (span * DEAD_RATIO <= usual).all(axis=1) & (usual > 0).all(axis=1)
         known = np.isfinite(own).all(axis=1)
-        bit = (span <= 1.01 * steps).all(axis=1) | (span * 2 * DEAD_RATIO <= own).all(axis=1)
+        bit = (span <= 1.01 * steps).all(axis=1) | (span * MUTE_RATIO <= own).all(axis=1)
         still = (span == 0).all(axis=1)  # that is frozen, which the monitor times by itself
         dead = np.where(known, mute & (beside | bit), beside) & self._real & ~still
         axis = (span == 0) & np.isfinite(own) & (own >= STEPS * steps)

@@ -18,9 +18,6 @@ NOISY_FRAMES = 32
 TWIN_CYCLES = 4
 """Cycles with new readings in which two chips agree to the bit before they count as one."""
 
-_WEIGHTS = np.array([1.0, np.pi, np.e])
-"""Makes one number of three components, the same only for the same components."""
-
 
 class Copies:
     """Frames of one array; knows one that is the very copy of an earlier one."""
@@ -93,7 +90,8 @@ class Twins:
         ``near`` (3, 1) µT is found at once, others after `TWIN_CYCLES` readings; those that are
         ``unchanged`` (A, n) do not count as readings.
         """
-        key = _WEIGHTS @ raw
+        # not by a matrix product: its sums may be rounded differently from taxel to taxel
+        key = raw[:, 0] + raw[:, 1] * np.pi + raw[:, 2] * np.e
         flat: list[float] = key.ravel().tolist() if self._whole else key[self._real].tolist()
         if len(set(flat)) == len(flat):
             self._run = None

@@ -29,6 +29,15 @@ UInt8 = NDArray[np.uint8]
 FROZEN_CYCLES = 3
 """Unchanged readings in a row before a taxel can be frozen, so that at low rates two equal
 readings by chance do not condemn it (three 12-bit noisy components repeat once in 10^3)."""
+FROZEN_BITS = 30.0
+"""Bits that a run of repeated readings must be improbable by, as often as the board's chips repeat
+themselves otherwise: coarse and quiet ones do so one time in three."""
+MOST_REPEATED = 0.5
+"""Share of repeated readings taken at most."""
+LONG_RUN = 8
+"""Repetitions of a run that count at most: a chip that was frozen says nothing of noise."""
+REMEMBERED = 1e5
+"""Readings after which earlier ones count half."""
 NEAR_SIGMAS = 7.0
 """A reading within so many sigma of the one before may be noise."""
 NOISE_UT = (4.4, 4.4, 6.7)
@@ -46,7 +55,17 @@ COPY_BITS = 30.0
 """Least information in a frame, bits, for a copy of one among `copies.KEPT` to be no chance."""
 
 _WELL = np.array(
-    [Fault.NONE, Fault.MISSING, Fault.SATURATED, Fault.RAIL, Fault.COPY, Fault.STALE], np.uint8
+    [
+        Fault.NONE,
+        Fault.MISSING,
+        Fault.SATURATED,
+        Fault.STALE,
+        Fault.RAIL,
+        Fault.COPY,
+        Fault.TEMPERATURE_JUMP,
+        Fault.TEMPERATURE_STUCK,
+    ],
+    np.uint8,
 )
 """Faults that say nothing against the chip: it comes back as the same."""
 
@@ -73,6 +92,7 @@ class HealthMonitor:
         self._frozen_after = None if frozen_after_s is None else round(frozen_after_s * NS_PER_S)
         self._limit = range_limit_ut
         self._real = layout.real
+        self._taxels = layout.taxels
         self._padded = not layout.real.all()
         self._rest = rest_ut
         self.scales = Scales(layout.real)
@@ -100,6 +120,8 @@ class HealthMonitor:
         self._since = np.zeros(shape, np.int64)
         self._repeats = np.zeros(shape, np.int64)
         self._repeating = True
+        self._needed = float(FROZEN_CYCLES)
+        self._readings = self._repeated = 0.0
         self._gone = np.zeros(shape, bool)
         self._gone_since = np.zeros(shape, np.int64)
         self._mute = False
@@ -266,21 +288,24 @@ class HealthMonitor:
         self, unchanged: Bool, present: Bool, whole: bool, captured: Instant
     ) -> Bool | None:
         """(A, n) taxels that have repeated one reading for too long; None: none has."""
+        self._readings += self._taxels
         if whole and not np.count_nonzero(unchanged):
             self._since.fill(captured)
             if self._repeating:
+                self._repeated += float(np.minimum(self._repeats, LONG_RUN).sum())
                 self._repeats.fill(0)
                 self._repeating = False
             return None
         self._repeating = True
         self._repeats[present] += 1
         changed = ~unchanged & present[:, None]  # an array that did not come did neither
+        self._repeated += float(np.minimum(self._repeats[changed], LONG_RUN).sum())
         self._repeats[changed] = 0
         self._since[changed] = captured
         if self._frozen_after is None:
             return None
         frozen = (captured - self._since) >= self._frozen_after
-        frozen &= self._repeats >= FROZEN_CYCLES
+        frozen &= self._repeats >= self._needed
         frozen &= present[:, None]
         return frozen if np.count_nonzero(frozen) else None
 
@@ -323,7 +348,7 @@ class HealthMonitor:
         _mark(fault, same & (far | (lasts & (np.abs(z) < TINY_UT))), Fault.ONES)
 
     def _mark_temperatures(self, fault: UInt8, temperature_c: Float, captured: Instant) -> None:
-        impossible, jumped = self._thermometers.check(temperature_c, captured)
+        impossible, jumped = self._thermometers.check(temperature_c, fault == 0, captured)
         if np.count_nonzero(impossible):
             _mark(fault, impossible, Fault.TEMPERATURE)
         if np.count_nonzero(jumped):
@@ -355,8 +380,16 @@ class HealthMonitor:
         self._mute = bool(silent) or self._thermometers.stuck is not None
         self.scales.recheck(raw, self._real & (fault == 0))
         spans = np.where(np.isfinite(activity.least), activity.least, 0.0)
-        bits = np.log2(1.0 + spans / np.where(np.isnan(steps), np.inf, steps))
-        self._rich = np.where(self._real[:, None], bits, 0.0).sum(axis=(1, 2)) >= COPY_BITS
+        bits = np.log2(1.0 + spans / np.where(np.isnan(steps), np.inf, steps)).sum(axis=1)
+        self._rich = np.where(self._real, bits, 0.0).sum(axis=1) >= COPY_BITS
+        share = self._repeated / max(self._readings, 1.0)
+        self._needed = float(FROZEN_CYCLES)
+        if share > 0:
+            enough = FROZEN_BITS / -np.log2(min(share, MOST_REPEATED))
+            self._needed = max(self._needed, float(enough))
+        if self._readings > REMEMBERED:
+            self._readings /= 2
+            self._repeated /= 2
 
     def _rescale(self, array: int) -> None:
         self.rescaled[array] = True

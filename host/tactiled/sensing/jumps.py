@@ -109,7 +109,8 @@ class Jumps:
         if self._lonely is not self._none:
             # a chip that is not believed yet goes on from where it was last, or goes back
             step = raw - np.where(np.isnan(last), trusted, last)
-            nearer = (self._lonely > 0) & (np.abs(step).max(1) < np.abs(away).max(1))
+            nearer = (self._lonely > 0) & ~self._jumping
+            nearer &= np.abs(step).max(axis=1) < np.abs(away).max(axis=1)
             base = np.where(nearer[:, None], step, away)
         large = (np.abs(base) > self._scales.jump) & open_[:, None]
         jumped = wrapped = self.never

@@ -42,16 +42,26 @@ class Masking:
     def reset(self) -> None:
         """A tare or a new beginning: nothing is in contact."""
         taxels = self._slices[-1].stop
+        self._sick = False
         self._masked = np.zeros(taxels, bool)
         self._hidden = np.zeros(taxels, bool)
         self.touched = np.zeros(taxels, bool)
         """(N,) taxels in contact in the last cycle; for the owner to set."""
+
+    def well(self, touched: Bool) -> None:
+        """No taxel was masked in a cycle in which (N,) taxels were in contact."""
+        self.touched = touched
+        if self._sick:
+            self._sick = False
+            self._masked = np.zeros_like(self._masked)
+            self._hidden = self._masked
 
     def judge(self, fault: UInt8, felt: Bool) -> tuple[list[Reason], bool]:
         """Reasons for which the forces of one cycle are incomplete, and whether too much so.
 
         ``fault``: (N,) of `Fault`. ``felt``: (N,) healthy taxels that something presses or pulls.
         """
+        self._sick = True
         masked = fault != 0
         self._hidden = masked & (self._hidden | (self.touched & ~self._masked))
         self._masked = masked

@@ -179,7 +179,10 @@ class BoardPipeline:
             reasons, valid = (*reasons, *more), valid and enough
         tip_usable = valid or (known and self._tip_usable(estimate, present))
         features = self._features.update(force, masked, reasons, valid, tip_usable, captured)
-        self._masking.touched = self._features.contact
+        if sick:
+            self._masking.touched = self._features.contact
+        else:
+            self._masking.well(self._features.contact)
         if rest.taring:
             rest.note_peak(features.peak_force)
         if self.settings.rest_tracking_s is not None and valid and not reasons:

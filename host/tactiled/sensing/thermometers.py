@@ -54,17 +54,21 @@ class Thermometers:
         """Whether (A, n) °C need no closer look: near those of the cycle before."""
         return float(np.abs(temperature_c - self.last).max()) < STEP_C
 
-    def check(self, temperature_c: Float, captured: Instant) -> tuple[Bool, Bool]:
-        """(A, n) temperatures that are impossible, and that jumped; the former are replaced."""
+    def check(self, temperature_c: Float, read: Bool, captured: Instant) -> tuple[Bool, Bool]:
+        """(A, n) temperatures that are impossible, and that jumped; the former are replaced.
+
+        ``read``: (A, n) chips that were read; what others show is not kept.
+        """
         impossible: Bool = ~(np.abs(temperature_c - _MIDDLE_C) <= _HALF_RANGE_C)
         if np.count_nonzero(impossible):
             np.copyto(temperature_c, np.nan_to_num(self._good, nan=ROOM_C), where=impossible)
-        jumped: Bool = np.abs(temperature_c - self._good) > STEP_C
+        # a buffer that no reading has ever filled shows naught
+        jumped: Bool = (np.abs(temperature_c - self._good) > STEP_C) & (self._good != 0.0)
         if np.count_nonzero(jumped):
             on = jumped & (np.abs(temperature_c - self.last) <= STEP_C)
             self._since[jumped & ~on] = captured
             jumped = jumped & ~(on & (captured - self._since >= SETTLED_S * NS_PER_S))
-        np.copyto(self._good, temperature_c, where=~(impossible | jumped))
+        np.copyto(self._good, temperature_c, where=read & ~(impossible | jumped))
         self.uneasy = bool(np.count_nonzero(jumped))
         return impossible, jumped
 
