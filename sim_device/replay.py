@@ -241,11 +241,14 @@ class ReplayBoard:
     def _spoilt(
         self, field: NDArray[np.float32], seconds: float
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Field and temperatures as broken chips give them."""
+        """Field and temperatures as broken chips give them.
+
+        All are made from counts, so that what is sent twice is the same to the bit.
+        """
         counts = np.clip(np.rint(field / self._lsb), -COUNT_MAX - 1, COUNT_MAX).astype(np.int16)
         reading = Reading(counts, self._status, self._temperature.astype(np.float64))
         spoilt = self._broken.spoil(reading, seconds)
-        out = np.where(spoilt.counts == counts, field, spoilt.counts * self._lsb)
+        out = spoilt.counts * self._lsb
         failed = np.flatnonzero(spoilt.status & TaxelStatus.READ_FAILED)
         temperature = spoilt.temperature_c.copy()
         temperature[failed] = temperature_of_raw(np.full(len(failed), 65535.0))

@@ -307,6 +307,17 @@ def test_temperatures_out_of_reason_mask_the_chip() -> None:
     assert cycles[-1].fault.tolist() == [0, 0, 0, 0, Fault.TEMPERATURE_STUCK]
 
 
+def test_a_board_that_warms_up_is_never_masked() -> None:
+    def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
+        temperature += min(30.0, 0.04 * k)
+        if k == 900:
+            counts[0] = 0
+
+    found = [cycle.fault.tolist() for cycle in Five(spoil).run(1000)]
+    assert found[900] == [Fault.ZEROS, 0, 0, 0, 0]
+    assert not any(any(faults) for faults in found[:900] + found[901:])
+
+
 def test_a_temperature_that_is_no_longer_read_does_not_mask_for_good() -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
         if k >= 200:

@@ -226,6 +226,7 @@ class HealthMonitor:
             self._trusted = np.where((fault == 0)[:, None], raw, self._trusted)
         else:
             self._trusted = raw
+            self._thermometers.accept(temperature_c)
         self._last = raw
         self._captured = captured
         self._thermometers.last = temperature_c

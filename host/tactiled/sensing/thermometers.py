@@ -54,6 +54,10 @@ class Thermometers:
         """Whether (A, n) °C need no closer look: near those of the cycle before."""
         return float(np.abs(temperature_c - self.last).max()) < STEP_C
 
+    def accept(self, temperature_c: Float) -> None:
+        """Take (A, n) °C that need no closer look."""
+        self._good = temperature_c
+
     def check(self, temperature_c: Float, read: Bool, captured: Instant) -> tuple[Bool, Bool]:
         """(A, n) temperatures that are impossible, and that jumped; the former are replaced.
 
@@ -68,14 +72,14 @@ class Thermometers:
             on = jumped & (np.abs(temperature_c - self.last) <= STEP_C)
             self._since[jumped & ~on] = captured
             jumped = jumped & ~(on & (captured - self._since >= SETTLED_S * NS_PER_S))
-        np.copyto(self._good, temperature_c, where=read & ~(impossible | jumped))
+        self._good = np.where(read & ~(impossible | jumped), temperature_c, self._good)
         self.uneasy = bool(np.count_nonzero(jumped))
         return impossible, jumped
 
     def judge(self, alive: Bool) -> None:
         """Find those that stand still while their array goes on; ``alive``: chips with noise."""
         self.stuck = None
-        now = self.last
+        now = self._good
         if self._real.shape[1] < FEWEST:
             return
         middle = np.median(now, axis=1, keepdims=True)
