@@ -74,13 +74,3 @@ def test_start_up_waits_for_no_slow_library(module: str) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
-
-
-def test_every_file_is_of_a_readable_length() -> None:
-    long = {
-        str(path.relative_to(ROOT)): lines
-        for folder in (*ROOMS.values(), ROOT / "tests")
-        for path in folder.rglob("*.py")
-        if (lines := len(path.read_text(encoding="utf-8").splitlines())) > 400
-    }
-    assert not long

@@ -89,8 +89,8 @@ def test_a_simulated_board_untouched(faults, chips, codes) -> None:
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("faults", "chips", "codes"), PLAYED, ids=[p[0] for p in PLAYED])
 def test_a_recorded_board_under_a_press(faults, chips, codes) -> None:
-    if faults.startswith(("dither", "inf=skin:*")):
-        pytest.skip("a count of this recording is as large as its noise")
+    if faults.startswith("dither"):
+        pytest.skip("a count of this recording is too near its noise")
     recording = load(RECORDINGS / "shear_force_20250416_200533" / "sensor.csv.gz")
     names = chips if chips != [0, 1, 2, 3, 4] else list(range(10))
     board = ReplayBoard(recording, plan=FaultPlan.parse("seed=3," + faults))
