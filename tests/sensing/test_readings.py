@@ -131,14 +131,32 @@ def test_a_chip_that_never_answers_is_named_from_the_start(count) -> None:
     assert last.features.codes == ("chip_masked:skin",)
 
 
-def test_a_chip_that_comes_alive_is_told_to_be_back() -> None:
+def test_a_chip_that_comes_alive_is_told_and_taken_in() -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
         if k < 300:
             counts[2], temperature[2] = 0, 0.0
 
     board = Five(spoil)
-    list(board.run(400))
+    cycles = list(board.run(600, ramp(2, 800.0, 450, 50)))
     assert board.revived == [(300, 2)]
+    assert cycles[310].fault[2] == Fault.UNRESTED
+    assert not any(cycle.fault.any() for cycle in cycles[400:])  # its rest has been taken
+    assert cycles[440].features.taxels_in_contact == 0
+    assert cycles[-1].features.peak_force == pytest.approx(800 / UT_PER_N, rel=0.1)
+
+
+def test_a_chip_that_comes_alive_under_a_press_waits_for_its_end() -> None:
+    def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
+        if k < 300:
+            counts[2], temperature[2] = 0, 0.0
+
+    board = Five(spoil)
+    press = np.array([0.3, 0.0, 1.0, 0.0, 0.0])[:, None] * [0.0, 0.0, 800.0]
+    cycles = list(board.run(700, lambda k: press * (200 <= k < 500)))
+    assert all(cycle.fault[2] for cycle in cycles[300:500])
+    assert not any(cycle.features.valid for cycle in cycles[210:500])
+    assert cycles[-1].fault[2] == 0
+    assert cycles[-1].features.taxels_in_contact == 0
 
 
 @pytest.mark.parametrize(("rest_z", "by"), [(7000.0, 2000.0), (-7000.0, -1500.0), (7500.0, 3500.0)])
@@ -216,7 +234,8 @@ def test_a_level_that_stays_is_taken_but_not_its_rest() -> None:
     cycles = list(board.run(400))
     assert board.revived
     assert all(no_force(cycle) for cycle in cycles)
-    assert cycles[-1].fault[1] == Fault.UNRESTED
+    assert cycles[260].fault[1] == Fault.UNRESTED
+    assert not cycles[-1].fault.any()  # another rest, taken while still
 
 
 def test_two_chips_with_the_same_bits_are_both_masked() -> None:

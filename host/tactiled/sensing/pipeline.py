@@ -15,6 +15,7 @@ from tactiled.sensing.features import FeatureExtractor
 from tactiled.sensing.force_model import ForceModel
 from tactiled.sensing.grouping import CycleCounters, Group, Grouper, gather_temperature
 from tactiled.sensing.health import HealthMonitor
+from tactiled.sensing.late_rest import LateRest
 from tactiled.sensing.layout import Layout
 from tactiled.sensing.masking import Masking
 from tactiled.sensing.methods import make_compensator
@@ -54,6 +55,7 @@ class BoardPipeline:
         self._compensator: Compensator = make_compensator(settings, layout, self._model)
         self._features = FeatureExtractor(geometry, settings)
         self._masking = Masking(geometry)
+        self._late = LateRest(settings.tare_s)
         self._net = NetStage(calibration.nets, layout)
         self._names = tuple(a.name for a in geometry.arrays)
         self._tip_arrays = [i for i, a in enumerate(geometry.arrays) if a.side.name == "TIP"]
@@ -148,6 +150,10 @@ class BoardPipeline:
         if known and np.count_nonzero(rest.unrested):
             health[rest.unrested] |= np.uint8(TaxelHealth.OUT_OF_RANGE)
             fault = np.where(rest.unrested & (fault == 0), np.uint8(Fault.UNRESTED), fault)
+        late = None
+        if known and np.count_nonzero(rest.unrested) and not rest.taring:
+            late = rest.unrested & (self._monitor.fault == 0)
+            late_field = field - model.plane_field(self._theta)
         masked = int(np.count_nonzero(health))
         sick = masked > 0
         healthy = layout.real
@@ -179,6 +185,8 @@ class BoardPipeline:
             reasons, valid = (*reasons, *more), valid and enough
         tip_usable = valid or (known and self._tip_usable(estimate, present))
         features = self._features.update(force, masked, reasons, valid, tip_usable, captured)
+        if late is not None:
+            self._rest_late(late_field, late, features.taxels_in_contact == 0, captured)
         if sick:
             self._masking.touched = self._features.contact
         else:
@@ -292,6 +300,17 @@ class BoardPipeline:
         self._net.reset()
         self._theta = np.zeros_like(self._theta)
         self._apply_noise(report.noise_ut)
+
+    def _rest_late(self, field: Float, late: Bool, untouched: bool, captured: Instant) -> None:
+        """Let chips that came late have a rest field once nothing touches the skin."""
+        if not (untouched and late.any()):
+            self._late.forget()
+            return
+        shift = self._late.advance(field, late, self._noise, captured)
+        if shift is not None:
+            self._model.rest += shift
+            self._rest.unrested = self._rest.unrested & ~late
+            self._monitor.set_rest(self._model.chip_rest())
 
     def _apply_noise(self, noise: Float) -> None:
         """Noise of one sample, (3,) µT in chip axes, sets the thresholds of contact and fit."""
