@@ -22,6 +22,7 @@ MOST_NAMED = 6
 
 _UNTOLD = (Fault.NONE, Fault.MISSING)
 """Of an array that is missing others tell."""
+_TOLD = np.array([fault not in _UNTOLD for fault in Fault])
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +69,7 @@ class ChipWatch:
         self._cycles += 1
         if not fault.any():
             return
-        bad = ~np.isin(fault, np.array(_UNTOLD, np.uint8))
+        bad = _TOLD[fault]
         new = bad & ~self._open
         self._since[new] = captured
         self._open |= new

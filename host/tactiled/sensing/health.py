@@ -54,20 +54,18 @@ REVIVED_S = 1.0
 COPY_BITS = 30.0
 """Least information in a frame, bits, for a copy of one among `copies.KEPT` to be no chance."""
 
-_WELL = np.array(
-    [
-        Fault.NONE,
-        Fault.MISSING,
-        Fault.SATURATED,
-        Fault.STALE,
-        Fault.RAIL,
-        Fault.COPY,
-        Fault.TEMPERATURE_JUMP,
-        Fault.TEMPERATURE_STUCK,
-    ],
-    np.uint8,
+_WELL = (
+    Fault.NONE,
+    Fault.MISSING,
+    Fault.SATURATED,
+    Fault.STALE,
+    Fault.RAIL,
+    Fault.COPY,
+    Fault.TEMPERATURE_JUMP,
+    Fault.TEMPERATURE_STUCK,
 )
 """Faults that say nothing against the chip: it comes back as the same."""
+_SICK: Bool = np.array([fault not in _WELL for fault in Fault])
 
 
 class HealthMonitor:
@@ -366,7 +364,7 @@ class HealthMonitor:
             if np.count_nonzero(revived):
                 self.revived = revived
             self._gone &= ~back
-        new = ~np.isin(fault, _WELL) & ~self._gone
+        new = _SICK[fault] & ~self._gone
         if np.count_nonzero(new):
             self._gone_since[new] = captured
             self._gone |= new

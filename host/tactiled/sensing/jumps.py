@@ -105,6 +105,11 @@ class Jumps:
         """
         self.settled = self.restored = self.never
         away = raw - trusted
+        if self._lonely is self._none and self._displaced is self.never:
+            size = np.abs(away).max(axis=1)
+            if not np.count_nonzero(open_ & (size > self.least)):
+                self._jumping = self.never
+                return self.never, self.never
         base = away
         if self._lonely is not self._none:
             # a chip that is not believed yet goes on from where it was last, or goes back
