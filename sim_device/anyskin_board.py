@@ -124,6 +124,8 @@ class AnySkinBoard(SkinOwner):
             raw = self._rng.choice(_DEAD_RAW, len(failed))
             temperature[failed] = temperature_of_raw(raw)
             field[failed] = np.where(raw > 0, -1.0, 0.0)[:, None] * lsb[failed]
+        if reading.infinite is not None:
+            field[reading.infinite] = np.inf, -np.inf, np.nan
         return FloatSamples(
             field.astype(np.float32), temperature.astype(np.float32), reading.status
         )

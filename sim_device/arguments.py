@@ -37,7 +37,11 @@ MAX_SPEED = 1000.0
 FAULTS_HELP = """\
 faults, parted by commas: flip=1e-5 (per bit), byteloss, byteinsert (per byte), loss, duplicate,
 reorder, splice (per frame), delay=0.01:0.02s, silence@5s+2s, reset@8s, busoff@5s+1s (CAN),
-stuck|saturated|failed=ARRAY:TAXEL@Ts+Ds, seed=N (default: the board's)"""
+copy@5s+2s (every third frame an old one), seed=N (default: the board's).
+Chips: WHAT=ARRAY:TAXEL@Ts+Ds, TAXEL * for all, such as zeros=left:3@2s+5s; with :SHARE only that
+share of readings, such as zeros=skin:*:0.05@4s. WHAT: stuck, saturated, failed (flagged, where the
+board can); zeros, ones (failed reads), rail, wrap (over the end of 16 bits under a press), jump,
+twin (another chip's bits), dither (dead but for the last bits), hot (99 °C), inf (anyskin only)."""
 
 
 def make_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
@@ -206,10 +210,12 @@ def _add_replay(commands: Commands) -> argparse.ArgumentParser:
     replay = commands.add_parser(
         "replay",
         help="send a recording of a real board again",
-        description="Send a recorded CSV (plain or .gz: time in s, then x, y, z in µT for each of "
-        "1 to 20 magnetometers) as the frames of an AnySkin board, at the recorded times. It "
-        "begins when a host reads, so that nothing is lost. Recordings hold no temperatures: 25 °C "
-        "is sent for all.",
+        description="Send a recorded CSV (plain or .gz: time in s, then x, y, z in µT for each of\n"
+        "1 to 20 magnetometers) as the frames of an AnySkin board, at the recorded times. It\n"
+        "begins when a host reads, so that nothing is lost. Recordings hold no temperatures:\n"
+        "25 °C is sent for all.",
+        epilog=FAULTS_HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     replay.add_argument("recording", type=Path, metavar="RECORDING.csv")
     replay.add_argument(
@@ -225,6 +231,11 @@ def _add_replay(commands: Commands) -> argparse.ArgumentParser:
         help="times real time, 0.001 to 1000 (default 1)",
     )  # fmt: skip
     replay.add_argument("--loop", action="store_true", help="begin again at the end (default: end)")
+    replay.add_argument(
+        "--faults", default="", metavar="SPEC",
+        help="faults to inject, at times of the recording, see below; its chips are skin:0 and so "
+        "on",
+    )  # fmt: skip
     _add_duration(replay)
     return replay
 

@@ -29,12 +29,14 @@ class Reading:
     """One conversion of every chip.
 
     ``counts`` (N, 3) int16 in chip axes, ``status`` (N,) uint8 of `TaxelStatus`,
-    ``temperature_c`` (N,) °C as the chips tell it.
+    ``temperature_c`` (N,) °C as the chips tell it. ``infinite`` (N,) bool: chips that firmware
+    sends no number of; None: there are none. Only boards that send floats can.
     """
 
     counts: NDArray[np.int16]
     status: NDArray[np.uint8]
     temperature_c: Float
+    infinite: NDArray[np.bool_] | None = None
 
 
 def truncated_normal(rng: np.random.Generator, sigma: float, shape: tuple[int, ...]) -> Float:

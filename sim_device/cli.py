@@ -144,6 +144,7 @@ def _cupboard_request(arguments: argparse.Namespace) -> CupboardRequest:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
+    from sim_device.faults import FaultPlan
     from sim_device.ports import PtyPort
     from sim_device.replay import RecordingError, ReplayBoard, load
     from sim_device.runner import ReplayStation
@@ -157,7 +158,11 @@ def _replay(arguments: argparse.Namespace) -> int:
         raise _Refusal(
             BAD_ARGUMENT, f"{arguments.recording}: cannot be read ({error.strerror})"
         ) from error
-    board = ReplayBoard(recording, arguments.speed, arguments.loop)
+    try:
+        faults = FaultPlan.parse(arguments.faults)
+        board = ReplayBoard(recording, arguments.speed, arguments.loop, faults)
+    except ValueError as error:
+        raise _Refusal(BAD_ARGUMENT, error) from error
     seconds = float(recording.seconds[-1]) / arguments.speed
     line = (
         f"{recording.magnetometers} magnetometers, {len(board)} rows, {seconds:.1f} s; "

@@ -32,16 +32,33 @@ class TaxelFaultKind(StrEnum):
     STUCK = "stuck"  # repeats its value, unflagged: a chip that stopped converting
     SATURATED = "saturated"  # full scale, flagged
     FAILED = "failed"  # does not answer the bus: flagged, the counts mean nothing
+    ZEROS = "zeros"  # a failed read sent as zeros, temperature and all, unflagged
+    ONES = "ones"  # a failed read sent as minus one on every axis, unflagged
+    RAIL = "rail"  # z at the end of its range, unflagged
+    WRAP = "wrap"  # z close to the end of its range: a press takes it over, and it wraps
+    JUMP = "jump"  # far from where it was, on every axis
+    TWIN = "twin"  # the bits of the chip before it (chip 0: of chip 1)
+    DITHER = "dither"  # stuck but for the last bits, which toggle
+    HOT = "hot"  # a thermometer that shows 99 °C
+    INFINITE = "inf"  # what is not a number; boards that send floats only
+
+
+ALL_TAXELS = -1
+"""Stands for every taxel of an array."""
 
 
 @dataclass(frozen=True, slots=True)
 class TaxelFault:
-    """Taxel number ``taxel`` of ``array`` is broken while ``window`` lasts."""
+    """Taxel number ``taxel`` of ``array`` is broken while ``window`` lasts.
+
+    ``share``: of its readings, drawn at random.
+    """
 
     kind: TaxelFaultKind
     array: str
     taxel: int
     window: Window
+    share: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +82,7 @@ class FaultPlan:
     silence: tuple[Window, ...] = ()
     reset: tuple[float, ...] = ()
     busoff: tuple[Window, ...] = ()
+    copy: tuple[Window, ...] = ()
     taxels: tuple[TaxelFault, ...] = ()
 
     def __post_init__(self) -> None:
@@ -82,9 +100,10 @@ class FaultPlan:
 
         Entries, parted by commas: ``seed=N``; ``NAME=PROBABILITY`` for flip, byteloss,
         byteinsert, loss, duplicate, reorder, splice; ``delay=PROBABILITY:SECONDSs``;
-        ``silence@Ts+Ds``, ``busoff@Ts+Ds``, ``reset@Ts``; ``stuck|saturated|failed=ARRAY:TAXEL``
-        with an optional ``@Ts`` or ``@Ts+Ds`` (``nan`` is ``failed``). ScriptError names the
-        entry and what is allowed.
+        ``silence@Ts+Ds``, ``busoff@Ts+Ds``, ``copy@Ts+Ds``, ``reset@Ts``; a `TaxelFaultKind`
+        such as ``zeros=ARRAY:TAXEL`` (``*``: every taxel) with an optional ``:SHARE`` of its
+        readings and an optional ``@Ts`` or ``@Ts+Ds`` (``nan`` is ``failed``). ScriptError names
+        the entry and what is allowed.
         """
         entries = [e.strip() for e in text.split(",")]
         return _collect([(e, f"fault {e!r}") for e in entries if e])
@@ -125,19 +144,20 @@ PROBABILITIES = (
     "delay",
 )
 _TAXEL_FAULTS = {**{kind.value: kind for kind in TaxelFaultKind}, "nan": TaxelFaultKind.FAILED}
-TIMED = ("silence", "reset", "busoff")
+TIMED = ("silence", "reset", "busoff", "copy")
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _ENTRY = re.compile(r"(?P<name>[a-z_]+)\s*(?P<mark>[=@])\s*(?P<rest>.+)")
 _DELAY = re.compile(rf"(?P<p>{_NUMBER})\s*(?::\s*(?P<s>{_NUMBER})\s*s)?")
 _WINDOW = re.compile(rf"(?P<at>{_NUMBER})\s*s\s*(?:\+\s*(?P<for>{_NUMBER})\s*s)?")
 _TAXEL = re.compile(
-    rf"(?P<array>[A-Za-z0-9_-]+):(?P<taxel>\d{{1,4}})\s*(?:@\s*(?P<window>{_NUMBER}\s*s.*))?"
+    rf"(?P<array>[A-Za-z0-9_-]+):(?P<taxel>\d{{1,4}}|\*)(?:\s*:\s*(?P<share>{_NUMBER}))?"
+    rf"\s*(?:@\s*(?P<window>{_NUMBER}\s*s.*))?"
 )
 _FORMS = (
     "allowed: seed=N; flip, byteloss, byteinsert, loss, duplicate, reorder, splice = probability "
-    "from 0 to 1; delay=PROBABILITY:SECONDSs; silence@Ts+Ds; busoff@Ts+Ds; reset@Ts; "
-    "stuck, saturated, failed (or nan) = ARRAY:TAXEL@Ts+Ds"
+    "from 0 to 1; delay=PROBABILITY:SECONDSs; silence@Ts+Ds; busoff@Ts+Ds; copy@Ts+Ds; reset@Ts; "
+    f"{', '.join(TaxelFaultKind)} (or nan: failed) = ARRAY:TAXEL:SHARE@Ts+Ds"
 )
 
 
@@ -187,6 +207,7 @@ def _collect(entries: list[tuple[str, str]]) -> FaultPlan:
         silence=tuple(windows["silence"]),
         reset=tuple(w.start for w in windows["reset"]),
         busoff=tuple(windows["busoff"]),
+        copy=tuple(windows["copy"]),
         taxels=tuple(taxels),
     )
 
@@ -223,11 +244,16 @@ def _taxel_fault(kind: TaxelFaultKind, text: str, label: str) -> TaxelFault:
     match = _TAXEL.fullmatch(text)
     if match is None:
         raise ScriptError(
-            f"{label}: allowed: ARRAY:TAXEL, then @Ts or @Ts+Ds, such as left:3@2s+5s"
+            f"{label}: allowed: ARRAY:TAXEL (* for all), then :SHARE of its readings, then @Ts or "
+            "@Ts+Ds, such as left:3@2s+5s or skin:*:0.05@4s"
         )
+    share = float(match["share"]) if match["share"] else 1.0
+    if not 0 < share <= 1:
+        raise ScriptError(f"{label}: allowed: a SHARE above 0 and up to 1")
     window = (
         _window(match["window"], label, needs_end=False, may_end=True)
         if match["window"]
         else Window(0.0)
     )
-    return TaxelFault(kind, match["array"], int(match["taxel"]), window)
+    taxel = ALL_TAXELS if match["taxel"] == "*" else int(match["taxel"])
+    return TaxelFault(kind, match["array"], taxel, window, share)

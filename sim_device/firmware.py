@@ -18,7 +18,7 @@ from sensor_proto.packets import Descriptor, Received
 from sim_device.board_clock import ClockParameters
 from sim_device.controller import DEFAULT_RATE, Controller, Identity
 from sim_device.environment import Environment
-from sim_device.faults import FaultPlan
+from sim_device.faults import FaultPlan, TaxelFaultKind
 from sim_device.faulty_wire import CanWire, SerialWire
 from sim_device.sampler import Contacts, Sampler, SkinOwner
 from sim_device.skin import SkinModel
@@ -47,6 +47,8 @@ class SimulatedBoard(SkinOwner, ABC):
     ) -> None:
         """ValueError for a plan or a rate that does not fit the board."""
         self._plan = options.get("plan", FaultPlan())
+        if any(fault.kind is TaxelFaultKind.INFINITE for fault in self._plan.taxels):
+            raise ValueError("inf: such a board sends counts; allowed on boards that send floats")
         super().__init__(
             Sampler(
                 skin,

@@ -7,6 +7,7 @@ import gzip
 import io
 import math
 import zlib
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +16,12 @@ from numpy.typing import NDArray
 
 from sensor_proto.anyskin import MAX_FIELD_UT, encode_anyskin
 from sensor_proto.anyskin_search import MAX_MAGNETOMETERS
-from sensor_proto.packets import FloatSamples
-from tactile_bus.instant import Instant, after
+from sensor_proto.packets import FloatSamples, TaxelStatus
+from sim_device.broken_taxels import BrokenTaxels
+from sim_device.chips import COUNT_MAX, Reading, temperature_of_raw
+from sim_device.faults import FaultPlan
+from sim_device.faulty_wire import SerialWire
+from tactile_bus.instant import Instant, after, seconds_between
 
 TEMPERATURE_C = 25.0
 """°C put into every frame: the recordings hold none."""
@@ -148,9 +153,24 @@ class ReplayBoard:
     """A board that sends a recording. It sends `BAIT` until `start`, and takes no commands.
 
     ``speed``: times real time. ``loop``: begin again after the last row, one period later.
+    ``plan``: what goes wrong with the chips, all of one array ``skin``, and on the wire, by the
+    time of the recording. ValueError for faults of other boards.
     """
 
-    def __init__(self, recording: Recording, speed: float = 1.0, loop: bool = False) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        speed: float = 1.0,
+        loop: bool = False,
+        plan: FaultPlan | None = None,
+    ) -> None:
+        plan = plan or FaultPlan()
+        if plan.reset or plan.busoff:
+            raise ValueError("reset and busoff: such a board has neither clock nor bus")
+        self._broken = BrokenTaxels(plan, {"skin": recording.magnetometers})
+        self._wire = SerialWire(plan, delimited=False) if plan.touches_wire else None
+        self._spoils = bool(plan.taxels or plan.copy)
+        self._lsb = _scale(recording.field_ut)
         if not (speed > 0 and math.isfinite(speed)):
             raise ValueError(f"speed {speed} given; allowed: a positive number")
         self._recording = recording
@@ -202,6 +222,9 @@ class ReplayBoard:
             out.append(self._frame(self._row))
             self._row += 1
             self.sent += 1
+        if self._wire is not None:
+            seconds = seconds_between(self._start, now) * self._speed
+            return b"".join(self._wire.pass_on(deque(out), seconds))
         return b"".join(out)
 
     def _due(self, row: int) -> Instant:
@@ -210,6 +233,49 @@ class ReplayBoard:
         return after(self._start or Instant(0), float(at) / self._speed)
 
     def _frame(self, row: int) -> bytes:
-        return encode_anyskin(
-            FloatSamples(self._recording.field_ut[row], self._temperature, self._status)
-        )
+        field, temperature = self._recording.field_ut[row], self._temperature
+        if self._spoils:
+            field, temperature = self._spoilt(field, float(self._recording.seconds[row]))
+        return encode_anyskin(FloatSamples(field, temperature, self._status))
+
+    def _spoilt(
+        self, field: NDArray[np.float32], seconds: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Field and temperatures as broken chips give them.
+
+        All are made from counts, so that what is sent twice is the same to the bit.
+        """
+        counts = np.clip(np.rint(field / self._lsb), -COUNT_MAX - 1, COUNT_MAX).astype(np.int16)
+        reading = Reading(counts, self._status, self._temperature.astype(np.float64))
+        spoilt = self._broken.spoil(reading, seconds)
+        out = spoilt.counts * self._lsb
+        failed = np.flatnonzero(spoilt.status & TaxelStatus.READ_FAILED)
+        temperature = spoilt.temperature_c.copy()
+        temperature[failed] = temperature_of_raw(np.full(len(failed), 65535.0))
+        if spoilt.infinite is not None:
+            out[spoilt.infinite] = np.inf, -np.inf, np.nan
+        return out.astype(np.float32), temperature.astype(np.float32)
+
+
+_SCALES_UT = tuple(
+    (xy * factor, z * factor)
+    for factor in (8, 4, 2, 1)
+    for xy, z in (
+        (0.751, 1.210), (0.601, 0.968), (0.451, 0.727), (0.375, 0.605),
+        (0.300, 0.484), (0.250, 0.403), (0.200, 0.323), (0.150, 0.242),
+    )
+)  # fmt: skip
+"""µT a count of x and y, and of z, of an MLX90393 at each resolution and gain (datasheet)."""
+_LOOKED_AT = 64
+"""Rows from which the scale of a recording is told."""
+
+
+def _scale(field_ut: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(3,) µT a count that all of (n, m, 3) are multiples of; the finest where there is none."""
+    rows = field_ut[:_LOOKED_AT].astype(np.float64)
+    for xy, z in _SCALES_UT:
+        scale = np.array([xy, xy, z])
+        counts = rows / scale
+        if (np.abs(counts - np.rint(counts)) < 0.1).all():
+            return scale
+    return np.array([*_SCALES_UT[-1][:1], *_SCALES_UT[-1]])

@@ -37,6 +37,7 @@ class TaxelHealth(IntFlag):
     FROZEN = 8
     OUT_OF_RANGE = 16
     MISSING = 32
+    IMPLAUSIBLE = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +49,7 @@ class SampleBlock:
     board ticks (or from arrivals where the board has no clock); ``uncertainty`` in s.
     ``thermometer``: False where the board sends no temperatures, which are then NaN and no fault.
     ``clock_usable``: False where the board's clock is so wrong that ``captured`` is of no use.
+    ``lsb_ut``: µT a count of x and y, and of z, where the board tells.
     """
 
     array: int
@@ -60,6 +62,7 @@ class SampleBlock:
     status: NDArray[np.uint8]
     thermometer: bool = True
     clock_usable: bool = True
+    lsb_ut: tuple[float, float] | None = None
 
     def split(self, sizes: Sequence[int]) -> tuple[SampleBlock, ...]:
         """One block an array, of a block that holds all ``sizes`` taxels of a board together.
@@ -162,7 +165,8 @@ class Cycle:
     in taxel axes after rest field and temperature, before compensation; NaN likewise.
     ``normal_bound``: (N,) N that hold the true normal force in 95 % of cycles; NaN likewise.
     ``health``: (N,) uint8 of `TaxelHealth`. ``features_due``: by the feature
-    rate, these features are to be sent; they are computed in every cycle.
+    rate, these features are to be sent; they are computed in every cycle. ``fault``: (N,) uint8 of
+    `readings.Fault`, what exactly is wrong with each taxel.
     """
 
     sequence: int
@@ -178,3 +182,4 @@ class Cycle:
     features: Features
     calibrated: bool
     features_due: bool = True
+    fault: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))

@@ -46,6 +46,10 @@ def summary(port: Port, node: int, station: Station, now: Instant) -> dict[str, 
         "drops": drops(port, node, station),
         "board": dict(station.board_status),
     }
+    if station.pipeline is not None:
+        doubt = station.pipeline.rest_reason
+        state = station.pipeline.rest_state.value
+        values["rest"] = {"state": state, "reason": "" if doubt is None else doubt.text}
     identity = station.identity
     if identity is not None:
         values["serial_number"] = identity.serial_number
@@ -76,6 +80,10 @@ def summary(port: Port, node: int, station: Station, now: Instant) -> dict[str, 
             "normal_force_bound_n": _finite(features.normal_force_bound),
             "unhealthy_taxels": health(cycle.health),
         }
+    if station.chips is not None and station.chips.masked:
+        values["masked_chips"] = {
+            f"{one.array}:{one.chip}": str(one) for one in station.chips.masked
+        }
     return values
 
 
@@ -105,7 +113,12 @@ def message(name: str, values: dict[str, Any], recorder: Recorder | None, wall_n
     level = LEVELS.get(state, WARNING)
     if level == OK and not values.get("features_valid", True):
         level = WARNING
+    masked = values.get("masked_chips", {})
+    if level == OK and masked:
+        level = WARNING
     text = state if level == OK else "; ".join([state, *values.get("reasons", ())])
+    if masked:
+        text += "; masked: " + ", ".join(masked)
     statuses = [
         diagnostic_status(
             f"tactiled/{name}", level, text, values.get("serial_number", ""), _flatten(values)

@@ -14,7 +14,8 @@ from tactile_bus.calibration_file import SUFFIX
 from tactile_bus.instant import NS_PER_S, Instant, seconds_between
 from tactile_bus.recorder import Recorder
 from tactile_bus.topics import AMBIENT, CONTACTS, FEATURES, FIELD, FORCES, GEOMETRY
-from tactiled.blocks import Cycle, Features, SampleBlock
+from tactiled.blocks import Cycle, Features, Reason, SampleBlock
+from tactiled.chip_watch import ChipWatch
 from tactiled.links.events import (
     Answered,
     BoardLog,
@@ -35,6 +36,7 @@ from tactiled.outgoing import MessageMaker
 from tactiled.outlet import Sink
 from tactiled.repeats import Repeats, Silences
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
+from tactiled.sensing.reasons import REPLUGGED
 from tactiled.shelf import Choice, Shelf
 from tactiled.skin_picture import SkinPicture
 
@@ -74,6 +76,8 @@ class Station:
         """Cycles whose forces were published."""
         self.counters: Counter[str] = Counter()
         self.board_status: dict[str, int] = {}
+        self.chips: ChipWatch | None = None
+        """Which of the board's chips are masked; None before it was identified."""
         self.summary: dict[str, Any] = {}
         """`diagnostics.summary` of the last second; replaced as a whole, for other threads."""
         self._outlet = outlet
@@ -86,6 +90,8 @@ class Station:
         self._rate_from: deque[tuple[Instant, int]] = deque([(outlet.now(), 0)], RATE_OVER)
         self._repeats = Repeats()
         self._silences = Silences()
+        self._unplugged = False
+        self._doubt: Reason | None = None
         self._answers: dict[int, Future[Event]] = {}
         self._tares: list[Future[dict[str, Any]]] = []
 
@@ -139,6 +145,7 @@ class Station:
             self.counters.update({k: v for k, v in asdict(before).items() if k not in ("cycles",)})
         self._maker = MessageMaker(calibration, self._outlet.wall)
         self._picture = SkinPicture(calibration.geometry)
+        self.chips = ChipWatch(calibration.geometry)
         recorder = self.recorder
         if recorder is not None:
             text = saves(calibration).encode()
@@ -174,6 +181,9 @@ class Station:
                 self.identity, self.refusal, self.state = identity, None, "identified"
                 if self.pipeline is not None and self.sent:
                     self.pipeline.reset()  # what it felt before it was out of sight is over
+                    if self._unplugged and not identity.serial_number:
+                        self.pipeline.forget_rest(REPLUGGED)  # it may be another board
+                self._unplugged = False
                 version = f", firmware {identity.firmware}" if identity.firmware else ""
                 written = f", read as {identity.layout}" if identity.layout else ""
                 self._say(logging.INFO, f"{identity}{version} found{written}", "found")
@@ -233,6 +243,7 @@ class Station:
     def port_lost(self, reason: str) -> None:
         """The port went away under the board."""
         self.state = "unplugged"
+        self._unplugged = True
         self._silences.gone()
         self._say(logging.WARNING, f"{reason}; waiting for it to come back", "lost")
 
@@ -271,13 +282,16 @@ class Station:
                 self._send(cycle)
 
     def each_second(self, now: Instant) -> None:
-        """Work out rate and latency of the last second."""
+        """Work out rate and latency of the last second; say what repeats and who is masked."""
         self._measure_rate(now)
         for level, text in self._repeats.due(now):
             self._say(level, text)
         said = self._silences.due(now)
         if said is not None:
             self._say(logging.WARNING, said)
+        if self.chips is not None:
+            for level, text in self.chips.each_second(now):
+                self._say(level, text)
         if self._latencies:
             ordered = sorted(self._latencies)
             last = len(ordered) - 1
@@ -324,6 +338,11 @@ class Station:
         before = pipeline.tare_report
         for cycle in pipeline.feed(block):
             self._send(cycle)
+        doubt = pipeline.rest_reason
+        if doubt is not self._doubt:
+            if doubt is not None and (self._doubt is None or self._doubt.code != doubt.code):
+                self._say(logging.WARNING, doubt.text, "rest field in doubt")
+            self._doubt = doubt
         report = pipeline.tare_report
         if report is not None and report is not before:
             level = logging.INFO if report.accepted else logging.WARNING
@@ -344,6 +363,8 @@ class Station:
         if maker is None:
             return
         stamp_ns = outlet.wall.wall_ns(cycle.captured)
+        if self.chips is not None:
+            self.chips.observe(cycle.fault, cycle.captured)
         if cycle.features_due:
             outlet.send(FEATURES, name, maker.features(cycle), stamp_ns)
         self._latencies.append((outlet.now() - cycle.received) / NS_PER_S)

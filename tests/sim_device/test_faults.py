@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from sim_device.faults import FaultPlan, TaxelFault, TaxelFaultKind, Window
+from sim_device.faults import ALL_TAXELS, FaultPlan, TaxelFault, TaxelFaultKind, Window
 from sim_device.scripts import ScriptError
 
 
@@ -49,6 +49,16 @@ def test_nan_is_a_failed_read() -> None:
     assert FaultPlan.parse("nan=tip:1@2s") == FaultPlan.parse("failed=tip:1@2s")
 
 
+def test_chips_break_in_every_way_all_or_a_share_of_the_time() -> None:
+    text = ",".join(f"{kind}=skin:1@2s" for kind in TaxelFaultKind)
+    assert [fault.kind for fault in FaultPlan.parse(text).taxels] == list(TaxelFaultKind)
+    plan = FaultPlan.parse("zeros=skin:*:0.05@4s+2s,copy@1s+2s")
+    assert plan.taxels == (
+        TaxelFault(TaxelFaultKind.ZEROS, "skin", ALL_TAXELS, Window(4, 2), share=0.05),
+    )
+    assert plan.copy == (Window(1, 2),)
+
+
 def test_no_text_is_no_fault() -> None:
     assert FaultPlan.parse("") == FaultPlan()
     assert not FaultPlan.parse("").touches_wire
@@ -76,6 +86,10 @@ def test_no_text_is_no_fault() -> None:
         ("stuck=left:x", "allowed: ARRAY:TAXEL"),
         ("stuck=left:1@", "allowed: ARRAY:TAXEL"),
         ("stuck@2s", "not understood"),
+        ("zeros=skin:2:0@2s", "allowed: a SHARE above 0 and up to 1"),
+        ("zeros=skin:2:1.5", "allowed: a SHARE above 0 and up to 1"),
+        ("zeros=skin:**", "allowed: ARRAY:TAXEL"),
+        ("copy@2s", "allowed: Ts[+]Ds"),
     ],
 )
 def test_bad_text_names_the_entry_and_what_is_allowed(text: str, message: str) -> None:

@@ -124,14 +124,16 @@ class FloatLink:
         self._silent, self._last_sample = False, arrival
         self._pace.heard(arrival, self._frames)
         placed = self.clock.arrived(arrival, behind, newest)
+        with np.errstate(invalid="ignore"):  # a damaged float may be a signalling NaN
+            values = message.field_ut.astype(np.float64), message.temperature_c.astype(np.float64)
         block = SampleBlock(
             array=0,
             sequence=placed.sequence % (1 << 32),
             captured=placed.stamp.captured,
             received=arrival,
             uncertainty=placed.stamp.uncertainty,
-            field_ut=message.field_ut.astype(np.float64),
-            temperature_c=message.temperature_c.astype(np.float64),
+            field_ut=values[0],
+            temperature_c=values[1],
             status=message.status,
             thermometer=self.thermometer,
         )

@@ -18,13 +18,15 @@ class ArrayIntake:
         self.tracker = SequenceTracker()
         self.steps = StepWatch()
         self._index = self._taxels = 0
+        self._lsb_ut = (1.0, 1.0)
         self._scale = np.ones(3)
         self._captured = Instant(0)
 
     def describe(self, index: int, array: ArrayDescriptor) -> None:
         """Take over what the board says of the array; ``index``: its place in the descriptor."""
         self._index, self._taxels = index, array.taxels
-        self._scale = np.array([array.lsb_xy_nt, array.lsb_xy_nt, array.lsb_z_nt]) * 1e-3
+        self._lsb_ut = array.lsb_xy_nt * 1e-3, array.lsb_z_nt * 1e-3
+        self._scale = np.array([self._lsb_ut[0], self._lsb_ut[0], self._lsb_ut[1]])
 
     def fits(self, message: Samples) -> bool:
         """Whether these are as many taxels as the board said."""
@@ -49,4 +51,5 @@ class ArrayIntake:
             field_ut=message.field * self._scale,
             temperature_c=np.array([message.temperature_cc / 100]),
             status=message.status,
+            lsb_ut=self._lsb_ut,
         )

@@ -84,6 +84,11 @@ class FeatureExtractor:
         """(N,) taxels in contact in the last cycle."""
         return self._contact
 
+    @property
+    def least_n(self) -> Float:
+        """(N,) N that a taxel must read at least to be in contact."""
+        return self._on
+
     def set_noise(self, sigma_n: Float) -> None:
         """Noise of the normal forces, (N,) N rms: contact thresholds follow."""
         self._on = np.maximum(self._minimum, self._sigmas * sigma_n)

@@ -121,6 +121,13 @@ class ForceModel:
             field -= self._drift * (temperature_c - self._reference)[:, None, :]
         return field
 
+    def chip_rest(self) -> Float:
+        """(A, 3, n) µT in chip axes that the untouched chips read."""
+        out = self.rest.copy()
+        out[:, 0] = self._cos * self.rest[:, 0] + self._sin * self.rest[:, 1]
+        out[:, 1] = self._cos * self.rest[:, 1] - self._sin * self.rest[:, 0]
+        return out
+
     def forces(self, field: Float) -> Float:
         """N in taxel axes that ``field`` in taxel axes stands for, ambient and all."""
         forces: Float = (self._matrix @ field.reshape(len(field), -1, 1)).reshape(field.shape)

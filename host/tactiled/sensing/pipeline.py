@@ -19,10 +19,13 @@ from tactiled.sensing.features import FeatureExtractor
 from tactiled.sensing.force_model import ForceModel
 from tactiled.sensing.grouping import CycleCounters, Group, Grouper, gather_temperature
 from tactiled.sensing.health import HealthMonitor
+from tactiled.sensing.late_rest import LateRest
 from tactiled.sensing.layout import Layout
+from tactiled.sensing.masking import Masking
 from tactiled.sensing.methods import make_compensator
 from tactiled.sensing.net_stage import NetStage
 from tactiled.sensing.pipeline_settings import PipelineSettings
+from tactiled.sensing.readings import Fault
 from tactiled.sensing.rest import RestField, RestState
 from tactiled.sensing.rest_watch import RestWatch
 from tactiled.sensing.tare import TareReport
@@ -49,9 +52,16 @@ class BoardPipeline:
         self._model = ForceModel(calibration, layout)
         self._sizes = tuple(a.taxels for a in geometry.arrays)
         self._grouper = Grouper(self._sizes)
-        self._monitor = HealthMonitor(layout, settings.frozen_after_s, settings.range_limit_ut)
+        self._monitor = HealthMonitor(
+            layout,
+            settings.frozen_after_s,
+            settings.range_limit_ut,
+            None if calibration.nominal else self._model.chip_rest(),
+        )
         self._compensator: Compensator = make_compensator(settings, layout, self._model)
         self._features = FeatureExtractor(geometry, settings)
+        self._masking = Masking(geometry)
+        self._late = LateRest(settings.tare_s)
         self._net = NetStage(calibration.nets, layout)
         self._names = tuple(a.name for a in geometry.arrays)
         self._reference_c = [a.reference_c for a in calibration.arrays]
@@ -146,6 +156,7 @@ class BoardPipeline:
         self._monitor.reset()
         self._compensator.reset()
         self._features.reset()
+        self._masking.reset()
         self._net.pause()
         self._watch.reset()
         self._theta = np.zeros_like(self._theta)
@@ -171,7 +182,11 @@ class BoardPipeline:
         blocks = [block for block in group.blocks if block is not None]
         captured = min(block.captured for block in blocks)
         health = self._monitor.update(raw, temperature, status, present, captured)
+        fault = self._monitor.fault
         rest = self._rest
+        monitor = self._monitor
+        if monitor.revived is not monitor.restored:  # both are one and the same mask, all False
+            rest.unrested = (rest.unrested | monitor.revived) & ~monitor.restored
         known = rest.known  # before: a first tare takes effect from the next cycle on
         field = model.taxel_field(raw, temperature)
         if rest.taring and not (self._watch.off and rest.suspicion is not None):
@@ -179,9 +194,15 @@ class BoardPipeline:
             self._advance_tare(field, temperature, health, whole, captured, group.sequence)
         if known and np.count_nonzero(rest.unrested):
             health[rest.unrested] |= np.uint8(TaxelHealth.OUT_OF_RANGE)
+            fault = np.where(rest.unrested & (fault == 0), np.uint8(Fault.UNRESTED), fault)
         if np.count_nonzero(rest.bare):
             health[rest.bare] |= np.uint8(TaxelHealth.OUT_OF_RANGE)
+            fault = np.where(rest.bare & (fault == 0), np.uint8(Fault.NO_MAGNET), fault)
         field_of_all = field.copy() if np.count_nonzero(rest.bare) else field
+        late = None
+        if known and np.count_nonzero(rest.unrested) and not rest.taring:
+            late = rest.unrested & (self._monitor.fault == 0)
+            late_field = field - model.plane_field(self._theta)
         masked = int(np.count_nonzero(health))
         sick = masked > 0
         healthy = layout.real
@@ -215,19 +236,25 @@ class BoardPipeline:
         reasons, valid = self._reasons(estimate, healthy, present, known)
         if not all(block.clock_usable for block in blocks):
             reasons, valid = (why.CLOCK_UNUSABLE, *reasons), False
+        if sick and known:
+            normal = np.abs(force[:, 2])  # NaN where masked: not felt
+            more, enough = self._masking.judge(layout.flat(fault), normal > self._features.least_n)
+            reasons, valid = (*reasons, *more), valid and enough
         tip_usable = valid or (known and self._tip_usable(estimate, present))
         features = self._features.update(
             force, masked, reasons, valid, tip_usable, captured, layout.flat(estimate.loaded)
         )
         features, normal_bound = self._bound(features, estimate, force, known)
+        if late is not None:
+            self._rest_late(late_field, late, features.taxels_in_contact == 0, captured)
+        if sick:
+            self._masking.touched = self._features.contact
+        else:
+            self._masking.well(self._features.contact)
         if rest.taring:
             rest.note_peak(features.peak_force)
         if self.settings.rest_tracking_s is not None and valid and not reasons:
             self._follow_rest(field, estimate, healthy, captured)
-        if known and np.count_nonzero(rest.unrested):
-            untouched = features.taxels_in_contact == 0
-            if rest.adopt(field, self._sound(health), untouched, captured):
-                self._settle_rest(temperature)
         if known and self._last_captured is not None and rest.state is RestState.KNOWN:
             elapsed = max(0.0, (captured - self._last_captured) / NS_PER_S)
             left_over = field - self._model.plane_field(estimate.theta)
@@ -247,6 +274,7 @@ class BoardPipeline:
             health=self._health,
             ambient=estimate.ambient,
             features=features,
+            fault=layout.flat(fault),
             calibrated=not self.calibration.nominal,
             features_due=self._due(captured),
         )
@@ -268,6 +296,8 @@ class BoardPipeline:
             told = block.temperature_c if block.thermometer else self._reference_c[a]
             temperature[a, :n] = told
             status[a, :n] = block.status
+            if block.lsb_ut is not None:
+                self._monitor.told(a, block.lsb_ut)
         return raw, temperature, status, present
 
     def _reasons(
@@ -339,8 +369,10 @@ class BoardPipeline:
             self._rest.bare |= self._watch.lost(before)
             self._rest.bare &= ~self._watch.covered()
         self._forgotten = None
+        self._monitor.set_rest(self._model.chip_rest())
         self._compensator.reset(rested=True)
         self._features.reset()
+        self._masking.reset()
         self._net.reset()
         self._watch.reset()
         self._theta = np.zeros_like(self._theta)
@@ -351,11 +383,6 @@ class BoardPipeline:
         """A rest field has just come into force."""
         self._model.rested_at(temperature)
         self._bounds.set_rest(self._layout.flat_vectors(self._model.rest))
-
-    def _sound(self, health: NDArray[np.uint8]) -> Bool:
-        """(A, n) taxels with nothing against them but that their rest field is unknown."""
-        others = health & ~np.uint8(TaxelHealth.OUT_OF_RANGE)
-        return np.asarray(self._layout.real & (others == 0))
 
     def _watch_rest(
         self, field: Float, forces: Float, estimate: Estimate, healthy: Bool, captured: Instant
@@ -426,9 +453,22 @@ class BoardPipeline:
         ends = np.cumsum(self._layout.counts)
         return int(np.searchsorted(ends, self._features.peak_taxel, side="right"))
 
+    def _rest_late(self, field: Float, late: Bool, untouched: bool, captured: Instant) -> None:
+        """Let chips that came late have a rest field once nothing touches the skin."""
+        if not (untouched and late.any()):
+            self._late.forget()
+            return
+        shift = self._late.advance(field, late, self._noise, captured)
+        if shift is not None:
+            self._model.rest += shift
+            self._rest.unrested = self._rest.unrested & ~late
+            self._monitor.set_rest(self._model.chip_rest())
+            self._bounds.set_rest(self._layout.flat_vectors(self._model.rest))
+
     def _apply_noise(self, noise: Float) -> None:
         """Noise of one sample, (3,) µT in chip axes, sets the thresholds of contact and fit."""
         self._noise = np.maximum(noise, MIN_NOISE_UT)
+        self._monitor.set_noise(self._noise)
         self._sigma = self._layout.flat(self._model.normal_sigma(self._noise))
         self._bounds.set_noise(self._sigma)
         self._set_thresholds()

@@ -7,6 +7,7 @@ meaning. Those that concern one array end in ``:name``.
 from __future__ import annotations
 
 from tactiled.blocks import Reason
+from tactiled.sensing.readings import Fault
 
 TARING = Reason("taring", "taring: leave the skin untouched")
 REST_UNCERTAIN = Reason(
@@ -100,3 +101,18 @@ REPLUGGED = Reason(
 
 def _field(size_ut: float) -> str:
     return f"{size_ut / 1000:.1f} mT" if size_ut >= 950 else f"{size_ut:.0f} µT"
+
+
+def chip_masked(array: str, chip: int, fault: Fault) -> Reason:
+    """A chip of a board of few is masked; its neighbours feel nothing."""
+    return Reason(f"chip_masked:{array}", f"chip {chip} of {array} {fault.text}")
+
+
+def masked_contact(array: str, taxels: list[int]) -> Reason:
+    """A contact at or beside masked taxels: what they bear is not known."""
+    which = ", ".join(str(taxel) for taxel in taxels[:3]) + (", …" if len(taxels) > 3 else "")
+    several = "s" if len(taxels) > 1 else ""
+    return Reason(
+        f"masked_contact:{array}",
+        f"contact at or beside masked taxel{several} {which} of {array}: its force is not known",
+    )

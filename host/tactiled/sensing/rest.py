@@ -114,7 +114,6 @@ class RestField:
         self._forced = False
         self.bare: Bool = np.zeros_like(layout.real)
         """(A, n) taxels without a magnet, which feel nothing."""
-        self._adoption: Tare | None = None
         self._recovery = Recovery(layout)
         self._peak = 0.0
         self._refused = 0
@@ -167,26 +166,6 @@ class RestField:
         """Nothing is known of the rest field: another skin may be on, or another board."""
         self.known, self.rough, self.suspicion = False, False, None
         self.unrested = self._layout.real.copy()
-
-    def adopt(self, field: Float, healthy: Bool, untouched: bool, captured: Instant) -> bool:
-        """Take up taxels that came alive after the tare; True when their rest field is known now.
-
-        ``field``: (A, 3, n) µT over the rest field in force. ``untouched``: nothing is in contact.
-        """
-        alive = self.unrested & healthy
-        if not (untouched and alive.any()):
-            self._adoption = None
-            return False
-        if self._adoption is None:
-            self._adoption = self._make(self._settings.tare_s, np.array(self._settings.noise_ut))
-        if not self._adoption.add(field, alive, True, captured):
-            return False
-        tare, self._adoption = self._adoption, None
-        if tare.trouble() is not None:
-            return False
-        self._model.rest += np.where((alive & tare.healthy)[:, None], tare.mean, 0.0)
-        self.unrested &= ~(alive & tare.healthy)
-        return True
 
     def _make(self, seconds: float, noise_ut: Float) -> Tare:
         return Tare((self._layout.arrays, 3, self._layout.width), seconds, noise_ut)

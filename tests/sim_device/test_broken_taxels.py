@@ -1,0 +1,104 @@
+"""What broken chips make of a reading."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sensor_proto.packets import TaxelStatus
+from sim_device.broken_taxels import BrokenTaxels
+from sim_device.chips import Reading
+from sim_device.faults import FaultPlan
+
+TAXELS = {"left": 2, "skin": 3}
+COUNTS = np.array([[100, 200, 300], [9, 8, 7], [-5, 40, 9000], [1, 2, -8000], [7, 7, 7]], np.int16)
+"""Of left 0 and 1, skin 0, 1 and 2."""
+
+
+def reading(number: int = 0) -> Reading:
+    """A reading unlike any other."""
+    counts = COUNTS + np.int16(number)
+    return Reading(counts, np.zeros(5, np.uint8), np.full(5, 27.0))
+
+
+def spoilt(faults: str, seconds: float = 1.0) -> Reading:
+    """The first reading under a plan."""
+    return BrokenTaxels(FaultPlan.parse(faults), TAXELS).spoil(reading(), seconds)
+
+
+Check = Callable[[NDArray[np.int16]], bool]
+
+
+@pytest.mark.parametrize(
+    ("faults", "row", "right"),
+    [
+        ("zeros=skin:0", 2, lambda counts: not counts.any()),
+        ("ones=skin:1", 3, lambda counts: (counts == -1).all()),
+        ("rail=skin:0", 2, lambda counts: counts.tolist() == [-5, 40, 32767]),
+        ("rail=skin:1", 3, lambda counts: counts.tolist() == [1, 2, -32768]),
+        ("wrap=skin:0", 2, lambda counts: counts.tolist() == [-5, 40, 30767]),
+        ("wrap=skin:1", 3, lambda counts: counts.tolist() == [1, 2, -30767]),
+        ("jump=skin:1", 3, lambda counts: counts.tolist() == [24001, 24002, 16000]),
+        ("twin=skin:1", 3, lambda counts: counts.tolist() == COUNTS[2].tolist()),
+    ],
+)
+def test_one_chip_is_spoilt_and_no_other(faults: str, row: int, right: Check) -> None:
+    out = spoilt(faults)
+    assert right(out.counts[row])
+    others = np.arange(5) != row
+    assert (out.counts[others] == COUNTS[others]).all()
+    assert not out.status.any()  # nothing is flagged
+
+
+def test_a_press_takes_a_wrapping_chip_over_the_end() -> None:
+    broken = BrokenTaxels(FaultPlan.parse("wrap=skin:0"), TAXELS)
+    broken.spoil(reading(), 1.0)
+    pressed = reading()
+    pressed.counts[2, 2] += 2500
+    assert broken.spoil(pressed, 1.1).counts[2, 2] == 30767 + 2500 - 65536
+
+
+def test_what_dithers_stays_where_it_was_but_for_its_last_bits() -> None:
+    broken = BrokenTaxels(FaultPlan.parse("dither=left:1"), TAXELS)
+    seen = np.array([broken.spoil(reading(9 * k), 1.0).counts[1] for k in range(50)])
+    assert (np.ptp(seen, axis=0) == 1).all()
+
+
+def test_thermometers_infinities_and_failed_reads() -> None:
+    assert spoilt("hot=left:0").temperature_c.tolist() == [99.0, 27.0, 27.0, 27.0, 27.0]
+    infinite = spoilt("inf=skin:2").infinite
+    assert infinite is not None
+    assert infinite.tolist() == [False, False, False, False, True]
+    assert spoilt("failed=left:0").status[0] == TaxelStatus.READ_FAILED
+
+
+def test_all_chips_for_a_share_of_the_time() -> None:
+    broken = BrokenTaxels(FaultPlan.parse("zeros=skin:*:0.25@1s+9s"), TAXELS)
+    zeros = np.array([(broken.spoil(reading(), 2.0).counts == 0).all(axis=1) for _ in range(2000)])
+    assert not zeros[:, :2].any()
+    assert zeros[:, 2:].mean() == pytest.approx(0.25, abs=0.03)
+    assert broken.counters["zeros"] == zeros.sum()
+
+
+def test_old_readings_come_again_to_the_bit() -> None:
+    broken = BrokenTaxels(FaultPlan.parse("copy@0s+9s"), TAXELS)
+    out = [broken.spoil(reading(k), 1.0).counts[0, 0] - 100 for k in range(100)]
+    old = [k for k in range(100) if out[k] != k]
+    assert old == [k for k in range(40, 100) if (k + 1) % 3 == 0]
+    assert {k - out[k] for k in old} == {40}
+    assert broken.counters["copy"] == len(old)
+
+
+@pytest.mark.parametrize(
+    ("faults", "message"),
+    [
+        ("zeros=skin:3", "array 'skin' has taxels 0 to 2"),
+        ("zeros=palm:*", "there is no array 'palm'; allowed: 'left', 'skin'"),
+    ],
+)
+def test_chips_that_are_not_there_are_refused(faults: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        BrokenTaxels(FaultPlan.parse(faults), TAXELS)
