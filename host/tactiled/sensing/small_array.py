@@ -406,10 +406,11 @@ class SmallArray:
             slack = (RELEASED_SHARE * self._peak[i]) ** 2
             distance = (state[:, 1 + i] ** 2 / (own + slack + MODEL_ERROR_UT**2)).sum()
             if distance < RELEASED_SIGMAS**2:
-                self._pin(i, slack)
+                # while its neighbours are loaded it may bear a little still
+                self._free[i] = self._near[i] = True
         if self._free.all():
             for i in np.flatnonzero(self._near).tolist():
-                self._pin(i, 0.0)
+                self._pin(i, (RELEASED_SHARE * self._peak[i]) ** 2)
             state[:, 1:] = 0.0
             cov[:, 1:, :] = 0.0
             cov[:, :, 1:] = 0.0

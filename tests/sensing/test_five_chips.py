@@ -1,0 +1,261 @@
+"""A board of five magnetometers, all of which feel a press: force, bound, rest; rows 5, 7 and 48.
+
+Fields are those of a recorded board's rest with what happens to it added, through the pipeline of
+an uncalibrated AnySkin in virtual time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sim_device.skin import Contact
+from tactile_bus.calibration import nominal
+from tactile_bus.geometry import anyskin
+from tactile_bus.instant import Instant
+from tactile_tools.benches.skin5 import TURN_AXIS, Board
+from tactiled.blocks import Cycle, SampleBlock
+from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings, RestState
+from tactiled.sensing.reasons import REPLUGGED
+
+Float = NDArray[np.float64]
+REST = np.array(
+    [
+        [-1391, 0, -1744],
+        [41, -2, -514],
+        [266, -788, -1335],
+        [1933, 3962, -3840],
+        [-577, 219, -1030],
+    ],
+    dtype=float,
+)
+OTHER_SKIN = REST * np.array([[0.8], [1.2], [0.9], [0.85], [1.1]]) + 60
+BARE = np.full((5, 3), 20.0)
+ARRAY = anyskin().arrays[0]
+PLACE = np.column_stack([ARRAY.surface, np.zeros(5)])
+
+
+class Owner:
+    """What an owner's board reads, frame by frame."""
+
+    def __init__(self, hz: float = 100.0, seed: int = 1) -> None:
+        self.hz = hz
+        self.pipeline = BoardPipeline(nominal("anyskin", ""), PipelineSettings())
+        self.rng = np.random.default_rng(seed)
+        self.frame = 0
+        self.play(lambda _: REST, 1.0)
+
+    def play(
+        self,
+        field_at: Callable[[float], Float],
+        seconds: float,
+        celsius_at: Callable[[float], float] = lambda _: 27.0,
+    ) -> list[Cycle]:
+        """Cycles of ``seconds`` in which the chips read ``field_at(s)``, noise added."""
+        out = []
+        for k in range(round(seconds * self.hz)):
+            t = k / self.hz
+            noise = self.rng.normal(0, 1, (5, 3)) * (1.5, 1.5, 2.5)
+            now = Instant(round(self.frame / self.hz * 1e9))
+            celsius = np.round((celsius_at(t) + self.rng.normal(0, 0.05, 5)) * 45.2) / 45.2
+            lsb = np.array([0.15, 0.15, 0.242])
+            field = np.round((field_at(t) + noise) / lsb) * lsb
+            block = SampleBlock(
+                0, self.frame, now, now, 0.01, field, celsius, np.zeros(5, np.uint8)
+            )
+            out += self.pipeline.feed(block)
+            self.frame += 1
+        return out
+
+
+def in_chips(field: Float) -> Float:
+    """(5, 3) µT in the skin's axes as each chip, mounted with its own yaw, reads it."""
+    c, s = np.cos(ARRAY.chip_yaw), np.sin(ARRAY.chip_yaw)
+    x, y = field[:, 0], field[:, 1]
+    return np.column_stack([c * x + s * y, -s * x + c * y, field[:, 2]])
+
+
+def turning(t: float, rad_per_s: float = 1.0) -> Float:
+    a = rad_per_s * t
+    return in_chips(np.tile([50 * np.sin(a), 0.0, 50 * np.cos(a) - 50], (5, 1)))
+
+
+def pressed(newton: dict[int, float]) -> Float:
+    field = np.zeros((5, 3))
+    for chip, force in newton.items():
+        field[chip, 2] = 115.0 * force
+    return field
+
+
+def codes(cycles: list[Cycle]) -> set[str]:
+    return {code for cycle in cycles for code in cycle.features.codes}
+
+
+def honest(cycles: list[Cycle], newton: float) -> float:
+    """Share of the cycles whose bound holds a normal force of ``newton``."""
+    return float(
+        np.mean(
+            [abs(c.features.normal_force - newton) <= c.features.normal_force_bound for c in cycles]
+        )
+    )
+
+
+@pytest.mark.parametrize("newton", [1.0, 3.0, 10.0])
+def test_a_press_on_a_calibrated_board_reads_what_it_is(newton):
+    board = Board(3)
+    axes, centre = ARRAY.rotation[0], ARRAY.position[0]
+    load = axes @ np.array([0.1 * newton, 0.0, -newton])
+
+    def force(t):
+        share = min(1.0, max(0.0, (t - 0.3) / 0.15))
+        return board.skin.taxel_force([Contact(centre + 0.003 * axes[:, 0], share * load, 4e-3)])
+
+    truth, cycles = board.run(force, lambda _: np.eye(3), 1.5)
+    late = cycles[70:]
+    read = np.mean([c.features.normal_force for c in late])
+    assert read == pytest.approx(truth[-1], abs=max(0.25, 0.06 * truth[-1]))
+    assert all(c.features.valid for c in late)
+    assert honest(late, truth[-1]) > 0.95
+    # and is over when it is over
+    _, after = board.run(lambda _: np.zeros((5, 3)), lambda _: np.eye(3), 1.0)
+    assert after[-1].features.normal_force < 0.25
+
+
+@pytest.mark.parametrize("chips", [[], [2], [0, 1, 2]])
+def test_bounds_hold_while_the_board_turns_under_a_press(chips):
+    owner = Owner()
+    owner.play(lambda t: REST + turning(t), 2.0)
+    load = pressed(dict.fromkeys(chips, 2.0))
+    cycles = owner.play(lambda t: REST + turning(2.0 + t) + load, 6.0)
+    assert honest(cycles, 2.0 * len(chips)) > 0.97
+    if chips:
+        peaks = [c.features.peak_force for c in cycles[50:]]
+        assert np.median(peaks) == pytest.approx(2.0, abs=0.15)
+    else:
+        assert max(c.features.normal_force for c in cycles) < 0.1
+        assert all(c.features.valid for c in cycles)
+
+
+def test_every_taxel_has_its_bound_and_it_grows_while_nothing_shows_the_field():
+    board = Board(5)
+    load = np.zeros((5, 3))
+    load[:, 2] = -2.0
+    from sim_device.environment import rotation_about
+
+    _, cycles = board.run(
+        lambda t: load * min(1.0, max(0.0, t - 0.5) / 0.15),
+        lambda t: rotation_about(TURN_AXIS, max(0.0, t - 2.0)),
+        6.0,
+    )
+    early, late = cycles[100], cycles[-1]
+    assert early.normal_bound.shape == (5,)
+    assert (late.normal_bound > early.normal_bound).all()
+    assert "uncertain:skin" in codes(cycles[300:])
+    assert not cycles[-1].features.valid
+
+
+def test_a_uniform_field_that_leaps_is_no_contact_and_passes():
+    owner = Owner()
+    leap = in_chips(np.tile([1200.0, -800.0, 1400.0], (5, 1)))
+    on = owner.play(lambda t: REST + leap * min(1.0, t / 0.2), 1.5)
+    assert "field_jump" in codes(on)
+    assert not any(c.features.valid and c.features.normal_force > 0.5 for c in on)
+    assert owner.pipeline.rest_state is RestState.SUSPECT
+    text = next(r.text for r in on[-1].features.reasons if r.code == "field_jump")
+    assert "on all taxels at once" in text
+    assert "tare" in text
+    off = owner.play(lambda _: REST, 3.0)
+    assert off[-1].features.valid
+    assert off[-1].features.normal_force < 0.1
+    assert owner.pipeline.rest_state is RestState.KNOWN
+
+
+@pytest.mark.parametrize("gain", [1.2, 0.8, 0.6])
+def test_a_change_of_gain_is_seen_at_once_and_taken_up(gain):
+    owner = Owner()
+    cycles = owner.play(lambda _: REST * gain, 3.0)
+    assert cycles[0].features.codes[0] == "gain_changed"
+    assert not any(c.features.valid and c.features.normal_force > 0.3 for c in cycles)
+    assert cycles[-1].features.valid
+
+
+def test_another_skin_is_never_a_contact_and_is_taken_up():
+    owner = Owner(hz=40.0)
+    bare = owner.play(lambda _: BARE, 2.0)
+    assert codes(bare) >= {"skin_off:skin"}
+    assert not any(c.features.valid for c in bare)
+    other = owner.play(lambda _: OTHER_SKIN, 4.0)
+    assert not any(c.features.valid and c.features.normal_force > 0.3 for c in other)
+    assert other[-1].features.valid
+    assert owner.pipeline.tare_report.accepted
+    press = owner.play(lambda _: OTHER_SKIN + pressed({2: 3.0}), 2.0)
+    assert press[-1].features.normal_force == pytest.approx(3.0, abs=0.3)
+
+
+def test_a_magnet_that_comes_loose_leaves_its_taxel_masked():
+    owner = Owner(hz=40.0)
+    lost = REST.copy()
+    lost[2] = 20, 10, 30
+    cycles = owner.play(lambda _: lost, 4.0)
+    assert not any(c.features.valid and c.features.normal_force > 0.3 for c in cycles)
+    assert "magnet_lost:skin" in codes(cycles)
+    assert np.isnan(cycles[-1].force[2]).all()
+    assert np.isfinite(cycles[-1].force[[0, 1, 3, 4]]).all()
+
+
+def test_warming_is_no_contact_and_its_doubt_is_said():
+    owner = Owner(hz=20.0)
+
+    def warmer(t):
+        return 20.0 * min(1.0, t / 60.0)
+
+    offset = np.random.default_rng(2).normal(0, 0.5, (5, 3))
+    cycles = owner.play(
+        lambda t: REST * (1 - 0.0012 * warmer(t)) + offset * warmer(t),
+        70.0,
+        lambda t: 27.0 + warmer(t),
+    )
+    assert not any(c.features.valid and c.features.normal_force > 0.3 for c in cycles)
+    assert honest(cycles, 0.0) > 0.99
+    assert "temperature_moved" in codes(cycles)
+    assert not cycles[-1].features.valid
+    owner.pipeline.tare()
+    after = owner.play(lambda _: REST * (1 - 0.024) + offset * 20.0, 2.0, lambda _: 47.0)
+    assert after[-1].features.valid
+
+
+def test_a_tare_under_load_is_refused_unless_it_is_forced():
+    owner = Owner()
+    load = REST + pressed({2: 4.0})
+    owner.play(lambda _: load, 1.0)
+    owner.pipeline.tare()
+    owner.play(lambda _: load, 1.0)
+    report = owner.pipeline.tare_report
+    assert not report.accepted
+    assert "force" in report.message
+    assert owner.play(lambda _: load, 0.3)[-1].features.normal_force > 3.0
+    owner.pipeline.tare(force=True)
+    after = owner.play(lambda _: load, 1.0)
+    assert owner.pipeline.tare_report.accepted
+    assert after[-1].features.normal_force < 0.2
+
+
+def test_a_board_that_may_be_another_has_no_rest_until_it_is_tared():
+    owner = Owner()
+    owner.pipeline.forget_rest(REPLUGGED)
+    cycles = owner.play(lambda _: OTHER_SKIN, 1.5)
+    assert cycles[0].features.codes[0] == "replugged"
+    assert not any(c.features.valid and c.features.normal_force > 0.2 for c in cycles)
+    assert cycles[-1].features.valid
+
+
+def test_what_a_skin_has_not_recovered_fades_and_is_not_a_contact_for_good():
+    owner = Owner(hz=25.0)
+    owner.play(lambda _: REST + pressed({0: 8.0, 1: 15.0, 2: 3.0, 3: 6.0, 4: 4.0}), 4.0)
+    left = pressed({0: 0.3, 1: 0.7, 2: 0.2, 3: 0.3, 4: 0.2})  # 4 % of the peak
+    cycles = owner.play(lambda _: REST + left, 15.0)
+    assert cycles[-1].features.normal_force < 0.3
+    assert owner.play(lambda _: REST + left, 3.0)[-1].features.valid
