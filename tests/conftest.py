@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,17 @@ from tactile_bus.messages import codec
 settings.register_profile("same", derandomize=True, deadline=None, database=None)
 settings.register_profile("random", deadline=None, database=None, print_blob=True)
 settings.load_profile("same")
+
+
+@pytest.fixture
+def fresh_seed(request: pytest.FixtureRequest) -> int:
+    """A seed: the same in ``make test``, another each time in ``make test-random``."""
+    if request.config.getoption("--hypothesis-profile") != "random":
+        return 0
+    seed = random.SystemRandom().randrange(1 << 30)
+    print("seed", seed)
+    return seed
+
 
 Edit = Callable[[str, int, Any], Iterable[tuple[str, int, Any]]]
 

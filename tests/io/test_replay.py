@@ -35,7 +35,7 @@ def read_to_the_end(host: SerialTransport) -> bytes:
     data = b""
     try:
         while True:
-            chunk = host.read(5)
+            chunk = host.read(60)
             assert chunk is not None
             assert isinstance(chunk.payload, bytes)
             data += chunk.payload
@@ -181,7 +181,7 @@ def test_a_recording_goes_whole_through_simdevice_and_a_terminal(tmp_path: Path)
     host.open()
     data = read_to_the_end(host)
     host.close()
-    _, errors = process.communicate(timeout=10)
+    _, errors = process.communicate(timeout=60)
     assert process.returncode == 0, errors
     assert not os.path.lexists(link)
     samples = decoded(data)

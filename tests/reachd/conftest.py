@@ -27,7 +27,7 @@ from tactile_bus.session import BusConfig, close_session, open_session
 from tactile_bus.streams import declare_publisher
 from tactile_bus.topics import ARM_STATE, COMMAND, REACH_EVENT, REACH_STATE, service_key
 
-SLOW = 40.0
+SLOW = 60.0
 """s that anything may take on a busy machine before a test gives it up."""
 
 EXPIRY = 0.06

@@ -138,7 +138,7 @@ def test_killed_its_arm_stops_its_log_recovers_and_the_next_one_starts(
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--log", "trial.mcap")
     lab.reaching(program)
-    time.sleep(1.0)
+    wait_until(lambda: (lab.folder / "trial.mcap").stat().st_size > 20_000)
     program.signal(signal.SIGKILL)
     program.wait()
     wait_until(lambda: not arm.moving)
