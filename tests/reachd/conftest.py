@@ -295,6 +295,10 @@ class Lab:
         until(lambda: self.arm.moving or program.process.poll() is not None)
         assert program.process.poll() is None, program.said
 
+    def told_to_stand(self) -> None:
+        """Wait until the last word to the arm is zero: it may be on its way when reachd is gone."""
+        until(lambda: bool(self.arm.heard) and all(h.still for h in self.arm.heard[-3:]))
+
     def close(self) -> None:
         for program in self._programs:
             program.end()
