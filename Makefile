@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup test lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage stress clean
+.PHONY: setup test test-random lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage stress clean
 
 setup: $(STAMP)
 
@@ -21,6 +21,12 @@ lint: setup
 
 test: lint
 	$(BIN)/python -m pytest -n 2
+
+# The property tests on new examples; `make test` draws the same ones every time. RUNS=20: as often.
+RUNS ?= 1
+test-random: setup
+	@for run in $$(seq $(RUNS)); do \
+	  $(BIN)/python -m pytest -q -n 2 --hypothesis-profile=random -m "hypothesis or random" || exit 1; done
 
 demo: setup
 	$(BIN)/tactile demo --out demo.mcap --png demo.png

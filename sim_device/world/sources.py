@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Final
 
@@ -11,10 +12,16 @@ from sim_device.world.scenes import Scene, SceneError
 
 FILE_PREFIX: Final = "recorded:"
 
+RECORDED_SCENES: Final = "scenes_1_60.json.gz"
+RECORDED_OUTCOMES: Final = "outcomes_1_60.csv"
+"""Names of the sixty scenes recorded in the authors' simulator, and of what happened in them.
+
+They are not part of this repository: nobody has put them under a licence."""
+
+FOLDER_VARIABLE: Final = "TACTILE_SCENES_DIR"
+"""Environment variable that names the folder where they are."""
+
 _BESIDE = Path(__file__).resolve().parents[3] / "shared" / "data" / "authors_scenes"
-RECORDED_FILE: Final = _BESIDE / "scenes_1_60.json.gz"
-RECORDED_OUTCOMES: Final = _BESIDE / "outcomes_1_60.csv"
-"""Where the recorded scenes, and what happened in them, lie beside a checkout."""
 
 MAX_SCENE_BYTES: Final = 1 << 20
 """A scene of 200 objects, the most there may be, takes 50 kB of JSON."""
@@ -30,7 +37,7 @@ def load_scene(name: str, seed: int) -> Scene:
     if name in GENERATORS:
         return generate(name, seed)
     if name == RECORDED:
-        return _recorded(RECORDED_FILE, seed)
+        return _recorded(find_recorded(RECORDED_SCENES), seed)
     if name.startswith(FILE_PREFIX):
         return _recorded(Path(name.removeprefix(FILE_PREFIX)), seed)
     path = Path(name)
@@ -38,6 +45,26 @@ def load_scene(name: str, seed: int) -> Scene:
         return _from_file(path)
     known = ", ".join([*sorted(GENERATORS), RECORDED, f"{FILE_PREFIX}FILE.json.gz"])
     raise SceneError(f"no scenes are called {name!r}; allowed: {known}, FILE.json")
+
+
+def find_recorded(name: str) -> Path:
+    """Where ``name``, a file of the recorded scenes, is; SceneError that says where to put it.
+
+    Looked for in the folder that `FOLDER_VARIABLE` names, else in the user's data folder, else
+    beside the checkout.
+    """
+    told = os.environ.get(FOLDER_VARIABLE)
+    data = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
+    home = data / "tactile-reach" / "authors_scenes"
+    folders = [Path(told)] if told else [home, _BESIDE]
+    for folder in folders:
+        if (folder / name).is_file():
+            return folder / name
+    raise SceneError(
+        f"{name} is not in {folders[0]}: the scenes recorded in the authors' simulator are not "
+        f"part of this repository; put {RECORDED_SCENES} and {RECORDED_OUTCOMES} there, or name "
+        f"their folder with {FOLDER_VARIABLE}"
+    )
 
 
 def _recorded(path: Path, seed: int) -> Scene:

@@ -145,7 +145,7 @@ def bus(free_port: Callable[[], int]) -> Iterator[Callable[..., Any]]:
 def until() -> Callable[..., None]:
     """``until(condition)``: wait for it, or fail."""
 
-    def wait(condition: Callable[[], object], timeout: float = 15.0) -> None:
+    def wait(condition: Callable[[], object], timeout: float = 60.0) -> None:
         deadline = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < deadline, "waited in vain"

@@ -1,8 +1,9 @@
-"""Skins whose force is known in closed form, and the recordings that may be beside the project."""
+"""Skins whose force is known in closed form, and recordings of a real board."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from tactile_tools.calibrate.recording import Recording
 
 Float = NDArray[np.float64]
 
-EFLESH = Path(__file__).parents[2].parent / "shared" / "data" / "eflesh"
+EFLESH = Path(__file__).parents[1] / "data" / "eflesh"
 PERIOD_S = 0.07
 NORMAL = ("normal_force_20250401_014340", "normal_force_20250401_015037")
 SHEAR = "shear_force_20250416_200533"
@@ -110,12 +111,10 @@ def write_pair(tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture(scope="session")
 def real() -> Callable[[str], Recording]:
-    """Recording of the eFlesh rig by name; skips where the data are not beside the project."""
+    """Recording of the eFlesh rig by name, read once: `Recording` does not change."""
 
+    @cache
     def read(name: str) -> Recording:
-        folder = EFLESH / name
-        if not folder.is_dir():
-            pytest.skip(f"the recordings are not at {EFLESH}")
-        return read_pair(folder)
+        return read_pair(EFLESH / name)
 
     return read

@@ -104,7 +104,7 @@ class Cupboard:
 
     def call(self, service: str, request: object = None, kind: str = "arm") -> Any:
         key = service_key("arm" if kind == "arm" else "world", service, kind)
-        return call(self.session, key, request, timeout=20)
+        return call(self.session, key, request, timeout=60)
 
     def publisher(self) -> Publisher:
         return declare_publisher(self.session, COMMAND, "arm")
@@ -132,7 +132,7 @@ class Cupboard:
 
     def end(self) -> tuple[int, str]:
         self.process.send_signal(signal.SIGINT)
-        _, errors = self.process.communicate(timeout=20)
+        _, errors = self.process.communicate(timeout=60)
         return self.process.returncode, errors
 
     def close(self) -> None:
@@ -142,7 +142,7 @@ class Cupboard:
             self.process.communicate()
 
 
-def until(condition: Callable[[], object], timeout: float = 30.0) -> None:
+def until(condition: Callable[[], object], timeout: float = 60.0) -> None:
     deadline = time.monotonic() + timeout
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"

@@ -11,6 +11,8 @@ import pytest
 from reachd.goals import make_goal, parse_target
 from reachd.parameters import SETS
 from sim_device.cli import main
+from sim_device.world import sources
+from sim_device.world.sources import FOLDER_VARIABLE, RECORDED_OUTCOMES, RECORDED_SCENES
 
 BAD = [
     (
@@ -93,15 +95,42 @@ def test_the_goal_of_a_scene_is_one_that_reachd_takes(
     assert capsys.readouterr().out.strip() == text
 
 
-def test_recorded_scenes_are_found_by_their_number(capsys: pytest.CaptureFixture[str]) -> None:
-    folder = Path(__file__).parents[3] / "shared/data/authors_scenes"
-    if not folder.is_dir():
-        pytest.skip("the recorded scenes are not here (../shared/data/authors_scenes)")
+FOUR = Path(__file__).parents[1] / "data" / "recorded_scenes"
+
+
+def test_recorded_scenes_are_found_by_their_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / RECORDED_SCENES).write_bytes((FOUR / "scenes_5_8.json.gz").read_bytes())
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
     goals = []
-    for name in ("authors_sim_recorded", f"recorded:{folder}/scenes_1_60.json.gz"):
+    for name in ("authors_sim_recorded", f"recorded:{tmp_path / RECORDED_SCENES}"):
         assert main(["cupboard", "--scene", name, "--seed", "7", "--print-goal"]) == 0
         goals.append(capsys.readouterr().out)
         assert main(["cupboard", "--scene", name, "--seed", "99", "--print-goal"]) == 2
-        assert "scenes_1_60.json.gz has 1 to 60" in capsys.readouterr().err
+        assert "scenes_1_60.json.gz has 5 to 8" in capsys.readouterr().err
     assert goals[0] == goals[1]
     assert goals[0].startswith("0.3580,")
+
+
+@pytest.mark.parametrize("place", ["folder", "home"])
+def test_recorded_scenes_that_are_not_there_are_asked_for(
+    place: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sources, "_BESIDE", tmp_path / "none")
+    monkeypatch.delenv(FOLDER_VARIABLE, raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    if place == "folder":
+        monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "empty"))
+    asked = tmp_path / ("empty" if place == "folder" else "tactile-reach/authors_scenes")
+    words = ["cupboard", "--scene", "authors_sim_recorded", "--seed", "7", "--print-goal"]
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert f"{RECORDED_SCENES} is not in {asked}" in said
+    assert f"put {RECORDED_SCENES} and {RECORDED_OUTCOMES} there" in said
+    asked.mkdir(parents=True)
+    (asked / RECORDED_SCENES).write_bytes((FOUR / "scenes_5_8.json.gz").read_bytes())
+    assert main(words) == 0

@@ -315,7 +315,7 @@ def ask() -> Callable[..., Any]:
         service: str,
         payload: object = None,
         name: str = "board0",
-        timeout: float = 10.0,
+        timeout: float = SLOW,
     ) -> Any:
         return call(session, service_key(name, service), payload, timeout)
 

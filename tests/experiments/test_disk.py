@@ -138,7 +138,7 @@ def test_a_real_short_write_leaves_whole_lines(alone: Path, tmp_path: Path) -> N
         capture_output=True,
         text=True,
         check=True,
-        timeout=60,
+        timeout=100,
     )
     assert "finished trials are kept" in done.stdout
     found, damaged = parse_lines((tmp_path / "run" / "trials.jsonl").read_bytes())

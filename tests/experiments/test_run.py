@@ -68,8 +68,9 @@ def test_a_run_grows_by_scenes_and_strategies_and_keeps_what_is_finished(
     assert load_run(folder).missing == 0
 
 
+@pytest.mark.random
 def test_a_run_killed_at_a_random_moment_and_resumed_gives_the_table_of_one_left_alone(
-    alone: Path, run_of: Run, study: Study, tmp_path: Path
+    alone: Path, run_of: Run, study: Study, tmp_path: Path, fresh_seed: int
 ) -> None:
     folder = tmp_path / "killed"
     words = [
@@ -79,9 +80,7 @@ def test_a_run_killed_at_a_random_moment_and_resumed_gives_the_table_of_one_left
     ]  # fmt: skip
     command = [sys.executable, "-m", "tactile_tools.cli", "experiment", *words]
     whole = len(study.specs)
-    seed = random.randrange(1 << 30)
-    print("seed", seed)
-    rng = random.Random(seed)
+    rng = random.Random(fresh_seed)
     kills = 0
     for _ in range(2):
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

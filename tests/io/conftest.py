@@ -13,6 +13,9 @@ from tactile_bus.instant import monotonic_now
 from tactiled.blocks import Chunk
 from tactiled.transports.base import Transport
 
+SLOW = 60.0
+"""s that anything may take on a busy machine before a test gives it up."""
+
 
 @pytest.fixture
 def pty(tmp_path: Path) -> Iterator[PtyPort]:
@@ -79,7 +82,7 @@ def adapter_of(tmp_path: Path) -> Iterator[Callable[[str], AdapterThread]]:
         thread.stop()
 
 
-def read_payload(transport: Transport, wanted: int, seconds: float = 5.0) -> bytes:
+def read_payload(transport: Transport, wanted: int, seconds: float = SLOW) -> bytes:
     """``wanted`` bytes, or what came in ``seconds``."""
     data = b""
     end = time.monotonic() + seconds
@@ -91,7 +94,7 @@ def read_payload(transport: Transport, wanted: int, seconds: float = 5.0) -> byt
     return data
 
 
-def read_frames(transport: Transport, wanted: int, seconds: float = 5.0) -> list[CanFrame]:
+def read_frames(transport: Transport, wanted: int, seconds: float = SLOW) -> list[CanFrame]:
     """``wanted`` frames, or what came in ``seconds``."""
     frames: list[CanFrame] = []
     end = time.monotonic() + seconds
@@ -103,7 +106,7 @@ def read_frames(transport: Transport, wanted: int, seconds: float = 5.0) -> list
     return frames
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 5.0) -> bool:
+def wait_for(condition: Callable[[], bool], seconds: float = SLOW) -> bool:
     """Whether ``condition`` came true within ``seconds``."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -143,13 +146,12 @@ def run_in_background() -> Iterator[Callable[[Callable[[], object]], Outcome]]:
 
 
 class Outcome:
-    """What a function in another thread returned or raised, and when."""
+    """What a function in another thread returned or raised."""
 
     def __init__(self, function: Callable[[], object]) -> None:
         self._function = function
         self.value: object = None
         self.error: Exception | None = None
-        self.at = 0.0
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
@@ -158,10 +160,9 @@ class Outcome:
             self.value = self._function()
         except Exception as error:  # noqa: BLE001 - kept for the test to judge
             self.error = error
-        self.at = time.monotonic()
 
     def join(self) -> None:
-        self._thread.join(10)
+        self._thread.join(SLOW)
         assert not self._thread.is_alive()
 
 

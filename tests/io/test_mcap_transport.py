@@ -106,7 +106,7 @@ def test_a_log_is_replayed_at_its_pace_or_faster(tmp_path: Path) -> None:
     assert transport.read(1) is not None
     assert transport.read(0) is None
     play(transport)
-    assert 0.9 * 49 * 0.02 / 5 < time.monotonic() - start < 10
+    assert time.monotonic() - start > 0.9 * 49 * 0.02 / 5
     transport.close()
 
 
@@ -165,7 +165,7 @@ def test_closing_wakes_a_reader_that_waits_for_its_time(
     transport = McapTransport(write_log(tmp_path / "run.mcap", ("b", far)))
     transport.open()
     assert transport.read(1) is not None
-    outcome = run_in_background(lambda: transport.read(20))
+    outcome = run_in_background(lambda: transport.read(600))
     time.sleep(0.05)
     transport.close()
     outcome.join()

@@ -65,7 +65,7 @@ def hear(
 ) -> list[Any]:
     """What a board says until it is ``enough``; ``ask`` makes the question of every half second."""
     messages: list[Any] = []
-    end = time.monotonic() + 20
+    end = time.monotonic() + 60
     again = 0.0
     while not enough(messages) and time.monotonic() < end:
         if ask is not None and time.monotonic() >= again:
@@ -110,7 +110,7 @@ def test_a_signal_ends_it_in_order_and_no_link_stays(
     assert (tmp_path / "board0").is_symlink()
     assert (tmp_path / "can0").is_symlink()
     process.send_signal(number)
-    _, errors = process.communicate(timeout=10)
+    _, errors = process.communicate(timeout=60)
     assert process.returncode == 0
     assert "Traceback" not in errors
     assert list(tmp_path.iterdir()) == []
@@ -118,7 +118,7 @@ def test_a_signal_ends_it_in_order_and_no_link_stays(
 
 def test_it_ends_by_itself_after_its_duration(launch: Launch, tmp_path: Path) -> None:
     process = launch("boards", "--pty", "board0", "--duration", "0.2")
-    _, errors = process.communicate(timeout=10)
+    _, errors = process.communicate(timeout=60)
     assert process.returncode == 0
     assert "board0: " in errors
     assert list(tmp_path.iterdir()) == []

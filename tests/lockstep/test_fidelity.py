@@ -9,7 +9,7 @@ import pytest
 
 from tactile_tools.cli import main
 
-RECORDED = Path(__file__).parents[2].parent / "shared" / "data" / "authors_scenes"
+RECORDED = Path(__file__).parents[1] / "data" / "recorded_scenes"
 
 
 def test_without_recordings_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -17,17 +17,23 @@ def test_without_recordings_it_says_so(tmp_path: Path, capsys: pytest.CaptureFix
     assert "none.gz" in capsys.readouterr().err
 
 
-@pytest.mark.skipif(not RECORDED.is_dir(), reason=f"the recordings are not at {RECORDED}")
 def test_a_scene_is_compared_outcome_by_outcome(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Our own outcomes, so that they agree but where a machine calculates otherwise."""
     report = tmp_path / "fidelity.json"
-    scenes, outcomes = RECORDED / "scenes_1_60.json.gz", RECORDED / "outcomes_1_60.csv"
-    words = ["fidelity", "--scenes", str(scenes), "--outcomes", str(outcomes), "--most", "1"]
+    words = ["fidelity", "--scenes", str(RECORDED / "scenes_5_8.json.gz"), "--most", "1"]
     assert main([*words, "--repeats", "1", "--jobs", "2", "--json", str(report)]) == 0
     written = json.loads(report.read_text())
     assert len(written["trials"]) == 5 * 2
     assert {t["strategy"] for t in written["trials"]} == set(written["summary"])
     for one in written["summary"].values():
-        assert 0.0 <= one["agreement"] <= 1.0
-    assert main([*words, "--repeats", "-1"]) == 2
+        assert 0.0 <= one["own_agreement"] <= 1.0
+    assert sum(one["agreement"] for one in written["summary"].values()) >= 4
+    for wrong in (["--repeats", "-1"], ["--jobs", "0"], ["--most", "0"]):
+        assert main([*words, *wrong]) == 2
+    assert "are at least 1" in capsys.readouterr().err
+    stranger = tmp_path / "scenes_of_mine.json.gz"
+    stranger.write_bytes((RECORDED / "scenes_5_8.json.gz").read_bytes())
+    assert main(["fidelity", "--scenes", str(stranger)]) == 3
+    assert "outcomes_of_mine.csv" in capsys.readouterr().err

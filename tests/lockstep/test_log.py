@@ -84,7 +84,7 @@ def test_the_series_tells_the_reach(recorded: Recorded) -> None:
     assert math.dist(tip[-1], (goal.x, goal.y)) == pytest.approx(
         reach.states[-1].distance, abs=2e-3
     )
-    moments = reach.moments(5, apart_s=0.5, apart_m=0.01, least_n=0.3)
+    moments = reach.moments(5, least_n=0.3)
     assert moments == sorted(moments)
     assert len(moments) >= 2
     for index in moments:

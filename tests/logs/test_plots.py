@@ -63,6 +63,45 @@ def test_every_picture_is_drawn_without_a_display(skin_log: Path, tmp_path: Path
     assert len({(shape, float(p.mean())) for shape, p in zip(sizes, drawn, strict=True)}) == 5
 
 
+@pytest.mark.parametrize(("size", "inches"), [("column", 3.5), ("page", 7.1)])
+def test_a_picture_for_a_paper_has_its_width(
+    size: str, inches: float, skin_log: Path, tmp_path: Path
+) -> None:
+    words = ["plot", str(skin_log), "--what", "forces", "--size", size]
+    out = tmp_path / "a.png"
+    assert main([*words, "--dpi", "120", "--out", str(out)]) == 0
+    assert picture(out).shape[1] == pytest.approx(120 * inches, abs=1)
+
+
+def test_vector_formats_are_written_beside_the_log_and_the_same_each_time(
+    skin_log: Path, tmp_path: Path
+) -> None:
+    log = tmp_path / "run.mcap"
+    log.write_bytes(skin_log.read_bytes())
+    for suffix, begin in (("pdf", b"%PDF"), ("svg", b"<?xml")):
+        written = []
+        for _ in range(2):
+            assert main(["plot", str(log), "--what", "field", "--format", suffix]) == 0
+            written.append(log.with_suffix(f".{suffix}").read_bytes())
+        assert written[0] == written[1]
+        assert written[0].startswith(begin)
+
+
+def test_of_two_boards_it_is_said_which_is_drawn(
+    skin_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], rewrite: Any
+) -> None:
+    def with_thumb(topic: str, at: int, message: Any) -> list[tuple[str, int, Any]]:
+        return [(topic, at, message), (topic.replace("finger", "thumb_2"), at, message)]
+
+    log = rewrite(skin_log, tmp_path / "two.mcap", with_thumb)
+    words = ["plot", str(log), "--what", "forces"]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "drawn: board finger (of 2: finger, thumb_2); choose with --name" in said
+    assert main([*words, "--name", "thumb_2"]) == 0
+    assert "choose" not in capsys.readouterr().out
+
+
 def test_the_strongest_moment_is_that_of_the_press(skin_log: Path) -> None:
     from tactile_tools.plots.skin import strongest
 
@@ -85,6 +124,10 @@ def test_bad_arguments_are_refused(
         ([skin_log, "--at", "99", "--what", "taxels"], 2, "--at 99; the log of finger goes from"),
         ([skin_log, "--out", tmp_path / "a.gif"], 2, "allowed: a file that ends in"),
         ([skin_log, "--out", tmp_path / "no" / "a.png"], 2, "there is no folder"),
+        ([skin_log, "--format", "pdf", "--out", tmp_path / "a.png"], 2, "say two things"),
+        ([skin_log, "--dpi", "9"], 2, "--dpi 9; allowed: 30 to 600"),
+        ([skin_log, "--what", "forces", "--reach", "1"], 2, "leave them out with forces"),
+        ([skin_log, "--reach", "1"], 3, "holds no reach"),
         ([note], 3, "is no MCAP file"),
         ([tmp_path / "none.mcap"], 2, "does not exist"),
     ):

@@ -27,7 +27,7 @@ from tactile_bus.session import BusConfig, close_session, open_session
 from tactile_bus.streams import declare_publisher
 from tactile_bus.topics import ARM_STATE, COMMAND, REACH_EVENT, REACH_STATE, service_key
 
-SLOW = 40.0
+SLOW = 60.0
 """s that anything may take on a busy machine before a test gives it up."""
 
 EXPIRY = 0.06
@@ -294,6 +294,10 @@ class Lab:
         """Wait until the arm moves."""
         until(lambda: self.arm.moving or program.process.poll() is not None)
         assert program.process.poll() is None, program.said
+
+    def told_to_stand(self) -> None:
+        """Wait until the last word to the arm is zero: it may be on its way when reachd is gone."""
+        until(lambda: bool(self.arm.heard) and all(h.still for h in self.arm.heard[-3:]))
 
     def close(self) -> None:
         for program in self._programs:

@@ -49,7 +49,7 @@ class Rig:
 
 
 def until(done: Callable[[], object]) -> None:
-    end = time.monotonic() + 20.0
+    end = time.monotonic() + 60.0
     while not done():
         assert time.monotonic() < end
         time.sleep(0.002)

@@ -94,21 +94,49 @@ def test_a_plane_is_recovered_under_contact(fitter, share):
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.1, 0.25, 0.45]))
-def test_an_added_field_comes_out_and_changes_nothing_else(seed, share):
-    """Any plane while most taxels are free; any uniform field at all times."""
+def test_an_added_uniform_field_comes_out_and_changes_nothing_else(seed, share):
     fitter = FITTER
     rng = np.random.default_rng(seed)
     field = fitter.noise(rng)
     press(rng, fitter, field, share)
-    added = fitter.theta(rng, slope=2.0 if share < 0.2 else 0.0)
+    added = fitter.theta(rng, slope=0.0)
     plain, moved = fitter.fit(field), fitter.fit(field + fitter.plane(added))
-    # another proposal may win on a steep plane, and the refinements leave a little of that:
-    # less than a fifth of one sample's noise
-    away = 1.0 if share < 0.2 else 1e-5
-    np.testing.assert_allclose(moved.theta - plain.theta, added, atol=away)
+    np.testing.assert_allclose(moved.theta - plain.theta, added, atol=1e-5)
     np.testing.assert_allclose(moved.support, plain.support)
-    np.testing.assert_allclose(moved.residual_ut, plain.residual_ut, atol=away)
+    np.testing.assert_allclose(moved.residual_ut, plain.residual_ut, atol=1e-5)
     np.testing.assert_array_equal(moved.valid, plain.valid)
+
+
+def added_plane(seed, share):
+    """Fits of one field without and with a plane, and by how much they differ beyond it, µT.
+
+    Proposals from more than three taxels have no slope, so another may win where a plane is
+    added, and three refinements do not quite forget where they began. With sixteen the fits agree
+    to the last digit, but neither is nearer to the truth than now (2.2 µT rms).
+    """
+    fitter = FITTER
+    rng = np.random.default_rng(seed)
+    field = fitter.noise(rng)
+    press(rng, fitter, field, share)
+    added = fitter.theta(rng)
+    plain, moved = fitter.fit(field), fitter.fit(field + fitter.plane(added))
+    return plain, moved, fitter.plane(moved.theta - plain.theta - added)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.1]))
+def test_an_added_plane_comes_out_to_within_the_noise(seed, share):
+    """Of two samples, 5 µT rms each; the largest of 16,000 draws was 4.2 µT rms on one array."""
+    plain, moved, away = added_plane(seed, share)
+    assert np.sqrt((away**2).mean(axis=(1, 2))).max() < 10.0
+    np.testing.assert_array_equal(moved.valid, plain.valid)
+
+
+def test_an_added_plane_mostly_comes_out_to_a_fraction_of_the_noise():
+    draws = [added_plane(seed, share) for share in (0.0, 0.1) for seed in range(200)]
+    assert np.sqrt(np.mean([away**2 for *_, away in draws])) < 0.2
+    same = [np.array_equal(moved.support, plain.support) for plain, moved, _ in draws]
+    assert np.mean(same) > 0.98
 
 
 @settings(max_examples=25, deadline=None)

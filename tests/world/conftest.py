@@ -12,11 +12,12 @@ import pytest
 
 from sim_device.world.base import World
 from sim_device.world.engines import ENGINES, EngineMissing, world_maker
-from sim_device.world.scenes import Pose, Scene, SceneObject, Shape
+from sim_device.world.scenes import Pose, Scene, SceneError, SceneObject, Shape
+from sim_device.world.sources import RECORDED_SCENES, find_recorded
 from tactile_bus.arm_types import Twist
 from tactile_bus.geometry import TIP_X
 
-RECORDED = Path(__file__).parents[2].parent / "shared" / "data" / "authors_scenes"
+RECORDED = Path(__file__).parents[1] / "data" / "recorded_scenes"
 
 
 def disc(x: float, y: float, *, radius: float = 0.04, mass: float = 0.5) -> SceneObject:
@@ -73,9 +74,17 @@ def engine(request: pytest.FixtureRequest) -> Engine:
 
 @pytest.fixture(scope="session")
 def recorded() -> Path:
-    if not RECORDED.is_dir():
-        pytest.skip("the recorded scenes are not here (../shared/data/authors_scenes)")
+    """Folder with four scenes of our own in the form of the authors' recordings."""
     return RECORDED
+
+
+@pytest.fixture(scope="session")
+def authors() -> Path:
+    """Folder with the sixty scenes of the authors' simulator; skips where nobody has put them."""
+    try:
+        return find_recorded(RECORDED_SCENES).parent
+    except SceneError as error:
+        pytest.skip(str(error))
 
 
 @dataclass(frozen=True)

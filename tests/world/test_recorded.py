@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sim_device.world.generate import generate
 from sim_device.world.mujoco_world import MujocoWorld
 from sim_device.world.recorded import RECORDED, load_outcomes, load_recorded
 from sim_device.world.scenes import Pose, SceneError, Shape
 
 
-def test_sixty_scenes_at_true_scale(recorded: Path) -> None:
-    scenes = load_recorded(recorded / "scenes_1_60.json.gz")
+def test_sixty_scenes_at_true_scale(authors: Path) -> None:
+    scenes = load_recorded(authors / "scenes_1_60.json.gz")
     assert [scene.seed for scene in scenes] == list(range(1, 61))
     first = scenes[0]
     assert first.source == RECORDED
@@ -34,8 +35,8 @@ def test_sixty_scenes_at_true_scale(recorded: Path) -> None:
     assert np.mean([scene.fill for scene in scenes]) == pytest.approx(0.37, abs=0.005)
 
 
-def test_outcomes_have_the_published_rates(recorded: Path) -> None:
-    outcomes = load_outcomes(recorded / "outcomes_1_60.csv")
+def test_outcomes_have_the_published_rates(authors: Path) -> None:
+    outcomes = load_outcomes(authors / "outcomes_1_60.csv")
     rates = {"straight": 33, "burrow": 60, "excavate": 40, "clock": 47, "event": 63}
     for strategy, rate in rates.items():
         mine = [o for o in outcomes if o.strategy == strategy]
@@ -45,18 +46,49 @@ def test_outcomes_have_the_published_rates(recorded: Path) -> None:
 
 
 def test_straight_reaches_end_as_they_did_there(
-    recorded: Path, reach_straight: Callable[..., Any]
+    authors: Path, reach_straight: Callable[..., Any]
 ) -> None:
     """Four scenes of sixty; over all sixty 19 succeed, 20 there, and 55 end alike."""
-    scenes = load_recorded(recorded / "scenes_1_60.json.gz")
+    scenes = load_recorded(authors / "scenes_1_60.json.gz")
     reference = {
-        o.seed: o for o in load_outcomes(recorded / "outcomes_1_60.csv") if o.strategy == "straight"
+        o.seed: o for o in load_outcomes(authors / "outcomes_1_60.csv") if o.strategy == "straight"
     }
     agreed = 0
     for scene in scenes[:4]:
         reach = reach_straight(MujocoWorld(scene))
         agreed += reach.success == reference[scene.seed].success
     assert agreed >= 3  # one in twelve differs
+
+
+def test_a_recorded_scene_is_the_one_that_was_made(recorded: Path) -> None:
+    """At true scale and in our axes, to the millionth that the file keeps."""
+    scenes = load_recorded(recorded / "scenes_5_8.json.gz")
+    assert [scene.seed for scene in scenes] == [5, 6, 7, 8]
+    for scene in scenes:
+        made = generate("authors_sim", scene.seed)
+        assert scene.source == RECORDED
+        assert (scene.start.x, scene.start.y) == pytest.approx((made.start.x, made.start.y))
+        assert scene.goal == pytest.approx(made.goal)
+        for one, other in zip(scene.objects, made.objects, strict=True):
+            assert one.shape is other.shape
+            for name in ("size_x", "size_y", "height", "mass", "x", "y"):
+                assert getattr(one, name) == pytest.approx(getattr(other, name), abs=1e-6), name
+            assert np.cos(one.yaw - other.yaw) == pytest.approx(1.0)
+
+
+def test_outcomes_say_what_happened_in_the_scenes(
+    recorded: Path, reach_straight: Callable[..., Any]
+) -> None:
+    scenes = {s.seed: s for s in load_recorded(recorded / "scenes_5_8.json.gz")}
+    outcomes = load_outcomes(recorded / "outcomes_5_8.csv")
+    assert {(o.seed, o.objects) for o in outcomes} == {
+        (seed, len(scene.objects)) for seed, scene in scenes.items()
+    }
+    assert all((o.entered_step is not None) == o.entered for o in outcomes)
+    straight = {o.seed: o for o in outcomes if o.strategy == "straight"}
+    for seed in (5, 8):  # one arrives, one is stopped far from its goal
+        reach = reach_straight(MujocoWorld(scenes[seed]))
+        assert reach.success == straight[seed].success
 
 
 def write(path: Path, entry: dict[str, Any]) -> Path:

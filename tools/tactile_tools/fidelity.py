@@ -21,7 +21,11 @@ from reachd.parameters import parameters
 from sim_device.world.engines import ENGINES, make_world
 from sim_device.world.recorded import load_outcomes, load_recorded
 from sim_device.world.scenes import Pose, Scene, SceneError
-from sim_device.world.sources import RECORDED_FILE, RECORDED_OUTCOMES
+from sim_device.world.sources import (
+    FOLDER_VARIABLE,
+    RECORDED_SCENES,
+    find_recorded,
+)
 from tactile_tools.lockstep import run_trial
 
 STRATEGIES = ("straight", "burrow", "excavate", "hybrid_clock", "hybrid_event")
@@ -67,14 +71,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--scenes",
         type=Path,
-        default=RECORDED_FILE,
-        help="recorded scenes (default %(default)s)",
+        metavar="FILE",
+        help=f"recorded scenes (default: {RECORDED_SCENES} in the folder that {FOLDER_VARIABLE} "
+        "names)",
     )
     parser.add_argument(
         "--outcomes",
         type=Path,
-        default=RECORDED_OUTCOMES,
-        help="what the reference did there (default %(default)s)",
+        metavar="FILE",
+        help="what the reference did there (default: beside the scenes, outcomes_1_60.csv of "
+        "scenes_1_60.json.gz)",
     )
     parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
     parser.add_argument("--depth", choices=("contacts", "taxels"), default="contacts")
@@ -90,15 +96,19 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(options: argparse.Namespace) -> int:
     """Run, print and write the comparison; 0 when all of it ran."""
     console = Console()
+    if options.repeats < 0 or options.jobs < 1 or (options.most is not None and options.most < 1):
+        print(
+            "tactile fidelity: --repeats is at least 0, --jobs and --most are at least 1",
+            file=sys.stderr,
+        )
+        return 2
     try:
-        scenes = load_recorded(options.scenes)[: options.most]
-        outcomes = load_outcomes(options.outcomes)
+        file = options.scenes or find_recorded(RECORDED_SCENES)
+        scenes = load_recorded(file)[: options.most]
+        outcomes = load_outcomes(options.outcomes or outcomes_of(file))
     except (SceneError, OSError) as error:
         print(f"tactile fidelity: {error}", file=sys.stderr)
         return 3
-    if options.repeats < 0 or options.jobs < 1:
-        print("tactile fidelity: --repeats is at least 0, --jobs at least 1", file=sys.stderr)
-        return 2
     reference = {(o.seed, REFERENCE_NAMES.get(o.strategy, o.strategy)): o for o in outcomes}
     tasks = [
         (scene, strategy, repeat)
@@ -135,6 +145,12 @@ def run(options: argparse.Namespace) -> int:
         options.json.write_text(json.dumps(report) + "\n", encoding="utf-8")
         console.print(f"wrote {options.json}")
     return 0
+
+
+def outcomes_of(scenes: Path) -> Path:
+    """Outcomes that lie beside a file of scenes: outcomes_1_60.csv of scenes_1_60.json.gz."""
+    name = scenes.name.removesuffix(".gz").removesuffix(".json")
+    return scenes.with_name(name.replace("scenes", "outcomes", 1) + ".csv")
 
 
 def _trial(task: tuple[Scene, str, int], engine: str, depth: str) -> Trial:

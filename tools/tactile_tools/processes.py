@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-PORT_WAIT_S = 20.0  # a loaded machine needs a few seconds to import numpy twice
+PORT_WAIT_S = 60.0  # a loaded machine needs some seconds to import numpy twice
 
 
 def free_port() -> int:

@@ -6,7 +6,7 @@ propose planes, all taxels vote on them by their joint three-component distance,
 the constant that the whole board agrees on, where that explains an array better) is refined by
 reweighted least squares, the last time on fields from which the neighbours' contacts were taken.
 Linear in the field wherever the choice of taxels is the same: a uniform field that is added comes
-out exactly, a plane to a fraction of the noise.
+out exactly, a plane to a fraction of the noise mostly, and at worst to about the noise.
 Shapes as in `Layout`.
 """
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -46,16 +47,23 @@ class LiveBoard:
         self._wall = WallClock.take()
         self._tap = Tap(session, FIELD.key(name), self._take_field)
 
-    def wait(self) -> None:
-        """Until frames come; `WizardError` when none do."""
-        if self._heard.wait(FIRST_FRAME_S):
+    def wait(self, ended: Callable[[], bool] = lambda: False) -> None:
+        """Until frames come; `WizardError` when none do, or their sender has ``ended``."""
+        if self._hears(FIRST_FRAME_S, ended):
             return
-        there = self._name in list_alive(self._session)
-        if not (there and self._heard.wait(SLOW_S)):
+        there = not ended() and self._name in list_alive(self._session)
+        if not (there and self._hears(SLOW_S, ended)):
             raise WizardError(
                 f"no frames of board {self._name!r} on the bus in {FIRST_FRAME_S:g} s; start "
                 f"tactiled with --name {self._name}, or give --port"
             )
+
+    def _hears(self, seconds: float, ended: Callable[[], bool]) -> bool:
+        until = time.monotonic() + seconds
+        while not (heard := self._heard.wait(0.1)):
+            if ended() or time.monotonic() > until:
+                break
+        return heard
 
     def calibration(self, given: Path | None) -> BoardCalibration:
         """What tactiled runs this board with: in ``given``, the file it names, or typical figures.

@@ -63,6 +63,7 @@ def read_log(path: Path, name: str | None = None) -> Recording:
     name = _which(path, boards, name)
     board = boards[name]
     _drop_early(board)
+    _drop_repeated(board)
     calibration = attached.get(name)
     if calibration is None:
         raise RecordingError(
@@ -161,6 +162,18 @@ def _drop_early(board: _Board) -> None:
     first = min(board.reference_ns)
     keep = next((i for i, at in enumerate(board.field_ns) if at >= first), len(board.field_ns))
     del board.field_ns[:keep], board.field_ut[:keep]
+
+
+def _drop_repeated(board: _Board) -> None:
+    """Forget a frame or a reading that is stamped like the one before it.
+
+    Of boards without a clock of their own, the daemon estimates when a frame was captured and
+    never lets its stamps run back: they stand still until the estimate has caught up.
+    """
+    for stamps, values in ((board.field_ns, board.field_ut), (board.reference_ns, board.force)):
+        same = [i for i in range(1, len(stamps)) if stamps[i] == stamps[i - 1]]
+        for index in reversed(same):
+            del stamps[index], values[index]
 
 
 def _which(path: Path, boards: dict[str, _Board], name: str | None) -> str:

@@ -7,7 +7,7 @@ import contextlib
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from tactile_bus.options import BusTable, bus_config
@@ -26,7 +26,7 @@ def record(options: argparse.Namespace) -> None:
     if trouble is not None:
         raise ActionError(trouble)
     with contextlib.ExitStack() as stack:
-        bus = stack.enter_context(_bus(options))
+        bus, ended = stack.enter_context(_bus(options))
         try:
             session = open_session(bus)
         except BusError as error:
@@ -37,7 +37,7 @@ def record(options: argparse.Namespace) -> None:
         except RecorderError as error:
             raise ActionError(str(error), REFUSED) from error
         try:
-            presses = _record(options, LiveBoard(session, recorder, options.name))
+            presses = _record(options, LiveBoard(session, recorder, options.name), ended)
         except WizardError as error:
             raise ActionError(str(error), REFUSED) from error
         except EOFError as error:
@@ -50,9 +50,9 @@ def record(options: argparse.Namespace) -> None:
     print(f"wrote {out}: {pressed}; next: tactile calibrate fit {out} --out FILE.cal.toml")
 
 
-def _record(options: argparse.Namespace, board: LiveBoard) -> int:
+def _record(options: argparse.Namespace, board: LiveBoard, ended: Callable[[], bool]) -> int:
     try:
-        board.wait()
+        board.wait(ended)
         board.attach(board.calibration(options.calibration))
         timing = Timing(options.rest, options.hold, options.turn)
         width = shutil.get_terminal_size().columns
@@ -73,10 +73,10 @@ def _ask(question: str) -> str:
 
 
 @contextlib.contextmanager
-def _bus(options: argparse.Namespace) -> Iterator[BusConfig]:
-    """The bus to listen on; with --port, that of a tactiled of our own."""
+def _bus(options: argparse.Namespace) -> Iterator[tuple[BusConfig, Callable[[], bool]]]:
+    """The bus to listen on and whether its tactiled has ended; with --port, one of our own."""
     if options.port is None:
-        yield bus_config(options, BusTable(), "tool")
+        yield bus_config(options, BusTable(), "tool"), lambda: False
         return
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     words = [command("tactiled"), "--port", options.port, "--name", options.name, "--no-log"]
@@ -87,7 +87,10 @@ def _bus(options: argparse.Namespace) -> Iterator[BusConfig]:
         said = Path(folder) / "tactiled"
         with running(words, said) as process:
             try:
-                yield BusConfig(role="tool", connect=(endpoint,))
+                yield (
+                    BusConfig(role="tool", connect=(endpoint,)),
+                    lambda: process.poll() is not None,
+                )
             except ActionError as error:
                 if process.poll() is None:
                     raise

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tactile_tools.experiments.rows import replace_file
+from tactile_tools.experiments.spec import STRATEGIES
 from tactile_tools.experiments.statistics import Rate
 
 
@@ -139,8 +140,8 @@ def slug(text: str) -> str:
 
 
 def spoken(name: str) -> str:
-    """A strategy's name in a sentence."""
-    return name.replace("_", " ")
+    """A strategy's name in a sentence: the paper's in words, a user's own as given."""
+    return name.replace("_", " ") if name in STRATEGIES else name
 
 
 def listed(words: list[str]) -> str:

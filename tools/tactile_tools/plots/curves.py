@@ -2,88 +2,113 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tactile_tools.plots.gaps import HOLE_PERIODS, broken, holes, period
+from tactile_tools.plots.look import (
+    COLOURS,
+    SCREEN,
+    Look,
+    Sheet,
+    drawn,
+    named,
+    plain,
+    plain_ticks,
+    say,
+    shortened,
+    width_pt,
+)
 from tactile_tools.plots.series import LATENCY_BINS, BoardSeries, Spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""Okabe and Ito's palette: told apart in print and by the colour-blind."""
-
 INVALID = "#F4C7C3"
 """Behind stretches in which features were not valid."""
+MISSING = "0.88"
+"""Behind stretches of which the log has nothing."""
 
-SHOWN_EVENTS = 12
-"""Events with their text; the others are lines alone."""
+LISTED = 10
+"""Groups of events with their text; the others are numbers alone, or are counted."""
 
-LONGEST_REASON = 46
-LONGEST_TEXT = 60
+TAKEN_UP = 0.6
+"""Share of the width that the numbers of events may take up before neighbours share one."""
 
-TOGETHER = 0.015
-"""Share of a log's length within which events share one text."""
+REASONS = 3
+
+SETTLED = (0.1, 0.9)
+"""Of a clock's error, the share of its points from the first to the last that sets the scale."""
 
 
-def contact_forces(axes: Axes, board: BoardSeries, applied: tuple[Any, Any] | None) -> None:
+def contact_forces(
+    axes: Axes, board: BoardSeries, applied: tuple[Any, Any] | None, look: Look = SCREEN
+) -> None:
     """Normal force of the contact patches of each array."""
-    labels = [name for name, _ in board.array_slices()]
     contact = board.contact_force()
-    for index, label in enumerate(labels):
+    for index, (label, _) in enumerate(board.array_slices()):
         axes.plot(
-            board.feature_time, contact[:, index], color=COLOURS[index % 6], lw=1.2, label=label
+            *broken(board.feature_time, contact[:, index]),
+            color=COLOURS[index % 6],
+            label=named(label),
         )
     if applied is not None:
-        axes.plot(*applied, color="black", ls="--", lw=1.0, label="really applied")
+        axes.plot(*applied, color="black", ls="--", lw=0.9 * look.thin, label="really applied")
     axes.set_ylabel("contact force, N\n(normal, summed)")
     axes.set_ylim(bottom=0, top=max(axes.get_ylim()[1], 0.5))
-    axes.legend(loc="upper right", ncols=5, fontsize=8)
-    axes.grid(alpha=0.25)
+    axes.grid(visible=True)
 
 
-def ambient(axes: Axes, board: BoardSeries) -> None:
+def ambient(axes: Axes, board: BoardSeries, look: Look = SCREEN) -> None:
     """Field at the centre of each array that compensation took off."""
     labels = [name for name, _ in board.array_slices()]
-    axes.set_ylabel("ambient field removed, µT")
-    axes.grid(alpha=0.25)
+    axes.set_ylabel("ambient field\nremoved, µT")
+    axes.grid(visible=True)
     if not board.ambient:
-        _say(axes, "compensation was off")
+        say(axes, "compensation was off")
         return
     plane = np.stack([np.asarray(m.plane, float).reshape(-1, 3, 3) for m in board.ambient])
     valid = np.stack([np.asarray(m.valid, bool) for m in board.ambient])
     for component, name in enumerate("xyz"):
         for index, label in enumerate(labels[: plane.shape[1]]):
+            values = np.where(valid[:, index], plane[:, index, component, 0], np.nan)
             axes.plot(
-                board.ambient_time,
-                np.where(valid[:, index], plane[:, index, component, 0], np.nan),
+                *broken(board.ambient_time, values),
                 color=COLOURS[component],
                 ls=("-", "--", ":")[index % 3],
-                lw=1.0,
-                label=f"{name} {label}",
+                lw=0.9 * look.thin,
+                label=f"{name} {plain(label)}",
             )
-    axes.legend(loc="upper right", ncols=3, fontsize=7)
 
 
-def latency(axes: Axes, board: BoardSeries) -> None:
-    """From capture to receipt, and where features were refused."""
-    rows = np.asarray(board.delays.items, float).reshape(-1, 3)
-    axes.plot(board.delays.time, rows[:, 0] * 1e3, color=COLOURS[0], lw=0.8)
-    axes.set_ylabel("captured → received, ms", fontsize=8)
-    axes.set_ylim(bottom=0)
-    axes.grid(alpha=0.25)
-    refused = [t for t, f in zip(board.feature_time, board.features, strict=True) if not f.valid]
-    if refused:
-        axes.plot(refused, np.zeros(len(refused)), "x", color="crimson", label="features invalid")
-        axes.legend(loc="upper right", fontsize=8)
+def latency(axes: Axes, board: BoardSeries, look: Look = SCREEN) -> None:
+    """From capture to receipt."""
+    delays = np.asarray(board.delays.items, float).reshape(-1, 3)[:, 0] * 1e3
+    axes.plot(*broken(board.delays.time, delays), color=COLOURS[0], lw=0.8 * look.thin)
+    axes.set_ylabel("captured →\nreceived, ms")
+    _logarithmic(axes, delays)
+    axes.grid(visible=True)
 
 
-def draw_forces(board: BoardSeries, out: Path) -> None:
+def draw_forces(
+    board: BoardSeries, out: Path, look: Look = SCREEN, dpi: int | None = None, title: str = ""
+) -> None:
     """Write contact forces, peak and tip, net wrench, taxels in contact, and what happened."""
-    figure, rows = _sheet(board, "contact forces, features and events", 4, (1.2, 1, 1, 0.6))
-    contact_forces(rows[0], board, None)
+    with drawn(look):
+        forces_sheet(board, look, title).save(out, dpi)
+
+
+def forces_sheet(board: BoardSeries, look: Look = SCREEN, title: str = "") -> Sheet:
+    """The same before it is written."""
+    groups = _grouped(board, 72.0 * (look.width_in - 0.12 * look.font_pt), look)
+    sheet, rows = _sheet(
+        board, f"{title or board.name}: contact forces, features and events",
+        (1.2, 1.0, 1.0, 0.7), look, groups,
+    )  # fmt: skip
+    contact_forces(rows[0], board, None, look)
     time, features = board.feature_time, board.features
     if features:
         _lines(rows[1], time, {
@@ -100,111 +125,172 @@ def draw_forces(board: BoardSeries, out: Path) -> None:
             "in contact": [f.taxels_in_contact for f in features],
             "masked": [f.taxels_masked for f in features],
         })  # fmt: skip
+    else:
+        for axes in rows:
+            say(axes, "the log holds no features")
     rows[1].set_ylabel("normal force, N")
     rows[2].set_ylabel("net force on\nthe skin, N")
     rows[3].set_ylabel("taxels")
-    _shade_invalid(rows, board)
-    _mark_events(rows[0], board)
-    _finish(figure, rows, out)
+    rows[3].yaxis.get_major_locator().set_params(integer=True)
+    for axes in rows[1:]:
+        axes.grid(visible=True)
+    for axes in rows:
+        sheet.legend(axes)
+    shade(sheet, rows, board, invalid=True)
+    return sheet
 
 
-def draw_field(board: BoardSeries, out: Path) -> None:
+def draw_field(
+    board: BoardSeries, out: Path, look: Look = SCREEN, dpi: int | None = None, title: str = ""
+) -> None:
     """Write the field removed, how well it was supported, what was left over, temperature."""
-    figure, rows = _sheet(board, "ambient field and its removal", 4, (1.4, 0.8, 0.8, 0.6))
+    with drawn(look):
+        field_sheet(board, look, title).save(out, dpi)
+
+
+def field_sheet(board: BoardSeries, look: Look = SCREEN, title: str = "") -> Sheet:
+    """The same before it is written."""
+    sheet, rows = _sheet(
+        board, f"{title or board.name}: ambient field and its removal",
+        (1.4, 0.9, 0.9, 0.7), look,
+    )  # fmt: skip
     labels = [name for name, _ in board.array_slices()]
-    ambient(rows[0], board)
+    ambient(rows[0], board, look)
     if board.ambient:
         support = np.stack([np.asarray(m.support, float) for m in board.ambient])
         residual = np.stack([np.asarray(m.residual_ut, float) for m in board.ambient])
         for index, label in enumerate(labels[: support.shape[1]]):
-            colour = COLOURS[index % 6]
-            rows[1].plot(
-                board.ambient_time, support[:, index] * 100, color=colour, lw=0.9, label=label
-            )
-            rows[2].plot(board.ambient_time, residual[:, index], color=colour, lw=0.9, label=label)
-        rows[1].legend(loc="lower right", ncols=3, fontsize=8)
-        rows[2].legend(loc="upper right", ncols=3, fontsize=8)
-    else:
-        _say(rows[1], "compensation was off")
-        _say(rows[2], "compensation was off")
-    if len(board.warmth):
-        warmth = [np.atleast_1d(item) for item in board.warmth.items]
-        width = min(len(item) for item in warmth)
-        per_taxel = width > len(labels)
-        curves = np.stack([item[:width] for item in warmth])
-        if per_taxel:
-            rows[3].plot(
-                board.warmth.time,
-                np.nanmean(curves, axis=1),
-                color=COLOURS[0],
-                lw=0.9,
-                label="mean of all taxels",
-            )
-        else:
-            for index in range(width):
-                rows[3].plot(
-                    board.warmth.time,
-                    curves[:, index],
+            for axes, values in ((rows[1], support * 100), (rows[2], residual)):
+                axes.plot(
+                    *broken(board.ambient_time, values[:, index]),
                     color=COLOURS[index % 6],
-                    lw=0.9,
-                    label=labels[index] if index < len(labels) else str(index),
+                    lw=0.8 * look.thin,
+                    label=named(label),
                 )
-        rows[3].legend(loc="upper right", ncols=3, fontsize=8)
     else:
-        _say(rows[3], "no field is in this log")
+        say(rows[1], "compensation was off")
+        say(rows[2], "compensation was off")
+    _warmth(rows[3], board, labels, look)
     rows[1].set_ylabel("taxels that\nsupport the fit, %")
     rows[1].set_ylim(0, 105)
     rows[2].set_ylabel("left over by\nthe fit, µT rms")
     rows[2].set_ylim(bottom=0)
     rows[3].set_ylabel("chips, °C")
     for axes in rows[1:]:
-        axes.grid(alpha=0.25)
-    _shade_invalid(rows, board)
-    _finish(figure, rows, out)
+        axes.grid(visible=True)
+    for axes in (rows[0], rows[1], rows[3]):  # the third has the curves of the second
+        sheet.legend(axes)
+    shade(sheet, rows, board, invalid=True)
+    return sheet
 
 
-def draw_timing(board: BoardSeries, out: Path) -> None:
+def _warmth(axes: Axes, board: BoardSeries, labels: list[str], look: Look) -> None:
+    if not len(board.warmth):
+        say(axes, "no field is in this log")
+        return
+    warmth = [np.atleast_1d(item) for item in board.warmth.items]
+    width = min(len(item) for item in warmth)
+    curves = np.stack([item[:width] for item in warmth]).astype(float)
+    if width > len(labels):
+        known = np.isfinite(curves).any(axis=1)
+        mean = np.full(len(curves), np.nan)
+        mean[known] = np.nanmean(curves[known], axis=1)
+        curves, labels = mean[:, None], ["mean of all taxels"]
+    for index, curve in enumerate(curves.T):
+        axes.plot(
+            *broken(board.warmth.time, curve),
+            color=COLOURS[index % 6],
+            lw=0.8 * look.thin,
+            label=named(labels[index] if index < len(labels) else str(index)),
+        )
+
+
+def draw_timing(
+    board: BoardSeries, out: Path, look: Look = SCREEN, dpi: int | None = None, title: str = ""
+) -> None:
     """Write latency, stamps' uncertainty, clock error and drops, with their distributions."""
-    plt = _pyplot()
-    figure = plt.figure(figsize=(14, 10), layout="constrained")
-    figure.suptitle(f"{board.name}: clock and latency, {_figures(board)}", fontsize=13)
-    grid = figure.add_gridspec(3, 2, width_ratios=(1.7, 1))
-    rows = [figure.add_subplot(grid[0, 0])]
-    rows += [figure.add_subplot(grid[i, 0], sharex=rows[0]) for i in (1, 2)]
+    with drawn(look):
+        timing_sheet(board, look, title).save(out, dpi)
+
+
+def timing_sheet(board: BoardSeries, look: Look = SCREEN, title: str = "") -> Sheet:
+    """The same before it is written."""
+    row_in = 1.35 * look.row_in
+    sheet = Sheet(
+        look, row_in * (6 if look.narrow else 3),
+        f"{title or board.name}: clock and latency, {_figures(board)}",
+    )  # fmt: skip
+    if look.narrow:
+        grid = sheet.figure.add_gridspec(6, 1)
+        places = [grid[i, 0] for i in range(6)]
+    else:
+        grid = sheet.figure.add_gridspec(3, 2, width_ratios=(1.7, 1))
+        places = [grid[i, j] for j in (0, 1) for i in range(3)]
+    rows = [sheet.figure.add_subplot(places[0])]
+    rows += [sheet.figure.add_subplot(place, sharex=rows[0]) for place in places[1:3]]
     times = board.delays.time
     delays = np.asarray(board.delays.items, float).reshape(-1, 3) * 1e3
-    rows[0].plot(times, delays[:, 0], color=COLOURS[0], lw=0.8, label="captured → received")
-    rows[0].plot(
-        times, delays[:, 2], color=COLOURS[1], lw=0.8, label="received → in the log's queue"
-    )
+    thin = 0.8 * look.thin
+    for column, index, label in ((0, 0, "captured → received"),
+                                 (2, 1, "received → in the log's queue")):  # fmt: skip
+        rows[0].plot(*broken(times, delays[:, column]), color=COLOURS[index], lw=thin, label=label)
     rows[0].set_ylabel("delay, ms")
-    rows[0].set_yscale("log")
-    rows[0].legend(loc="upper right", fontsize=8)
-    rows[1].plot(times, delays[:, 1], color=COLOURS[2], lw=0.9)
-    rows[1].set_ylabel("uncertainty of\nthe capture time, ms")
-    rows[1].set_yscale("log")
+    _logarithmic(rows[0], delays[:, [0, 2]])
+    rows[1].plot(*broken(times, delays[:, 1]), color=COLOURS[2], lw=thin)
+    rows[1].set_ylabel("uncertainty of the\ncapture time, ms")
+    _logarithmic(rows[1], delays[:, 1])
+    _clock(rows[2], board, look)
+    rows[2].set_ylabel("board's clock\nruns fast, ppm")
+    for axes in rows:
+        axes.grid(visible=True)
+    sheet.legend(rows[0])
+    sheet.legend(rows[2])
+    shade(sheet, rows, board, invalid=False)
+    margin = max(0.01 * (board.last - board.first), 1e-3)
+    rows[0].set_xlim(board.first - margin, board.last + margin)
+    _finish_axes(rows)
+    for place, spread, what, index in zip(
+        places[3:],
+        (board.latency_spread, board.logging_spread, board.period_spread),
+        ("captured → received", "received → in the log's queue", "from cycle to cycle"),
+        range(3), strict=True,
+    ):  # fmt: skip
+        _histogram(sheet, sheet.figure.add_subplot(place), spread, what, index)
+    return sheet
+
+
+def _clock(axes: Axes, board: BoardSeries, look: Look) -> None:
+    """Error of the board's clock; what it was while it was not yet known does not set the scale."""
     errors = [
         (when, float(values["clock_rate_error"]) * 1e6)
         for when, values in zip(board.told.time, board.told.items, strict=True)
         if _is_number(values.get("clock_rate_error", ""))
     ]
-    if errors:
-        rows[2].plot(*zip(*errors, strict=True), "o-", ms=3, color=COLOURS[3], lw=0.9)
-    else:
-        _say(rows[2], "this board has no clock of its own")
-    rows[2].set_ylabel("board's clock\nruns fast, ppm")
-    for axes in rows:
-        axes.grid(alpha=0.25)
-    for axes in rows[:2]:
-        _plain_ticks(axes.yaxis, *axes.get_ylim())
-    _finish_axes(rows)
-    _histogram(figure.add_subplot(grid[0, 1]), board.latency_spread, "captured → received", 0)
-    _histogram(
-        figure.add_subplot(grid[1, 1]), board.logging_spread, "received → in the log's queue", 1
-    )
-    _histogram(figure.add_subplot(grid[2, 1]), board.period_spread, "from cycle to cycle", 2)
-    figure.savefig(out, dpi=100)
-    plt.close(figure)
+    if not errors:
+        say(axes, "this board has no clock of its own")
+        return
+    times, values = np.array(errors).T
+    axes.plot(*broken(times, values), "o-", ms=3 * look.thin, color=COLOURS[3], lw=0.9 * look.thin)
+    low, high = np.quantile(values, SETTLED)
+    room = max(2.0 * (high - low), 1.0)
+    outside = (values < low - room) | (values > high + room)
+    if not outside.any():
+        return
+    inside = values[~outside]
+    margin = 0.08 * max(float(np.ptp(inside)), 1.0)
+    bottom, top = float(inside.min()) - margin, float(inside.max()) + margin
+    axes.set_ylim(bottom, top)
+    axes.plot(
+        times[outside], np.clip(values[outside], bottom, top), "D", color="black", clip_on=False,
+        ms=4 * look.thin, zorder=5,
+        label=f"beyond the scale: {_range(values[outside])} ppm",
+    )  # fmt: skip
+
+
+def _range(values: Any) -> str:
+    """ "-414", or "3 points, -414 to 220"."""
+    low, high = f"{values.min():.3g}", f"{values.max():.3g}"
+    return low if len(values) == 1 else f"{len(values)} points, {low} to {high}"
 
 
 def _figures(board: BoardSeries) -> str:
@@ -216,116 +302,201 @@ def _figures(board: BoardSeries) -> str:
     return f"{rate}{board.cycles} cycles, {board.lost} lost; drops: {drops or 'none'}"
 
 
-def _histogram(axes: Axes, spread: Spread, what: str, index: int) -> None:
-    axes.set_title(what, fontsize=10)
-    axes.set_xlabel("ms")
+def _histogram(sheet: Sheet, axes: Axes, spread: Spread, what: str, index: int) -> None:
+    axes.set_xlabel(f"{what}, ms")
     axes.set_ylabel("cycles")
     if not spread.number:
-        _say(axes, "nothing to count")
+        say(axes, "nothing to count")
         return
     edges = LATENCY_BINS * 1e3
     axes.stairs(spread.counts[1:-1], edges, fill=True, color=COLOURS[index], alpha=0.6)
     axes.set_xscale("log")
     low, high = max(spread.least, LATENCY_BINS[0]) * 1e3, max(spread.greatest, 1e-4) * 1e3
     axes.set_xlim(low / 1.6, high * 1.6)
-    _plain_ticks(axes.xaxis, low / 1.6, high * 1.6)
+    plain_ticks(axes.xaxis, low / 1.6, high * 1.6)
     for share, style in ((0.5, "-"), (0.99, "--")):
         value = spread.percentile(share) * 1e3
-        axes.axvline(value, color="0.2", lw=1, ls=style, label=f"p{share * 100:.0f} {value:.3g} ms")
-    axes.plot([], [], " ", label=f"greatest {spread.greatest * 1e3:.3g} ms")
-    axes.legend(fontsize=8, loc="upper right")
-    axes.grid(alpha=0.25)
+        axes.axvline(
+            value,
+            color="0.2",
+            lw=sheet.look.thin,
+            ls=style,
+            label=f"p{share * 100:.0f} {value:.4g}",
+        )
+    axes.plot([], [], " ", label=f"greatest {spread.greatest * 1e3:.4g}")
+    axes.grid(visible=True)
+    sheet.legend(axes)
 
 
-def _plain_ticks(axis: Any, low: float, high: float) -> None:
-    """Label a logarithmic axis with 1, 2, 5, 10 …, thinned where there are many decades."""
-    low, high = max(low, 1e-6), max(high, 1e-5)
-    decades = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
-    steps = (1, 2, 5) if len(decades) <= 4 else (1,)
-    ticks = [s * 10.0**d for d in decades for s in steps if low <= s * 10.0**d <= high]
-    axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
-    axis.set_ticks([], minor=True)
-
-
-def _pyplot() -> Any:
-    import matplotlib as mpl  # 0.3 s: not before a picture is really wanted
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    return plt
+def _logarithmic(axes: Axes, values: Any) -> None:
+    """A logarithmic axis for delays: some are a hundred times others. Told: those not above 0."""
+    known = np.asarray(values)[np.isfinite(values)]
+    positive = known[known > 0]
+    if not len(positive):
+        axes.set_ylim(bottom=0)
+        return
+    axes.set_yscale("log", nonpositive="mask")
+    low, high = float(positive.min()) / 1.3, float(positive.max()) * 1.3
+    axes.set_ylim(low, high)
+    plain_ticks(axes.yaxis, low, high)
+    if count := int((known <= 0).sum()):
+        axes.plot([], [], " ", label=f"{count} not above 0, not shown")
 
 
 def _sheet(
-    board: BoardSeries, what: str, count: int, ratios: tuple[float, ...]
-) -> tuple[Any, list[Any]]:
-    plt = _pyplot()
-    figure = plt.figure(figsize=(14, 11), layout="constrained")
+    board: BoardSeries,
+    title: str,
+    ratios: tuple[float, ...],
+    look: Look,
+    groups: Sequence[Group] = (),
+) -> tuple[Sheet, list[Any]]:
+    """Rows of curves under a title; what happened is a strip above them and a list below."""
     seconds = board.last - board.first
-    figure.suptitle(f"{board.name}: {what}, {board.cycles} cycles in {seconds:.1f} s", fontsize=14)
-    grid = figure.add_gridspec(count, 1, height_ratios=ratios)
-    first = figure.add_subplot(grid[0])
-    return figure, [first, *(figure.add_subplot(grid[i], sharex=first) for i in range(1, count))]
+    listed = _listed(groups, board)
+    text_in = look.line_in * (len(listed) + 0.5) if listed else 0.0
+    strip_in = 2.0 * look.line_in if groups else 0.0
+    heights = [ratio * look.row_in for ratio in ratios]
+    sheet = Sheet(
+        look, sum(heights) + text_in + strip_in + 0.35 * look.row_in,
+        f"{title}, {board.cycles} cycles in {seconds:.1f} s",
+    )  # fmt: skip
+    every = [*([strip_in] if groups else []), *heights, *([text_in] if listed else [])]
+    grid = sheet.figure.add_gridspec(len(every), 1, height_ratios=every)
+    offset = 1 if groups else 0
+    first = sheet.figure.add_subplot(grid[offset])
+    rows = [first]
+    for index in range(1, len(heights)):
+        rows.append(sheet.figure.add_subplot(grid[offset + index], sharex=first))
+    margin = max(0.01 * seconds, 1e-3)
+    first.set_xlim(board.first - margin, board.last + margin)
+    if groups:
+        _strip(sheet.figure.add_subplot(grid[0], sharex=first), groups, rows, look)
+        _list(sheet, sheet.figure.add_subplot(grid[len(every) - 1]), listed)
+    _finish_axes(rows)
+    return sheet, rows
 
 
 def _lines(axes: Axes, time: list[float], curves: dict[str, list[Any]]) -> None:
     for index, (label, values) in enumerate(curves.items()):
         style = ("-", "-", "--")[index % 3]  # the last may lie on the one before it
-        axes.plot(time, values, color=COLOURS[index], lw=1.0, ls=style, label=label)
-    axes.legend(loc="upper right", ncols=3, fontsize=8)
-    axes.grid(alpha=0.25)
+        axes.plot(*broken(time, values), color=COLOURS[index], ls=style, label=label)
 
 
-def _shade_invalid(rows: list[Any], board: BoardSeries) -> None:
-    """Grey out where features were not to be acted on, with the commonest reasons."""
+def shade(sheet: Sheet, rows: Sequence[Any], board: BoardSeries, *, invalid: bool) -> None:
+    """Grey where the log has nothing, red where features were not to be acted on, and why."""
+    gaps = holes(board.time)
+    spans, reasons = _invalid(board) if invalid else ([], [])
+    for axes in rows:
+        for begin, end in spans:
+            axes.axvspan(begin, end, color=INVALID, lw=0, zorder=0)
+        for begin, end in gaps:
+            axes.axvspan(begin, end, color=MISSING, lw=0, zorder=0.1)
+    explain_shades(sheet, gaps, reasons if spans else None)
+
+
+def explain_shades(
+    sheet: Sheet, gaps: Sequence[tuple[float, float]], reasons: Sequence[str] | None
+) -> None:
+    """Say what the grey and the red stand for; ``reasons``: None where nothing is red."""
+    from matplotlib.patches import Patch
+
+    if gaps:
+        longest = max(end - begin for begin, end in gaps)
+        number = f"a hole of {longest:.3g} s"
+        if len(gaps) > 1:
+            number = f"{len(gaps)} holes, the longest {longest:.3g} s"
+        sheet.key(Patch(color=MISSING), f"nothing in the log: {number}")
+    if reasons is not None:
+        why = "; ".join(plain(reason) for reason in reasons)
+        sheet.key(Patch(color=INVALID), f"features not valid{': ' if why else ''}{why}")
+
+
+def _invalid(board: BoardSeries) -> tuple[list[tuple[float, float]], list[str]]:
+    """Stretches without valid features, s, and the commonest reasons."""
     spans: list[tuple[float, float]] = []
     reasons: dict[str, int] = {}
-    period = 1.5 * (board.last - board.first) / max(1, len(board.feature_time))
+    usual = period(board.feature_time)
     for when, features in zip(board.feature_time, board.features, strict=True):
         if features.valid:
             continue
         for reason in features.reasons:
             reasons[reason] = reasons.get(reason, 0) + 1
-        if spans and when - spans[-1][1] <= 2 * period:
+        if spans and when - spans[-1][1] <= HOLE_PERIODS * usual:
             spans[-1] = (spans[-1][0], when)
         else:
             spans.append((when, when))
-    for axes in rows:
-        for begin, end in spans:
-            axes.axvspan(begin - period / 2, end + period / 2, color=INVALID, lw=0, zorder=0)
-    if spans:
-        common = sorted(reasons, key=lambda r: -reasons[r])[:3]
-        text = "; ".join(reason[:LONGEST_REASON] for reason in common)
-        rows[0].text(
-            0.005, 0.97, f"red: features not valid ({text})", transform=rows[0].transAxes,
-            fontsize=8, va="top", color="#A03028",
-        )  # fmt: skip
+    common = sorted(reasons, key=lambda reason: -reasons[reason])[:REASONS]
+    return [(begin - usual / 2, end + usual / 2) for begin, end in spans], common
 
 
-def _mark_events(axes: Axes, board: BoardSeries) -> None:
-    """Lines at what happened, with its text; what happened together is told together."""
+Group = tuple[float, list[str]]
+"""When events happened, s, and their texts: those that happened together share one number."""
+
+
+def _grouped(board: BoardSeries, room_pt: float, look: Look) -> list[Group]:
     span = max(board.last - board.first, 1e-3)
-    groups: list[tuple[float, list[str]]] = []
+    most = max(2.0, TAKEN_UP * room_pt / width_pt("000", _number_pt(look)))
+    groups: list[Group] = []
     for when, text in board.events:
-        if groups and when - groups[-1][0] < TOGETHER * span:
+        if groups and when - groups[-1][0] < span / most:
             groups[-1][1].append(text)
         else:
             groups.append((when, [text]))
-    top = axes.get_ylim()[1]
-    for index, (when, texts) in enumerate(groups):
-        axes.axvline(when, color="0.45", lw=0.8, ls="--")
-        if index < SHOWN_EVENTS:
-            said = "; ".join(dict.fromkeys(texts))
-            said = said if len(said) <= LONGEST_TEXT else said[: LONGEST_TEXT - 1] + "…"
-            late = when > board.first + 0.5 * span
-            axes.annotate(
-                said, (when, top * 0.86), xytext=(-3 if late else 3, 0), textcoords="offset points",
-                rotation=90, va="top", ha="right" if late else "left", fontsize=8, color="0.3",
+    return groups
+
+
+def _number_pt(look: Look) -> float:
+    return 0.85 * look.font_pt
+
+
+def _strip(axes: Axes, groups: Sequence[Group], rows: Sequence[Any], look: Look) -> None:
+    """Numbers at the moments of events, and faint lines through the curves."""
+    begin, end = rows[0].get_xlim()
+    axes.set_ylim(0, 1)
+    axes.set_yticks([])
+    axes.set_ylabel("events", rotation=0, ha="right", va="center")
+    axes.tick_params(labelbottom=False, bottom=False)
+    for side in ("top", "right", "left"):
+        axes.spines[side].set_visible(False)
+    for number, (when, _) in enumerate(groups, 1):
+        if not begin <= when <= end:
+            continue  # by a clock that is not the board's, or while it was silent
+        axes.text(
+            when, 0.5, str(number), ha="center", va="center", fontsize=_number_pt(look),
+            clip_on=True,
+        )  # fmt: skip
+        for row in rows:
+            row.axvline(when, color="0.5", lw=0.5 * look.thin, ls="--", alpha=0.6, zorder=0.5)
+
+
+def _listed(groups: Sequence[Group], board: BoardSeries) -> list[str]:
+    """One line of text a group, and one for those that there is no room for."""
+    lines = []
+    for number, (when, texts) in enumerate(groups[:LISTED], 1):
+        counts: dict[str, int] = {}
+        for text in texts:
+            counts[text] = counts.get(text, 0) + 1
+        said = "; ".join(plain(t) + (f" (× {n})" if n > 1 else "") for t, n in counts.items())
+        lines.append(f"{number}  at {when:.2f} s: {said}")
+    rest = sum(len(texts) for _, texts in groups[LISTED:]) + board.events_left_out
+    if rest:
+        lines.append(f"and {rest} more, which `tactile log cat` lists")
+    return lines
+
+
+def _list(sheet: Sheet, axes: Axes, lines: Sequence[str]) -> None:
+    axes.axis("off")
+    size = _number_pt(sheet.look)
+
+    def write() -> None:
+        room = axes.get_window_extent().width * 72.0 / sheet.figure.dpi
+        for index, line in enumerate(lines):
+            axes.text(
+                0.0, 1.0 - (index + 0.5) / len(lines), shortened(line, room, size),
+                transform=axes.transAxes, fontsize=size, va="center", in_layout=False,
             )  # fmt: skip
 
-
-def _say(axes: Axes, text: str) -> None:
-    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", color="0.4")
+    sheet.later(write)
 
 
 def _is_number(text: str) -> bool:
@@ -341,9 +512,4 @@ def _finish_axes(rows: list[Any]) -> None:
     rows[-1].set_xlabel("time since the first cycle, s")
 
 
-def _finish(figure: Any, rows: list[Any], out: Path) -> None:
-    from matplotlib import pyplot as plt
-
-    _finish_axes(rows)
-    figure.savefig(out, dpi=100)
-    plt.close(figure)
+Drawer = Callable[..., Sheet]

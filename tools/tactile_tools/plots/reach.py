@@ -11,6 +11,9 @@ import numpy as np
 
 from tactile_bus.geometry import FINGER_OUTLINE, TIP_X
 from tactile_bus.markers import ADD, CYLINDER
+from tactile_tools.plots.curves import MISSING, explain_shades
+from tactile_tools.plots.gaps import broken, holes
+from tactile_tools.plots.look import SCREEN, Look, Sheet, drawn, named, plain, shortened
 from tactile_tools.plots.reach_series import Contact, ReachSeries, read_reach, turned
 
 if TYPE_CHECKING:
@@ -27,56 +30,114 @@ ACTIVITIES = {
 OTHER = "#7f7f7f"
 TOUCHED = "#B2182B"  # contacts and what they did
 FINGER = "#08306B"
+TARGET = "#F0E442"
 
-AREA_PER_N = 55.0  # points²
+M_AT_1_N = 0.0105
+"""Width of the circle of 1 N; its area goes with the force."""
 SHEAR_M_PER_N = 0.008
 SHEAR_FROM_N = 0.3  # shorter arrows would be dots
 MOVED_M = 0.004  # an object that went less far is drawn once
 SHOWN = 6  # moments that are numbered
-APART_S, APART_M = 1.2, 0.012  # one of both must lie between two of them
 LEAST_N = 0.3  # weaker touches are not numbered
 FAINT_EVERY_S = 0.2  # all the other touches, as faint circles
+NAMED = 4
+"""Excavations named; of more, the rest are lines alone."""
+GATES = 6
+"""Rows for what the safety gate did; of more kinds, the rarest share one."""
 
-BELOW_M = 0.235  # how far in front of the shelf the picture begins
+ROOM_M = 0.02
+"""Of the picture round what is in it."""
 
 
-def draw_reach(path: Path | Sequence[Path], out: Path) -> None:
+def draw_reach(
+    path: Path | Sequence[Path], out: Path, look: Look = SCREEN, dpi: int | None = None
+) -> None:
     """Write the picture of the last reach in a log; LogUnreadableError when there is none."""
-    import matplotlib as mpl  # 0.3 s: not before a picture is really wanted
+    draw(read_reach(path), out, look, dpi)
 
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
 
-    reach = read_reach(path)
-    moments = reach.moments(SHOWN, APART_S, APART_M, LEAST_N)
-    figure = plt.figure(figsize=(15.5, 9.2), layout="constrained")
-    grid = figure.add_gridspec(3, 2, width_ratios=(1.12, 1), height_ratios=(1, 1, 0.6))
-    _cupboard(figure.add_subplot(grid[:, 0]), reach, moments)
-    distance = figure.add_subplot(grid[0, 1])
-    force = figure.add_subplot(grid[1, 1], sharex=distance)
-    doing = figure.add_subplot(grid[2, 1], sharex=distance)
-    _distance(distance, reach)
-    _force(force, reach, moments)
-    _activity(doing, reach)
+def draw(reach: ReachSeries, out: Path, look: Look = SCREEN, dpi: int | None = None) -> None:
+    """Write the picture of one reach."""
+    with drawn(look):
+        reach_sheet(reach, look).save(out, dpi)
+
+
+def reach_sheet(reach: ReachSeries, look: Look = SCREEN) -> Sheet:
+    """The same before it is written."""
+    moments = reach.moments(SHOWN, LEAST_N)
+    activities = list(dict.fromkeys(s.activity for s in reach.states))
+    rows_in = [1.35 * look.row_in, 1.35 * look.row_in]
+    bars_in = (len(activities) + len(_gates(reach)) + 1) * 1.25 * look.line_in
+    rows_in.append(max(bars_in, 0.5 * look.row_in))
+    rest = 0.75 * look.row_in
+    if look.narrow:
+        heights = [1.05 * look.width_in, *rows_in]
+        sheet = Sheet(look, sum(heights) + 2.2 * rest, _title(reach))
+        grid = sheet.figure.add_gridspec(4, 1, height_ratios=heights)
+        places = [grid[i] for i in range(4)]
+    else:
+        sheet = Sheet(look, max(sum(rows_in) + rest, 0.58 * look.width_in), _title(reach))
+        grid = sheet.figure.add_gridspec(3, 2, width_ratios=(1.05, 1), height_ratios=rows_in)
+        places = [grid[:, 0], grid[0, 1], grid[1, 1], grid[2, 1]]
+    _cupboard(sheet, sheet.figure.add_subplot(places[0]), reach, moments, activities)
+    distance = sheet.figure.add_subplot(places[1])
+    force = sheet.figure.add_subplot(places[2], sharex=distance)
+    doing = sheet.figure.add_subplot(places[3], sharex=distance)
+    _distance(distance, reach, look)
+    _force(force, reach, moments, look)
+    _activity(doing, reach, activities, look)
+    missing = _missing(reach)
+    for axes in (distance, force, doing):
+        for begin, end in missing:
+            axes.axvspan(begin, end, color=MISSING, lw=0, zorder=0.1)
     for axes in (distance, force):
         axes.tick_params(labelbottom=False)
+        sheet.legend(axes)
         for begin, end, activity in _spans(reach):
             if activity.startswith("excavate"):
-                axes.axvspan(begin, end, color=ACTIVITIES.get(activity, OTHER), alpha=0.15, lw=0)
-    distance.set_xlim(0.0, max(reach.time[-1], 0.1))
-    figure.suptitle(_title(reach), fontsize=15)
-    figure.savefig(out, dpi=100)
-    plt.close(figure)
+                axes.axvspan(
+                    begin, end, color=ACTIVITIES.get(activity, OTHER), alpha=0.15, lw=0, zorder=0
+                )
+    distance.set_xlim(0.0, max(reach.time[-1], 0.1) * 1.01)
+    explain_shades(sheet, missing, None)
+    if reach.left_out:
+        from matplotlib.lines import Line2D
+
+        sheet.key(Line2D([], [], ls=""), f"{reach.left_out} later messages are left out: too many")
+    return sheet
+
+
+def _missing(reach: ReachSeries) -> list[tuple[float, float]]:
+    """Stretches in which any of states, arm and touch is missing, s."""
+    every = sorted([*holes(reach.time), *holes(reach.arm_time), *(holes(reach.touch_time))])
+    joined: list[tuple[float, float]] = []
+    for begin, end in every:
+        if joined and begin <= joined[-1][1]:
+            joined[-1] = (joined[-1][0], max(end, joined[-1][1]))
+        else:
+            joined.append((begin, end))
+    return joined
 
 
 def _title(reach: ReachSeries) -> str:
-    """Strategy and outcome in words."""
+    """Strategy and outcome in words, and which of several this is."""
     outcome = reach.outcome()
     peak = max((t.peak_force for t in reach.touch if math.isfinite(t.peak_force)), default=0.0)
     count = len(reach.excavations())
     words = outcome.text if outcome is not None else "the log ends before the reach does"
     number = f"{count or 'no'} excavation{'' if count == 1 else 's'}"
-    return f"{reach.states[-1].strategy}: {words}; peak force {peak:.1f} N, {number}"
+    several = []
+    if len(reach.all_reaches) > 1:
+        several.append(f"reach {reach.number} of {len(reach.all_reaches)}")
+    for what, name, held in (
+        ("board", reach.board_name, reach.boards),
+        ("arm", reach.arm_name, reach.arms),
+    ):
+        if len(held) > 1:
+            several.append(f"{what} {name} of {', '.join(sorted(held))}")
+    which = f"{', '.join(several)}. " if several else ""
+    strategy = reach.states[-1].strategy
+    return f"{which}{strategy}: {words}; peak force {peak:.1f} N, {number}"
 
 
 def _flip(points: Any) -> Any:
@@ -88,43 +149,56 @@ def _flip(points: Any) -> Any:
 def _spans(reach: ReachSeries) -> list[tuple[float, float, str]]:
     """(begin, end, activity) of each stretch of one activity, s."""
     found: list[tuple[float, float, str]] = []
+    torn = {end for _, end in holes(reach.time)}
     for when, state in zip(reach.time, reach.states, strict=True):
-        if found and found[-1][2] == state.activity:
+        if found and found[-1][2] == state.activity and when not in torn:
             found[-1] = (found[-1][0], when, state.activity)
         else:
-            if found:
+            if found and when not in torn:
                 found[-1] = (found[-1][0], when, found[-1][2])
             found.append((when, when, state.activity))
     return found
 
 
-def _cupboard(axes: Axes, reach: ReachSeries, moments: Sequence[int]) -> None:
-    _objects(axes, reach)
+def _cupboard(
+    sheet: Sheet, axes: Axes, reach: ReachSeries, moments: Sequence[int], activities: Sequence[str]
+) -> None:
+    look = sheet.look
+    _objects(axes, reach, look)
     tip = _flip(reach.tip())
     at = np.clip(np.searchsorted(reach.time, reach.arm_time), 0, len(reach.states) - 1)
     doing = np.array([reach.states[i].activity for i in at])
     for activity in dict.fromkeys(doing.tolist()):
-        # Gaps where it did something else must not be bridged by a line.
+        # Gaps where it did something else, or of which nothing is known, must not be bridged.
         line = np.where((doing == activity)[:, None], tip, np.nan)
+        _, line = broken(reach.arm_time, line)
         colour = ACTIVITIES.get(activity, OTHER)
-        axes.plot(line[:, 0], line[:, 1], lw=2.6, color=colour, zorder=5, solid_capstyle="round")
-    for index, style in ((0, {"ls": ":", "lw": 1.3}), (len(tip) - 1, {"lw": 2.0})):
+        axes.plot(*line.T, lw=2.4 * look.thin, color=colour, zorder=5, solid_capstyle="round")
+    thin = look.thin
+    shown = [tip]
+    for index, style in ((0, {"ls": ":", "lw": 1.3 * thin}), (len(tip) - 1, {"lw": 2.0 * thin})):
         arm = reach.arm[index]
         outline = _flip(turned(_outline(reach), arm.x, arm.y, arm.heading))
         closed = np.vstack([outline, outline[:1]])
         axes.plot(closed[:, 0], closed[:, 1], color=FINGER, zorder=4, **style)
         pointed = _flip(turned([(0.15185, 0.0), (TIP_X, 0.0)], arm.x, arm.y, arm.heading))
         axes.plot(pointed[:, 0], pointed[:, 1], color=FINGER, zorder=4, **style)
-    _contacts(axes, reach, moments)
+        shown.append(closed)
+    _contacts(sheet, axes, reach, moments)
     goal = next((s for s in reversed(reach.states) if s.goal_radius > 0), None)
     if goal is not None:
-        axes.plot(-goal.goal.y, goal.goal.x, "*", ms=19, color="#F0E442", mec="black", zorder=9)
-    axes.set_aspect("equal")
-    axes.set_ylim(bottom=min(-BELOW_M, float(tip[:, 1].min()) - 0.19))
+        place = np.array([[-goal.goal.y, goal.goal.x]])
+        shown.append(place)
+        axes.plot(*place.T, "*", ms=17 * thin, color=TARGET, mec="black", mew=thin, zorder=9)
+    axes.autoscale_view()
+    axes.set_aspect("equal", anchor="N")
+    low, high = np.vstack(shown).min(axis=0) - ROOM_M, np.vstack(shown).max(axis=0) + ROOM_M
+    axes.set_xlim(min(low[0], axes.get_xlim()[0]), max(high[0], axes.get_xlim()[1]))
+    axes.set_ylim(min(low[1], axes.get_ylim()[0]), max(high[1], axes.get_ylim()[1]))
     axes.set_xlabel("across the cupboard, m")
-    axes.set_ylabel("into the cupboard, m  (0: front edge of the shelf)")
-    axes.set_title("the cupboard from above", fontsize=12)
-    _legends(axes, list(dict.fromkeys(doing.tolist())))
+    axes.set_ylabel("into the cupboard, m  (0: front edge)")
+    axes.set_title("the cupboard from above")
+    _legends(sheet, axes, activities, moved=_any_moved(reach))
 
 
 def _outline(reach: ReachSeries) -> list[tuple[float, float]]:
@@ -135,10 +209,24 @@ def _outline(reach: ReachSeries) -> list[tuple[float, float]]:
     return [(x, y * told / width) for x, y in FINGER_OUTLINE]
 
 
-def _objects(axes: Axes, reach: ReachSeries) -> None:
+def _moved(old: Any, new: Any) -> bool:
+    here, there = (_flip((m.pose.position.x, m.pose.position.y)) for m in (old, new))
+    return math.dist(here, there) > MOVED_M
+
+
+def _any_moved(reach: ReachSeries) -> bool:
+    if reach.last_world is None:
+        return False
+    after = {m.id: m for m in _shown(reach.last_world) if m.ns == "objects"}
+    before = [m for m in _shown(reach.first_world) if m.ns == "objects"]
+    return any(m.id not in after or _moved(m, after[m.id]) for m in before)
+
+
+def _objects(axes: Axes, reach: ReachSeries, look: Look) -> None:
     """Draw walls and objects at the end; those that were moved at the start as well, dashed."""
     if reach.last_world is None:
         return
+    thin = look.thin
     before = {m.id: m for m in _shown(reach.first_world) if m.ns == "objects"}
     for marker in _shown(reach.last_world):
         tone = (marker.color.r, marker.color.g, marker.color.b)
@@ -147,18 +235,27 @@ def _objects(axes: Axes, reach: ReachSeries) -> None:
         if marker.ns != "objects":
             continue
         old = before.pop(marker.id, marker)
-        here, there = (_flip((m.pose.position.x, m.pose.position.y)) for m in (old, marker))
-        moved = math.dist(here, there) > MOVED_M
+        moved = _moved(old, marker)
         edge = TOUCHED if moved else "0.35"
-        axes.add_patch(_shape(marker, facecolor=tone, edgecolor=edge, alpha=0.8, lw=0.9 + moved))
+        axes.add_patch(
+            _shape(marker, facecolor=tone, edgecolor=edge, alpha=0.8, lw=(0.9 + moved) * thin)
+        )
         if moved:
-            axes.add_patch(_shape(old, fill=False, edgecolor=TOUCHED, ls="--", lw=1.0))
-            arrow = {"arrowstyle": "-|>", "color": TOUCHED, "lw": 1.2, "ls": "--"}
+            here, there = (_flip((m.pose.position.x, m.pose.position.y)) for m in (old, marker))
+            axes.add_patch(_shape(old, fill=False, edgecolor=TOUCHED, ls="--", lw=thin))
+            arrow = {"arrowstyle": "-|>", "color": TOUCHED, "lw": 1.2 * thin, "ls": "--",
+                     "mutation_scale": 10 * thin, "shrinkA": 0, "shrinkB": 0}  # fmt: skip
             axes.annotate("", there, here, arrowprops=arrow, zorder=3)
     for gone in before.values():
-        axes.add_patch(_shape(gone, fill=False, edgecolor=TOUCHED, ls="--", lw=1.0))
-        place = _flip((gone.pose.position.x, gone.pose.position.y))
-        axes.annotate("off the shelf", place, ha="center", fontsize=8, color=TOUCHED)
+        axes.add_patch(_shape(gone, fill=False, edgecolor=TOUCHED, ls="--", lw=thin))
+        x, y = _flip((gone.pose.position.x, gone.pose.position.y))
+        cross: dict[str, Any] = {
+            "marker": "x",
+            "s": 60 * thin**2,
+            "lw": 1.2 * thin,
+            "color": TOUCHED,
+        }
+        axes.scatter([x], [y], zorder=3, **cross)
 
 
 def _shown(world: Any) -> list[Any]:
@@ -178,45 +275,81 @@ def _shape(marker: Any, **look: Any) -> Any:
     return Polygon(_flip(turned([(a, b), (-a, b), (-a, -b), (a, -b)], x, y, yaw)), **look)
 
 
-def _contacts(axes: Axes, reach: ReachSeries, moments: Sequence[int]) -> None:
+def _contacts(sheet: Sheet, axes: Axes, reach: ReachSeries, moments: Sequence[int]) -> None:
     """Draw numbered moments as circles with shear arrows, and every other touch faintly."""
+    look = sheet.look
+    marks: list[tuple[int, Any]] = []
     due = 0.0
+    known = reach.placed()
+    faint: list[Contact] = []
     for index, when in enumerate(reach.touch_time):
-        if when >= due and reach.touch[index].patches:
+        if when >= due and known[index] and reach.touch[index].patches:
             due = when + FAINT_EVERY_S
-            for contact in reach.contacts_at(index):
-                _circle(axes, contact, alpha=0.10)
+            faint += reach.contacts_at(index)
+    _circles(axes, faint, alpha=0.10)
     for number, index in enumerate(moments, 1):
         contacts = reach.contacts_at(index)
+        if not contacts:
+            continue
+        _circles(axes, contacts, alpha=0.45, rim=0.8 * look.thin)
         for contact in contacts:
-            _circle(axes, contact, alpha=0.45, rim=0.8)
-            _shear(axes, contact)
-        strongest = _flip(max(contacts, key=lambda c: c.normal).place)
+            _shear(axes, contact, look)
+        marks.append((number, _flip(max(contacts, key=lambda c: c.normal).place)))
+    sheet.later(lambda: _number(sheet, axes, marks))
+
+
+def _number(sheet: Sheet, axes: Axes, marks: Sequence[tuple[int, Any]]) -> None:
+    """Put a number beside each place, as far as may be from other numbers and places."""
+    look = sheet.look
+    per_pt = sheet.figure.dpi / 72.0
+    places = [axes.transData.transform(place) for _, place in marks]
+    taken = list(places)
+    turns = np.linspace(0.0, 2 * math.pi, 24, endpoint=False)
+    box = axes.get_window_extent()
+    for (number, place), here in zip(marks, places, strict=True):
+        offsets = 26 * look.thin * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+        tried = here + offsets * per_pt
+        away = [
+            min((math.dist(spot, other) for other in taken if other is not here), default=math.inf)
+            if box.contains(*spot)
+            else -1.0
+            for spot in tried
+        ]
+        best = int(np.argmax(away))
+        taken.append(tried[best])
         axes.annotate(
-            str(number),
-            strongest,
-            # Turned from one to the next, so that moments at one place can all be read.
-            xytext=(26 * math.cos(2.4 * number), 26 * math.sin(2.4 * number)),
-            textcoords="offset points",
-            ha="center",
-            va="center",
-            fontsize=9,
-            color="white",
-            weight="bold",
-            bbox={"boxstyle": "circle,pad=0.2", "fc": TOUCHED, "ec": "white", "lw": 0.6},
-            arrowprops={"arrowstyle": "-", "color": TOUCHED, "lw": 0.7},
-            zorder=10,
+            str(number), place, xytext=tuple(offsets[best]), textcoords="offset points",
+            arrowprops={"arrowstyle": "-", "color": TOUCHED, "lw": 0.7 * look.thin},
+            **_tag(look),
+        )  # fmt: skip
+
+
+def _tag(look: Look) -> dict[str, Any]:
+    """How the number of a moment looks."""
+    box = {"boxstyle": "circle,pad=0.2", "fc": TOUCHED, "ec": "white", "lw": 0.6 * look.thin}
+    return {
+        "ha": "center", "va": "center", "fontsize": 0.85 * look.font_pt, "color": "white",
+        "weight": "bold", "bbox": box, "zorder": 10,
+    }  # fmt: skip
+
+
+def _circles(axes: Axes, contacts: Sequence[Contact], alpha: float, rim: float = 0.0) -> None:
+    from matplotlib.collections import EllipseCollection
+
+    if not contacts:
+        return
+    widths = [M_AT_1_N * math.sqrt(max(c.normal, 0.0)) for c in contacts]
+    axes.add_collection(
+        EllipseCollection(
+            widths, widths, np.zeros(len(widths)), units="xy",
+            offsets=np.array([_flip(c.place) for c in contacts]),
+            offset_transform=axes.transData, facecolors=TOUCHED, edgecolors=TOUCHED,
+            linewidths=rim, alpha=alpha, zorder=6,
         )
+    )  # fmt: skip
 
 
-def _circle(axes: Axes, contact: Contact, alpha: float, rim: float = 0.0) -> None:
-    place = _flip(contact.place)
-    size = AREA_PER_N * max(contact.normal, 0.0)
-    look: dict[str, Any] = {"facecolors": TOUCHED, "edgecolors": TOUCHED, "linewidths": rim}
-    axes.scatter(place[0], place[1], s=size, alpha=alpha, zorder=6, **look)
-
-
-def _shear(axes: Axes, contact: Contact) -> None:
+def _shear(axes: Axes, contact: Contact, look: Look) -> None:
     size = float(np.hypot(*contact.shear))
     if not size >= SHEAR_FROM_N:
         return
@@ -225,115 +358,145 @@ def _shear(axes: Axes, contact: Contact) -> None:
         "",
         place + _flip(contact.shear) * SHEAR_M_PER_N,
         place,
-        arrowprops={"arrowstyle": "-|>", "color": "black", "lw": 1.3, "shrinkA": 0, "shrinkB": 0},
+        arrowprops={"arrowstyle": "-|>", "color": "black", "lw": 1.3 * look.thin, "shrinkA": 0,
+                    "shrinkB": 0, "mutation_scale": 10 * look.thin},
         zorder=8,
-    )
+    )  # fmt: skip
 
 
-def _legends(axes: Axes, activities: Sequence[str]) -> None:
-    """Keys to colours, and to the sizes of circles and arrows, in front of the shelf."""
+def _legends(sheet: Sheet, axes: Axes, activities: Sequence[str], moved: bool) -> None:
+    """Key to colours, sizes and arrows, under the picture from above."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
+    from matplotlib.transforms import ScaledTranslation
 
+    thin = sheet.look.thin
     paths = [
-        Line2D([], [], color=ACTIVITIES.get(a, OTHER), lw=3, label=a.replace("_", " "))
+        Line2D([], [], color=ACTIVITIES.get(a, OTHER), lw=2.6 * thin, label=f"tip, {named(a)}")
         for a in activities
     ]
-    style: dict[str, Any] = {"fontsize": 9, "framealpha": 0.9, "title_fontsize": 9}
-    axes.add_artist(axes.legend(handles=paths, loc="lower right", title="path of the tip", **style))
-    circles = [
-        Line2D(
-            [], [], ls="", marker="o", ms=math.sqrt(AREA_PER_N * n), mec=TOUCHED, mfc=TOUCHED,
-            alpha=0.45, label=f"contact, {n:g} N normal",
-        )
-        for n in (1.0, 5.0)
-    ]  # fmt: skip
+    circle = Line2D([], [], ls="", marker="o", mec=TOUCHED, mfc=TOUCHED, alpha=0.45,
+                    label="contact, 5 N normal")  # fmt: skip
     things = [
-        *circles,
-        Line2D([], [], color="black", marker=">", ms=5, markevery=[1],
+        circle,
+        Line2D([], [], color="black", marker=">", ms=4 * thin, markevery=[1],
                label=f"shear ({1 / SHEAR_M_PER_N / 100:.2g} N is 1 cm)"),
-        Patch(fc="0.7", ec=TOUCHED, lw=1.9, label="object that was moved"),
-        Patch(fc="none", ec=TOUCHED, ls="--", label="… where it was"),
         Patch(fc="0.75", ec="0.35", label="object (darker: heavier)"),
+        *([Patch(fc="0.7", ec=TOUCHED, lw=1.9 * thin, label="object that was moved"),
+           Patch(fc="none", ec=TOUCHED, ls="--", label="… where it was (×: fell off)")]
+          if moved else []),
         Line2D([], [], color=FINGER, ls=":", label="finger at the start"),
-        Line2D([], [], color=FINGER, lw=2, label="finger at the end"),
-        Line2D([], [], ls="", marker="*", ms=13, color="#F0E442", mec="black", label="target"),
+        Line2D([], [], color=FINGER, lw=2 * thin, label="finger at the end"),
+        Line2D([], [], ls="", marker="*", ms=11 * thin, color=TARGET, mec="black",
+               mew=thin, label="target"),
     ]  # fmt: skip
-    axes.legend(handles=things, loc="lower left", labelspacing=0.7, **style)
+    # Under ticks, numbers and label, however high the axes will be.
+    down_in = (2.7 * sheet.look.font_pt + 14.0 * thin) / 72.0
+    below = axes.transAxes + ScaledTranslation(0.0, -down_in, sheet.figure.dpi_scale_trans)
+    legend = axes.legend(
+        handles=[*things, *paths], loc="upper center", bbox_to_anchor=(0.5, 0.0),
+        bbox_transform=below,
+        ncols=3 if sheet.look.width_in > 10 else 2, fontsize=0.85 * sheet.look.font_pt,
+        frameon=False, labelspacing=0.5, handlelength=1.8, columnspacing=1.2, borderaxespad=0.0,
+    )  # fmt: skip
+
+    def size() -> None:
+        """Circles of the key as large as those in the picture."""
+        box = axes.get_window_extent()
+        per_m = box.width / (axes.get_xlim()[1] - axes.get_xlim()[0]) * 72.0 / sheet.figure.dpi
+        index = things.index(circle)
+        key: Any = legend.legend_handles[index]
+        key.set_markersize(M_AT_1_N * math.sqrt(5.0) * per_m)
+
+    sheet.later(size)
 
 
-def _distance(axes: Axes, reach: ReachSeries) -> None:
+def _distance(axes: Axes, reach: ReachSeries, look: Look) -> None:
     distance = [s.distance * 1e2 for s in reach.states]
-    axes.plot(reach.time, distance, color=FINGER)
+    axes.plot(*broken(reach.time, distance), color=FINGER)
     axes.set_ylabel("tip to target, cm")
     axes.set_ylim(bottom=0)
-    axes.grid(alpha=0.25)
+    axes.grid(visible=True)
+    said = []
     for when, text in reach.excavations():
-        axes.annotate(
-            f" excavate {text.replace(' ', ': ', 1)}",
-            (when, 0.97),
-            xycoords=("data", "axes fraction"),
-            rotation=90,
-            va="top",
-            ha="left",
-            fontsize=9,
-        )
-        axes.axvline(when, color="0.3", lw=0.8)
+        axes.axvline(when, color="0.3", lw=0.8 * look.thin)
+        said.append(f"{when:.1f} s {text.replace(' ', ': ', 1)}")
+    if said:
+        more = len(said) - NAMED
+        told = ", ".join(said[:NAMED]) + (f" and {more} more" if more > 0 else "")
+        axes.plot([], [], color="0.3", lw=0.8 * look.thin, label=f"excavation: {plain(told)}")
     outcome = reach.outcome()
     if outcome is not None:
         word = outcome.code if outcome.code == "reached" else f"not reached: {outcome.code}"
-        axes.annotate(
-            word,
-            (reach.time[-1], distance[-1]),
-            xytext=(-8, 22),
-            textcoords="offset points",
-            ha="right",
-            fontsize=10,
-            weight="bold",
-            arrowprops={"arrowstyle": "->", "color": "0.2"},
-        )
+        axes.plot(
+            [reach.time[-1]], [distance[-1]], "o", ms=5 * look.thin, mfc="white", mec=FINGER,
+            clip_on=False, zorder=5, label=plain(word),
+        )  # fmt: skip
 
 
-def _force(axes: Axes, reach: ReachSeries, moments: Sequence[int]) -> None:
+def _force(axes: Axes, reach: ReachSeries, moments: Sequence[int], look: Look) -> None:
     load = [math.hypot(a.wrench.force.x, a.wrench.force.y) for a in reach.arm]
-    axes.plot(reach.arm_time, load, lw=0.7, color="0.6", label="arm's force sensor")
     total = [t.normal_force for t in reach.touch]
-    axes.plot(reach.touch_time, total, lw=0.9, color="#E69F00", label="skin, sum of normal forces")
     peak = [t.peak_force for t in reach.touch]
-    axes.plot(reach.touch_time, peak, lw=1.2, color=TOUCHED, label="skin, peak")
-    for number, index in enumerate(moments, 1):
-        axes.annotate(
-            str(number),
-            (reach.touch_time[index], total[index]),
-            xytext=(0, 9),
-            textcoords="offset points",
-            ha="center",
-            fontsize=9,
-            color="white",
-            weight="bold",
-            bbox={"boxstyle": "circle,pad=0.15", "fc": TOUCHED, "ec": "white", "lw": 0.6},
-            zorder=10,
-        )
+    for time, values, colour, label, width in (
+        (reach.arm_time, load, "0.72", "arm's force sensor", 2.4),
+        (reach.touch_time, total, "#E69F00", "skin, sum of normal forces", 0.9),
+        (reach.touch_time, peak, TOUCHED, "skin, peak", 0.9),
+    ):
+        axes.plot(*broken(time, values), lw=width * look.thin, color=colour, label=label)
     axes.set_ylabel("force, N")
-    axes.set_ylim(bottom=0)
-    axes.margins(y=0.15)
-    axes.legend(fontsize=9, loc="upper left")
-    axes.grid(alpha=0.25)
+    axes.grid(visible=True)
+    known = [v for v in (*total, *peak, *load) if math.isfinite(v)]
+    top = 1.05 * max([1.0, *known])
+    # The numbers stand above every curve, the next one higher where two would touch.
+    axes.set_ylim(0, top * (1.32 if moments else 1.0))
+    levels, last = 2, -math.inf
+    level = 0
+    span = max(reach.time[-1], 0.1)
+    for number, index in enumerate(moments, 1):
+        when = reach.touch_time[index]
+        level = (level + 1) % levels if when - last < 0.05 * span else 0
+        last = when
+        axes.axvline(when, color=TOUCHED, lw=0.6 * look.thin, ls=":", zorder=1)
+        axes.text(when, top * (1.08 + 0.15 * level), str(number), **_tag(look))
 
 
-def _activity(axes: Axes, reach: ReachSeries) -> None:
+def _gates(reach: ReachSeries) -> list[tuple[str, list[str]]]:
+    """Rows for what the gate did: label and codes, the commonest first."""
+    count: dict[str, int] = {}
+    for state in reach.states:
+        for code in state.interventions:
+            count[code] = count.get(code, 0) + 1
+    codes = sorted(count, key=lambda code: -count[code])
+    if len(codes) <= GATES:
+        return [(f"gate: {plain(code)}", [code]) for code in codes]
+    rare = codes[GATES - 1 :]
+    rows = [(f"gate: {plain(code)}", [code]) for code in codes[: GATES - 1]]
+    return [*rows, (f"gate: {len(rare)} other kinds", rare)]
+
+
+def _activity(axes: Axes, reach: ReachSeries, names: Sequence[str], look: Look) -> None:
     """Bars for what it did, and under them for what the safety gate did."""
-    spans = _spans(reach)
-    names = list(dict.fromkeys(activity for _, _, activity in spans))
-    for begin, end, activity in spans:
+    for begin, end, activity in _spans(reach):
         colour = ACTIVITIES.get(activity, OTHER)
         axes.barh(names.index(activity), max(end - begin, 0.02), left=begin, height=0.7, fc=colour)
-    labels = [name.replace("_", " ") for name in names]
-    for code in dict.fromkeys(c for s in reach.states for c in s.interventions):
-        when = [t for t, s in zip(reach.time, reach.states, strict=True) if code in s.interventions]
-        axes.plot(when, np.full(len(when), len(labels)), "|", color="black", ms=9)
-        labels.append(f"gate: {code.replace('_', ' ')}")
-    axes.set_yticks(range(len(labels)), labels, fontsize=9)
+    labels = [plain(name) for name in names]
+    for label, codes in _gates(reach):
+        when = [
+            t
+            for t, s in zip(reach.time, reach.states, strict=True)
+            if any(code in s.interventions for code in codes)
+        ]
+        axes.plot(
+            when, np.full(len(when), len(labels)), "|", color="black", ms=8 * look.thin,
+            mew=look.thin,
+        )  # fmt: skip
+        labels.append(label)
+    room = 72.0 * look.width_in * (0.3 if look.narrow else 0.15)
+    size = 0.85 * look.font_pt
+    axes.set_yticks(
+        range(len(labels)), [shortened(label, room, size) for label in labels], fontsize=size
+    )
     axes.set_ylim(len(labels) - 0.5, -0.5)
     axes.set_xlabel("time since the reach began, s")
-    axes.grid(alpha=0.25, axis="x")
+    axes.grid(visible=True, axis="x")

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from tactile_bus.geometry import TIP_X, finger
 from tactile_bus.topics import ARM_STATE, FEATURES, REACH_EVENT, REACH_STATE, WORLD
+from tactile_tools.logs.terminal import ToolError
+from tactile_tools.plots.gaps import HOLE_PERIODS, period, presses
 from tactile_tools.plots.series import LogUnreadableError, messages
 
 Float = NDArray[np.float64]
 
 WANTED = frozenset({ARM_STATE, FEATURES, REACH_EVENT, REACH_STATE, WORLD})
-CAPTURED = frozenset({ARM_STATE, FEATURES})
 UNDER_WAY = frozenset({"homing", "reaching"})
 
 MAX_POINTS = 200_000
@@ -37,21 +38,69 @@ class Contact:
     shear: Float
 
 
+@dataclass(frozen=True, slots=True)
+class Told:
+    """A reach that the log holds: who reached, by what strategy, how it ended ("" unknown)."""
+
+    name: str
+    strategy: str
+    outcome: str
+
+
 @dataclass(eq=False)
 class ReachSeries:
-    """What a log says of its last reach. Times are s since that reach began."""
+    """What a log says of one reach. Times are s since that reach began.
+
+    ``number``: among all in the log, from 1. ``arms``, ``boards``: those heard of meanwhile, of
+    which ``arm_name`` and ``board_name`` are drawn. ``left_out``: messages beyond `MAX_POINTS`.
+    """
 
     start_ns: int
     first_world: Any
+    name: str = "reach"
+    number: int = 1
     time: list[float] = field(default_factory=list)
     states: list[Any] = field(default_factory=list)
-    arm_time: list[float] = field(default_factory=list)
-    arm: list[Any] = field(default_factory=list)
-    touch_time: list[float] = field(default_factory=list)
-    touch: list[Any] = field(default_factory=list)
     events: list[tuple[float, Any]] = field(default_factory=list)
     last_world: Any = None
     ended: bool = False
+    arms: dict[str, tuple[list[float], list[Any]]] = field(default_factory=dict)
+    boards: dict[str, tuple[list[float], list[Any]]] = field(default_factory=dict)
+    arm_name: str = ""
+    board_name: str = ""
+    all_reaches: tuple[Told, ...] = ()
+    left_out: int = 0
+    newest: Any = None
+
+    def is_over(self, state: Any) -> bool:
+        """Whether ``state`` is of a later reach, the end of this one being lost in a hole."""
+        last = self.newest
+        return (
+            last is not None
+            and state.state == last.state
+            and state.stamped_ns > last.stamped_ns
+            and state.elapsed < last.elapsed
+        )
+
+    @property
+    def arm_time(self) -> list[float]:
+        """Of `arm`."""
+        return self.arms[self.arm_name][0]
+
+    @property
+    def arm(self) -> list[Any]:
+        """States of the arm that is drawn."""
+        return self.arms[self.arm_name][1]
+
+    @property
+    def touch_time(self) -> list[float]:
+        """Of `touch`."""
+        return self.boards.get(self.board_name, ([], []))[0]
+
+    @property
+    def touch(self) -> list[Any]:
+        """Features of the board that is drawn; none where nothing was felt or logged."""
+        return self.boards.get(self.board_name, ([], []))[1]
 
     def outcome(self) -> Any:
         """The event that tells how the reach ended, None when the log was cut off before."""
@@ -70,6 +119,16 @@ class ReachSeries:
         k = min(int(np.searchsorted(self.arm_time, when)), len(self.arm) - 1)
         arm = self.arm[k]
         return float(arm.x), float(arm.y), float(arm.heading)
+
+    def placed(self) -> NDArray[np.bool_]:
+        """(features,) whether it is known where the arm was: not in a hole of its states."""
+        times, asked = np.asarray(self.arm_time), np.asarray(self.touch_time)
+        if not len(asked):
+            return np.zeros(0, bool)
+        after = np.clip(np.searchsorted(times, asked), 0, len(times) - 1)
+        before = np.clip(after - 1, 0, None)
+        away = np.minimum(np.abs(times[after] - asked), np.abs(times[before] - asked))
+        return np.asarray(away <= max(HOLE_PERIODS * period(times), 0.02))
 
     def tip(self) -> Float:
         """(arm states, 2) m: path of the tip."""
@@ -95,26 +154,18 @@ class ReachSeries:
             )
         return found
 
-    def moments(self, most: int, apart_s: float, apart_m: float, least_n: float) -> list[int]:
-        """Features of the strongest moments, in order of time.
+    def moments(self, most: int, least_n: float) -> list[int]:
+        """Features of the strongest moments, in order of time: each of another press.
 
-        No two are within both ``apart_s`` and ``apart_m`` of each other, none below ``least_n``.
+        None below ``least_n``, none while it is not known where the arm was.
         """
-        chosen: list[tuple[int, Float]] = []
-        for index in np.argsort([-t.normal_force for t in self.touch]).tolist():
-            contacts = self.contacts_at(index)
-            if not contacts or not self.touch[index].normal_force >= least_n:
-                continue
-            place = max(contacts, key=lambda c: c.normal).place
-            if all(
-                abs(self.touch_time[index] - self.touch_time[k]) > apart_s
-                or math.dist(place, other) > apart_m
-                for k, other in chosen
-            ):
-                chosen.append((index, place))
-            if len(chosen) == most:
-                break
-        return sorted(index for index, _ in chosen)
+        sides = 1 + max((p.side for t in self.touch for p in t.patches), default=0)
+        force = np.zeros((len(self.touch), sides))
+        for index, known in enumerate(self.placed()):
+            if known:
+                for patch in self.touch[index].patches:
+                    force[index, patch.side] += max(float(patch.normal_force), 0.0)
+        return presses(self.touch_time, force, least_n, most)
 
 
 _SKIN = finger()
@@ -134,47 +185,122 @@ def turned(points: Any, x: float, y: float, heading: float) -> Float:
     return np.asarray(np.asarray(points) @ np.array([[c, s], [-s, c]]) + (x, y))
 
 
-def read_reach(path: Path | Sequence[Path]) -> ReachSeries:
-    """Return the last reach in a log; LogUnreadableError when there is none."""
-    series: ReachSeries | None = None
-    world: Any = None
-    for topic, _, message in messages(path, WANTED):
-        if topic == WORLD:
-            world = message
-            if series is not None and not series.ended:
-                series.first_world = series.first_world or message
-                series.last_world = message
-            continue
-        if topic == REACH_STATE:
-            under_way = message.state in UNDER_WAY
-            if under_way and (series is None or series.ended):
-                series = ReachSeries(message.stamped_ns, world, last_world=world)
-            elif series is not None and not under_way:
-                series.ended = True
-        if series is not None:
-            _add(series, topic, message)
-    if series is None or not series.arm:
-        first = path if isinstance(path, Path) else path[0]
+def read_reach(
+    path: Path | Sequence[Path],
+    number: int | None = None,
+    board: str | None = None,
+    arm: str | None = None,
+) -> ReachSeries:
+    """Return one reach of a log, the last unless ``number`` (from 1, in the order they began).
+
+    ``board``, ``arm``: whose features and states; else those of which there is most.
+    LogUnreadableError when the log holds no reach, ToolError when it holds no such one.
+    """
+    reader = _Reader(number)
+    for topic, name, message in messages(path, WANTED):
+        reader.take(topic, name, message)
+    first = path if isinstance(path, Path) else path[0]
+    series = reader.chosen
+    told = tuple(reader.told)
+    if not told:
         raise LogUnreadableError(
             f"{first} holds no reach: was it written by reachd or `tactile reach --log`?"
         )
+    if series is None:
+        raise ToolError(f"no reach {number} in the log; it holds {len(told)}:\n{listed(told)}")
+    if not series.arms:
+        raise LogUnreadableError(
+            f"{first} holds no states of an arm during reach {series.number}, so that it is not "
+            "known where the finger was: was the arm's topic logged?"
+        )
+    series.all_reaches = told
+    series.arm_name = _choose("arm", arm, series.arms)
+    series.board_name = _choose("board", board, series.boards)
     return series
 
 
-def _add(series: ReachSeries, topic: Any, message: Any) -> None:
-    stamp = message.captured_ns if topic in CAPTURED else message.stamped_ns
-    now = (int(stamp) - series.start_ns) * 1e-9
-    if topic == REACH_EVENT:
-        if now >= 0 and (not series.ended or message.kind == "outcome"):
+def listed(told: Sequence[Told]) -> str:
+    """One line a reach."""
+    many = len({reach.name for reach in told}) > 1
+    return "\n".join(
+        f"  {number}  {reach.name + ': ' if many else ''}{reach.strategy}, "
+        f"{reach.outcome or 'no outcome in the log'}"
+        for number, reach in enumerate(told, 1)
+    )
+
+
+def _choose(what: str, asked: str | None, held: dict[str, tuple[list[float], list[Any]]]) -> str:
+    if asked is not None and asked not in held:
+        there = ", ".join(sorted(held)) or "none"
+        raise ToolError(f"no {what} {asked!r} was heard during this reach, but {there}")
+    return asked or max(sorted(held), key=lambda name: len(held[name][1]), default="")
+
+
+class _Reader:
+    """Goes through a log and keeps one reach of it."""
+
+    def __init__(self, wanted: int | None) -> None:
+        self.told: list[Told] = []
+        self.chosen: ReachSeries | None = None
+        self._wanted = wanted
+        self._world: Any = None
+        self._current: dict[str, ReachSeries] = {}  # of each reach name, the last that began
+
+    def take(self, topic: Any, name: str, message: Any) -> None:
+        """Take the next message."""
+        if topic == REACH_STATE:
+            self._state(name, message)
+        elif topic == REACH_EVENT:
+            self._event(name, message)
+        elif topic == WORLD:
+            self._world = message
+            for each in self._current.values():
+                if not each.ended:
+                    each.first_world = each.first_world or message
+                    each.last_world = message
+        elif (series := self.chosen) is not None and not series.ended:
+            held = series.arms if topic == ARM_STATE else series.boards
+            times, kept = held.setdefault(name, ([], []))
+            self._keep(series, times, kept, message.captured_ns, message)
+
+    def _state(self, name: str, message: Any) -> None:
+        series = self._current.get(name)
+        under_way = message.state in UNDER_WAY
+        if under_way and (series is None or series.ended or series.is_over(message)):
+            self.told.append(Told(name, message.strategy, ""))
+            series = ReachSeries(
+                message.stamped_ns, self._world, name, len(self.told), last_world=self._world
+            )
+            self._current[name] = series
+            if self._wanted in (None, series.number):
+                self.chosen = series
+        elif series is not None and not under_way:
+            series.ended = True
+        if series is None:
+            return
+        series.newest = message
+        if series is self.chosen and not series.ended:
+            self._keep(series, series.time, series.states, message.stamped_ns, message)
+
+    def _event(self, name: str, message: Any) -> None:
+        series = self._current.get(name)
+        if series is None:
+            return
+        now = (int(message.stamped_ns) - series.start_ns) * 1e-9
+        if now < 0 or (series.ended and message.kind != "outcome"):
+            return
+        if message.kind == "outcome" and series.outcome() is None:
+            known = self.told[series.number - 1]
+            self.told[series.number - 1] = Told(known.name, known.strategy, message.code)
+        if len(series.events) < MAX_POINTS:
             series.events.append((now, message))
-        return
-    if series.ended:
-        return
-    times, kept = {
-        REACH_STATE: (series.time, series.states),
-        ARM_STATE: (series.arm_time, series.arm),
-        FEATURES: (series.touch_time, series.touch),
-    }[topic]
-    if len(kept) < MAX_POINTS:
-        times.append(now)
-        kept.append(message)
+
+    @staticmethod
+    def _keep(
+        series: ReachSeries, times: list[float], kept: list[Any], stamp_ns: int, message: Any
+    ) -> None:
+        if len(kept) < MAX_POINTS:
+            times.append((int(stamp_ns) - series.start_ns) * 1e-9)
+            kept.append(message)
+        else:
+            series.left_out += 1

@@ -38,7 +38,7 @@ MAX_POINTS = 16_384
 """Points of one curve: ten times the pixels of a picture's width. Beyond, every two become one."""
 
 MAX_EVENTS = 200
-"""Remarks and events kept: more would not be legible."""
+"""Remarks kept of a board, and events of reaches: more would not be legible. More are counted."""
 
 WARNING = 30
 """Level of ``rcl_interfaces/Log`` from which a remark is an event."""
@@ -143,6 +143,7 @@ class BoardSeries:
     logging_spread: Spread = field(default_factory=Spread)
     period_spread: Spread = field(default_factory=Spread)
     events: list[tuple[float, str]] = field(default_factory=list)
+    events_left_out: int = 0  # beyond `MAX_EVENTS`
     drops: dict[str, int] = field(default_factory=dict)
     _sequence: int | None = None
 
@@ -201,8 +202,8 @@ class BoardSeries:
         elif topic == DIAGNOSTICS:
             self._take_diagnostics(message)
         elif topic == LOG:
-            if message.level >= WARNING and len(self.events) < MAX_EVENTS:
-                self.events.append((self.last, message.msg))
+            if message.level >= WARNING:
+                self.remark(self.last, message.msg)
         elif topic == FORCES:
             self._take_forces(message, log_ns, (message.captured_ns - start) * 1e-9)
         else:
@@ -214,6 +215,13 @@ class BoardSeries:
                 self.removed.add(now, message)
             elif topic == FIELD:
                 self.warmth.add(now, np.asarray(message.temperature_c, np.float32).copy())
+
+    def remark(self, when: float, text: str) -> None:
+        """Keep what happened, or count it where there is too much."""
+        if len(self.events) < MAX_EVENTS:
+            self.events.append((when, text))
+        else:
+            self.events_left_out += 1
 
     def _take_forces(self, message: Any, log_ns: int, now: float) -> None:
         force = np.asarray(message.force, np.float32).reshape(-1, 3).copy()
@@ -307,11 +315,16 @@ def read_boards(
     """Return the series of every board in a log, by board name; raises LogUnreadableError."""
     boards: dict[str, BoardSeries] = {}
     reach: list[tuple[int, str]] = []
+    reach_left_out = 0
     start: int | None = None
     for topic, name, message, log_ns in _timed(source, WANTED, progress):
         if topic == REACH_EVENT:
-            if message.kind != "intervention" and len(reach) < MAX_EVENTS:
+            if message.kind == "intervention":
+                continue
+            if len(reach) < MAX_EVENTS:
                 reach.append((message.stamped_ns, f"{message.kind}: {message.code}"))
+            else:
+                reach_left_out += 1
             continue
         board = boards.setdefault(name, BoardSeries(name))
         if start is None:
@@ -322,6 +335,7 @@ def read_boards(
         board.start_ns = start or 0
         board.events += [((at - board.start_ns) * 1e-9, text) for at, text in reach]
         board.events.sort()
+        board.events_left_out += reach_left_out
     if not boards:
         paths = source if isinstance(source, Path) else source[0]
         raise LogUnreadableError(
