@@ -75,6 +75,17 @@ NO_MESSAGES = frozenset((op.HEADER, op.SCHEMA, op.CHANNEL, op.MESSAGE_INDEX, op.
 DATA_RECORDS = frozenset((op.HEADER, op.SCHEMA, op.CHANNEL, op.METADATA, op.MESSAGE))
 
 
+class _Any:
+    """Contains everything."""
+
+    def __contains__(self, _: object) -> bool:
+        return True
+
+
+ANY: Container[int] = _Any()
+"""All channels, for `LogReader.messages` to hand out none of their data."""
+
+
 @dataclass(slots=True)
 class LogReader:
     """One pass over a log, as a context manager. `LogError` when the file is none.

@@ -171,8 +171,8 @@ def _content_findings(found: LogInfo, watch: _Watch) -> list[Finding]:
         out.append(Finding("gap", True, f"{text} {first.detail}".rstrip(), gone))
     if found.one_counter and found.numbers_missing:
         text = (
-            f"one counter numbers the messages of all channels, and {found.numbers_missing} numbers "
-            "are missing: of messages that were lost, or of channels that are not in this log"
+            f"one counter numbers the messages of all channels, and {found.numbers_missing} of its "
+            "numbers are missing: of messages that were lost, or of channels that are not in here"
         )
         out.append(Finding("missing_messages", True, text, gone))
     elif found.one_counter:

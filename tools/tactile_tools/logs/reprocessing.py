@@ -84,7 +84,7 @@ def survey(series: Series, report: Progress | None = None) -> Known:
                 elif item.name.startswith("board:"):
                     known.serials.add(item.values.get("serial_number", ""))
             elif isinstance(item, Attachment) and item.name.endswith(SUFFIX):
-                text = item.data.decode("utf-8", "replace")
+                text = item.read().decode("utf-8", "replace")
                 calibration = loads(text, f"{series.name}: {item.name}")
                 known.versions.setdefault(calibration.hash, calibration)
                 known.first.setdefault(item.name.removesuffix(SUFFIX), calibration)
@@ -249,7 +249,7 @@ class Reprocessing:
                     data = saves(choice.calibration).encode()
                     name = f"{station.name}{SUFFIX}"
                     now = self.sink.wall.wall_ns(self.sink.now())
-                    output.attach(Attachment(name, "application/toml", now, now, data))
+                    output.attach(Attachment.of(name, "application/toml", now, now, data))
 
     def summary(self, series: Series, given: list[BoardCalibration]) -> dict[str, str]:
         """What the new log says of how it was made."""

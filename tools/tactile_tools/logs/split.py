@@ -10,9 +10,9 @@ from typing import Any
 
 from tactile_bus.gaps import GAP
 from tactile_bus.instant import NS_PER_S
+from tactile_bus.latched import is_latched
 from tactile_bus.log_records import MetadataRecord
 from tactile_bus.options import finite_above_zero
-from tactile_bus.topics import find_topic
 from tactile_tools.logs.arguments import add_files, check_output, moment, size_bytes
 from tactile_tools.logs.sources import FILE, find_series
 from tactile_tools.logs.stream import (
@@ -27,8 +27,9 @@ from tactile_tools.logs.stream import (
 from tactile_tools.logs.terminal import ToolError, bytes_text, cannot_write, plain_console, progress
 from tactile_tools.logs.writing import LogOutput
 
-STAYING = ("tf_static", "robot_description")
-"""Topics of other programs whose last message holds until the next."""
+REPEATED_BYTES = 1 << 20
+"""Attachments up to that size are in every part, so that each can be used alone; calibrations and
+configurations have kilobytes."""
 
 MAX_PARTS = 9999
 
@@ -36,8 +37,9 @@ MAX_PARTS = 9999
 def fill(parser: argparse.ArgumentParser) -> None:
     """Give ``tactile log split`` its arguments."""
     parser.description = (
-        "Write a log as several files, which the other tools take as one again. Each "
-        "has the attachments and tables of the log and the last values that hold."
+        "Write a log as several files, which the other tools take as one again, nothing twice. "
+        "Each begins with the tables, small attachments and latched messages that hold there, so "
+        "that it can be used alone."
     )
     add_files(parser)
     how = parser.add_mutually_exclusive_group(required=True)
@@ -143,7 +145,8 @@ class Parts:
                 self._tables[item.name] = item
         elif isinstance(item, Attachment):
             output.attach(item)
-            self._files[item.name] = item
+            if item.size <= REPEATED_BYTES:
+                self._files[item.name] = Attachment.of(*item[:4], item.read())
         else:
             output.write(item)
             if self._stays(item.stream):
@@ -184,7 +187,5 @@ class Parts:
     def _stays(self, stream: Stream) -> bool:
         stays = self._kept.get(stream)
         if stays is None:
-            found = find_topic(stream.topic)
-            named = stream.topic.rpartition("/")[2] in STAYING
-            stays = self._kept[stream] = named or (found is not None and found[0].latched)
+            stays = self._kept[stream] = is_latched(stream.topic, dict(stream.metadata))
         return stays
