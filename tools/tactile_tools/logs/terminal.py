@@ -85,6 +85,9 @@ def fail(error: LogError) -> int:
 
 def cannot_write(what: object, error: OSError) -> ToolError:
     """`ToolError` for an output that the system refuses, with the remedy."""
+    if error.errno == errno.EMFILE:
+        remedy = "take fewer topics at a time with --topic"
+        return ToolError(f"cannot write {what}: {error.strerror}; {remedy}", REFUSED)
     full = error.errno in (errno.ENOSPC, errno.EDQUOT)
     remedy = "make room, or name a place on another disk" if full else "name a place to write to"
     return ToolError(f"cannot write {what}: {error.strerror or error}; {remedy}", REFUSED)
