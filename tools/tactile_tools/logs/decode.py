@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import re
@@ -18,7 +19,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.base import TypesysError
 
 from tactile_bus.messages import DecodeError
-from tactile_tools.logs.cdr import ARRAY, BASE, NAME, SEQUENCE, WideDecoder
+from tactile_tools.logs.cdr import ARRAY, BASE, NAME, SEQUENCE, CdrError, WideDecoder
 from tactile_tools.logs.stream import Stream
 
 __all__ = ["ARRAY", "BASE", "NAME", "SEQUENCE", "Decoder", "Reader", "finite", "plain"]
@@ -93,6 +94,12 @@ SERVICE = re.compile(r"(.*)_(Event|Request|Response)")
 
 EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 
+FEW = 32
+"""Messages of a type that are decoded without code of its own: as long as that takes to make."""
+
+MAX_STORES = 16
+"""Type stores kept for further types; definitions of one name that differ need one each."""
+
 DUMMY = "structure_needs_at_least_one_member"
 """What ROS puts into a message without fields."""
 
@@ -128,26 +135,74 @@ def _typed_reader(msgtype: str, schema_encoding: str, definition: bytes) -> Read
     """Reader of a type; `DecodeError` says what is wrong with its definition."""
     try:
         types = _types(definition.decode(), msgtype, schema_encoding)
-        store = get_typestore(Stores.EMPTY)
-        name = next((n for n in _names(msgtype) if n in types or n in store.fielddefs), "")
+        fields = {**get_typestore(Stores.EMPTY).fielddefs, **types}
+        name = next((n for n in _names(msgtype) if n in fields), "")
         if not name:
             raise DecodeError(f"does not hold {msgtype}")
-        wide = _prepare(types)
-        missing = _undefined(name, {**store.fielddefs, **types})
+        wide = _prepare(fields)
+        missing = _undefined(name, fields)
         if EVENT_INFO in missing:
-            types[EVENT_INFO] = get_typestore(Stores.ROS2_JAZZY).fielddefs[EVENT_INFO]
+            fields[EVENT_INFO] = get_typestore(Stores.ROS2_JAZZY).fielddefs[EVENT_INFO]
             missing.remove(EVENT_INFO)
         if missing:
             raise DecodeError(f"lacks {', '.join(missing)}")
         if wide:
-            fields = {**store.fielddefs, **types}
             return Reader(WideDecoder(fields, name), fields, name)
-        store.register(types)
     except DecodeError:
         raise
     except (TypesysError, UnicodeDecodeError, KeyError, ValueError, RecursionError) as error:
         raise DecodeError(f"cannot be read: {error}") from error
-    return Reader(lambda data: store.deserialize_cdr(data, name), dict(store.fielddefs), name)
+    return Reader(_Decode(fields, name), fields, name)
+
+
+class _Decode:
+    """Decodes messages of a type: the first few field by field, more by code made for the type.
+
+    To make it takes some ms, and logs may have thousands of types with a message each.
+    """
+
+    def __init__(self, fields: dict[str, Any], name: str) -> None:
+        self._fields = fields
+        self._name = name
+        self._few = WideDecoder(fields, name)
+        self._count = 0
+        self._store: Any = None
+
+    def __call__(self, data: bytes) -> Any:
+        """The message in ``data``; errors as rosbags raises them."""
+        if self._store is None:
+            self._count += 1
+            if self._count <= FEW:
+                with contextlib.suppress(CdrError):
+                    return self._few(data)
+            try:
+                self._store = _store_for(self._fields)
+            except TypesysError as error:
+                raise ValueError(str(error)) from error
+        return self._store.deserialize_cdr(data, self._name)
+
+
+_stores: list[tuple[Any, dict[str, Any]]] = []
+
+
+def _store_for(fields: dict[str, Any]) -> Any:
+    """A type store with these definitions: one that has others too, if none is different there.
+
+    To make code for a type takes some ms, and logs have thousands that share most of their parts.
+    """
+    fit = (s for s in _stores if all(s[1].get(n, each) == each for n, each in fields.items()))
+    store, known = next(fit, (None, {}))
+    if store is None:
+        store = get_typestore(Stores.EMPTY)
+        known = dict(store.fielddefs)
+        if any(known.get(name, each) != each for name, each in fields.items()):
+            known = {name: each for name, each in known.items() if name not in fields}
+        if len(_stores) < MAX_STORES:
+            _stores.append((store, known))
+    new = {name: each for name, each in fields.items() if name not in known}
+    known.update(new)
+    store.register(new)
+    return store
 
 
 def _types(text: str, msgtype: str, schema_encoding: str) -> dict[str, Any]:
@@ -165,11 +220,26 @@ def _types(text: str, msgtype: str, schema_encoding: str) -> dict[str, Any]:
     service = SERVICE.fullmatch(name)
     parts = PARTS.split(own)
     if service is None or len(parts) != 2:
-        return dict(get_types_from_msg(text, name))
+        return _sections(own, name, others)
     types: dict[str, Any] = {}
     for part, kind in zip(parts, ("Request", "Response"), strict=True):
-        types |= get_types_from_msg(f"{part}\n{others}", f"{service[1]}_{kind}")
+        types |= _sections(part, f"{service[1]}_{kind}", others)
     return types | _event(name, types)
+
+
+def _sections(own: str, name: str, others: str) -> dict[str, Any]:
+    """Types of a definition and of all it brings with it, each parsed once however often it is."""
+    types: dict[str, Any] = {}
+    heads = list(DELIMITER.finditer(others))
+    ends = [*(head.start() for head in heads[1:]), len(others)]
+    for head, end in zip(heads, ends, strict=False):
+        types |= _section(others[head.end() : end].strip("\n"), head[1])
+    return types | _section(own, name)
+
+
+@lru_cache(maxsize=4096)
+def _section(text: str, name: str) -> dict[str, Any]:
+    return dict(get_types_from_msg(text + "\n", name))
 
 
 def _event(name: str, types: dict[str, Any]) -> dict[str, Any]:

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+
+# Arrow's own pool keeps what it was given: 20 to 40 MB more for batches as small as these. It is
+# chosen when Arrow is first imported.
+os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
+
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
@@ -19,7 +25,7 @@ BATCH = 1024
 """Rows written at once: some MB of the widest topic (80 taxels); a Parquet row group has ten."""
 
 BATCH_BYTES = 2 << 20
-"""Encoded bytes after which a batch is written in any case: Python's objects take ten times that."""
+"""Encoded bytes after which a batch is written in any case: as objects they take ten times that."""
 
 HELD_BYTES = 16 << 20
 """Encoded bytes of the messages that wait in all tables together."""
@@ -28,7 +34,7 @@ MESSAGE_BYTES = 500
 """What a message is counted beside its bytes."""
 
 GROUP = 10
-GROUP_BYTES = 2 << 20
+GROUP_BYTES = 1 << 20
 """Encoded bytes after which a row group of a Parquet file is written in any case."""
 
 OWN = ("time_s", "log_time_ns", "publish_time_ns", "log_sequence")
@@ -40,10 +46,6 @@ NOTES = {
     "publish_time_ns": "ns since the Unix epoch, when it was sent",
     "log_sequence": "number of the message within its stream",
 }
-
-
-# Arrow's own pool keeps what it was given: 20 to 40 MB more for batches as small as these.
-pa.set_memory_pool(pa.system_memory_pool())
 
 
 class Budget:
