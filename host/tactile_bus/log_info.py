@@ -225,7 +225,8 @@ class LogInfo:
     ``path``: the first file, ``files``: how many. ``missing_files``: numbers not there between the
     first and the last. ``outcomes``: of the reaches in it. ``tables`` and ``files_within``: each of
     them, the first MAX_LISTED, without those that a later file repeats; ``metadata`` and
-    ``attachments``: the last of each name. ``one_counter``: the messages are numbered over all
+    ``attachments``: the last of each name. ``indexed``: all messages are in chunks, of which the
+    summaries tell, and all channels. ``one_counter``: the messages are numbered over all
     channels; then ``numbers_missing`` counts instead of what is missing of each channel.
     """
 
@@ -246,6 +247,7 @@ class LogInfo:
     table_count: int = 0
     files_within: list[AttachmentInfo] = field(default_factory=list)
     attachment_count: int = 0
+    indexed: bool = True
     one_counter: bool = False
     numbers_missing: int = 0
     damages: list[Damage] = field(default_factory=list)
@@ -384,6 +386,7 @@ class _Taker:
         result.size += reader.size
         result.profile, result.library = reader.profile, reader.library
         result.closed &= reader.closed
+        result.indexed &= reader.indexed
         result.damages += reader.damages[: MAX_LISTED - len(result.damages)]
         result.damage_count += reader.damage_count
         result.bytes_damaged += reader.bytes_damaged

@@ -117,6 +117,7 @@ class LogReader:
     messages_lost: int = 0
     lost_unknown: int = 0
     unchunked: int = 0
+    chunk_count: int = 0
     suspect: int = 0
     summary: Summary | None = None
     data_crc: int = 0
@@ -151,6 +152,20 @@ class LogReader:
         at: TracebackType | None,
     ) -> None:
         self._bytes.close()
+
+    @property
+    def indexed(self) -> bool:
+        """After the pass: whether the summary tells of all channels and types, and has an index of
+        every chunk and of its messages, so that programs that need one find every message."""
+        summary = self.summary
+        if summary is None or self.unchunked or not summary.knows_all_channels:
+            return False
+        types = {schema.number for schema in summary.schemas} | {0}
+        return (
+            not summary.unindexed
+            and len(summary.chunks) == self.chunk_count
+            and all(channel.schema in types for channel in summary.channels)
+        )
 
     @property
     def lossy(self) -> bool:
@@ -507,6 +522,7 @@ class LogReader:
         found = self._bytes.chunk_head(position)
         if found is None:
             raise BadRecordError("a chunk whose sizes do not agree")
+        self.chunk_count += 1
         head, place = found
         after = position + 9 + length
         packed = Packed(head, place, head.data_length)
