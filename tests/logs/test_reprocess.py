@@ -181,7 +181,7 @@ def test_a_log_that_was_cut_off_gives_what_its_bytes_give(
 ) -> None:
     data = pressed.read_bytes()
     cut = tmp_path / "cut.mcap"
-    cut.write_bytes(data[: len(data) * 2 // 3])
+    cut.write_bytes(data[: len(data) * 4 // 5])
     outcome = log_tool("reprocess", cut)
     assert outcome.code == 0, outcome.err
     new, old, same = counts(outcome.out)["/tactile/finger/features"]

@@ -43,7 +43,8 @@ def fill(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         f"Write {METADATA} for a log: beside its files, or with --out in a new folder "
         "with the files (hard links where that can be, else copies; files that were cut off, or "
-        "have no indexes, which ros2 bag needs, are written anew). Types of tactile_msgs have to be built in the workspace to be played."
+        "have no indexes, which ros2 bag needs, are written anew). Types of tactile_msgs have to "
+        "be built in the workspace to be played."
     )
     add_files(parser)
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="new folder (default: beside)")
