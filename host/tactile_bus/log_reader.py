@@ -63,6 +63,9 @@ MAX_RECORD = 16 << 20
 MAX_DEFINITIONS = 64 << 20
 """Bytes of all schemas and channels of a file: three thousand topics have some MB."""
 
+MAX_FILE = 1 << 50
+"""Bytes beyond which no file goes: a length that says so is wrong."""
+
 MAX_DAMAGES = 1000
 """Places reported one by one; beyond that they are only counted."""
 
@@ -760,7 +763,11 @@ class LogReader:
         self._settle_lost_chunk()
         head = self.read_at(position, 9)
         after = position + 9 + op.RECORD.unpack(head)[1] if len(head) == 9 else self._bytes.end
-        messages = 0 if head[:1] and head[0] in NO_MESSAGES else None
+        messages = None
+        if head[:1] and head[0] in NO_MESSAGES:
+            length = after - position - 9
+            believed = head[0] == op.ATTACHMENT or length <= MAX_RECORD
+            messages = 0 if believed and after <= MAX_FILE else None
         if head[:1] == bytes((op.MESSAGE,)) and after > self._bytes.end:
             messages = 1
         if not self._bytes.plausible(after) and after != self._bytes.end:

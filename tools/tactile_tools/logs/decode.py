@@ -97,6 +97,9 @@ EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 FEW = 32
 """Messages of a type that are decoded without code of its own: as long as that takes to make."""
 
+MAX_DEPTH = 32
+"""How deep types may lie within one another; ROS's own go to six."""
+
 MAX_STORES = 16
 """Type stores kept for further types; definitions of one name that differ need one each."""
 
@@ -145,7 +148,8 @@ def _typed_reader(msgtype: str, schema_encoding: str, definition: bytes) -> Read
             fields[EVENT_INFO] = get_typestore(Stores.ROS2_JAZZY).fielddefs[EVENT_INFO]
             missing.remove(EVENT_INFO)
         if missing:
-            raise DecodeError(f"lacks {', '.join(missing)}")
+            raise DecodeError(f"lacks {', '.join(missing[:10])}")
+        _check_depth(name, fields)
         if wide:
             return Reader(WideDecoder(fields, name), fields, name)
     except DecodeError:
@@ -310,6 +314,33 @@ def _undefined(msgtype: str, fields: dict[str, Any]) -> list[str]:
 def _is_empty(reader: Reader) -> bool:
     fields = reader.fields.get(reader.msgtype)
     return fields is not None and [name for name, _ in fields[1]] == [DUMMY]
+
+
+def _check_depth(msgtype: str, fields: dict[str, Any]) -> None:
+    """`DecodeError` for types that contain themselves, or others too many times over."""
+    depths: dict[str, int] = {}  # 0 while a type is being looked into
+    todo = [msgtype]
+    while todo:
+        name = todo[-1]
+        inner = {_inner(*each) for _, each in fields[name][1]} - {""}
+        if any(depths.get(each) == 0 for each in inner if each in depths):
+            raise DecodeError(f"has {name} contain itself")
+        waiting = [each for each in inner if each not in depths]
+        if waiting:
+            depths[name] = 0
+            todo += waiting
+            continue
+        depths[name] = 1 + max((depths[each] for each in inner), default=0)
+        if depths[name] > MAX_DEPTH:
+            raise DecodeError(f"nests types more than {MAX_DEPTH} times")
+        todo.pop()
+
+
+def _inner(kind: int, arguments: Any) -> str:
+    """Name of the type within a field; empty for numbers and texts."""
+    if kind in (ARRAY, SEQUENCE):
+        kind, arguments = arguments[0]
+    return arguments if kind == NAME else ""
 
 
 def plain(message: Any, fields: dict[str, Any], msgtype: str) -> Any:
