@@ -371,13 +371,21 @@ class LogReader:
             self.note_damage(Damage(place, 0, reason, lost))
 
     def data_checksum_is_right(self) -> bool:
-        """Whether the bytes of the data have their checksum; reads them all where there is one."""
+        """Whether the bytes of the data have their checksum; reads them all where there is one.
+
+        Writers differ in where the data begin: with the file, behind its first eight bytes, or
+        behind the header.
+        """
         if not self.data_crc:
             return True
-        crc = 0
-        for piece in self.pieces_at(0, self.data_end):
-            crc = zlib.crc32(piece, crc)
-        return crc == self.data_crc
+        header = 8 + 9 + op.RECORD.unpack(self.read_at(8, 9).ljust(9, b"\0"))[1]
+        for start in (0, 8, header):
+            crc = 0
+            for piece in self.pieces_at(start, self.data_end - start):
+                crc = zlib.crc32(piece, crc)
+            if crc == self.data_crc:
+                return True
+        return False
 
     # Passing over what is outside the window
 
@@ -652,7 +660,12 @@ class LogReader:
         while at + 9 <= len(data):
             opcode, length = op.RECORD.unpack_from(data, at)
             after = at + 9 + length
-            if opcode == op.MESSAGE and after <= len(data) and self._likely(data, at, packed.head):
+            if opcode == op.MESSAGE and self._likely(data, at, packed.head):
+                if after < len(data) and not self._likely(data, after, packed.head):
+                    following = self._resume(data, at + 31, packed.head)
+                    if following < after:  # its length is wrong: it would swallow others
+                        at = following
+                        continue
                 fields = op.MESSAGE_HEAD.unpack_from(data, at)
                 self.suspect += 1
                 self._suspect_kept += 1

@@ -141,7 +141,11 @@ class _Copy:
     def finish(self) -> None:
         """Close the target; `LogError` when there is nothing in it."""
         if self._file is None:
-            raise LogError(f"{self._report.source} holds nothing that can be read")
+            reader = self._reader
+            hint = ""
+            if not reader.keep_suspect and any("checksum" in d.reason for d in reader.damages):
+                hint = " and whose checksum is right; --keep-suspect takes what looks readable"
+            raise LogError(f"{self._report.source} holds nothing that can be read{hint}")
         self._flush(self._file)
         self._file.finish()
         self._file = None
