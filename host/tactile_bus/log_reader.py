@@ -600,10 +600,11 @@ class LogReader:
                 if opcode == op.MESSAGE:
                     if len(held) - at < 31:
                         break
-                    fields = op.MESSAGE_HEAD.unpack_from(held, at)
-                    if fields[2] in without:
+                    _, _, channel, *fields = op.MESSAGE_HEAD.unpack_from(held, at)
+                    sequence, log_ns, publish_ns = fields
+                    if channel in without:
                         self._messages += 1
-                        yield Message(*fields[2:], b"")
+                        yield Message(channel, sequence, log_ns, publish_ns, b"")
                         skip = max(0, at + size - len(held))
                         at = min(at + size, len(held))
                         if skip:
@@ -612,7 +613,8 @@ class LogReader:
                     if len(held) - at < size:
                         break
                     self._messages += 1
-                    yield Message(*fields[2:], bytes(memoryview(held)[at + 31 : at + size]))
+                    data = bytes(memoryview(held)[at + 31 : at + size])
+                    yield Message(channel, sequence, log_ns, publish_ns, data)
                 elif opcode in (op.SCHEMA, op.CHANNEL) and length <= MAX_RECORD:
                     if len(held) - at < size:
                         break
@@ -666,10 +668,11 @@ class LogReader:
                     if following < after:  # its length is wrong: it would swallow others
                         at = following
                         continue
-                fields = op.MESSAGE_HEAD.unpack_from(data, at)
+                _, _, channel, *fields = op.MESSAGE_HEAD.unpack_from(data, at)
+                sequence, log_ns, publish_ns = fields
                 self.suspect += 1
                 self._suspect_kept += 1
-                yield Message(*fields[2:], data[at + 31 : after])
+                yield Message(channel, sequence, log_ns, publish_ns, data[at + 31 : after])
             elif opcode in (op.SCHEMA, op.CHANNEL) and after <= len(data):
                 with contextlib.suppress(BadRecordError):
                     self._define(opcode, data[at + 9 : after])

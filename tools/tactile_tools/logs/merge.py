@@ -24,6 +24,7 @@ from tactile_tools.logs.stream import (
     Reading,
     Record,
     Stream,
+    common_profile,
     read_series,
 )
 from tactile_tools.logs.terminal import ToolError, complain, plain_console, progress
@@ -79,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
     shared = {stream for stream, count in streams.items() if count > 1}
     counted = {stream for survey in surveys for stream in survey.counted}
     seen = Copies(shared)
-    with progress("merging") as report, LogOutput(options.out) as output:
+    with progress("merging") as report, LogOutput(options.out, common_profile(logs)) as output:
         output.metadata(FILE, {"set": uuid.uuid4().hex, "file": "0"})
         tables = Tables(logs, output)
         for number, item in _merged(logs, surveys, shifts, reading, report, options.out.parent):

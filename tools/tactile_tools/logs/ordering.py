@@ -72,7 +72,7 @@ class _Waiting(NamedTuple):
     """A message that waits; ``run``: the file it came from, whose next one takes its place."""
 
     log_ns: int
-    count: int
+    number: int
     run: int
     record: Record
 
@@ -177,4 +177,4 @@ def _chain(first: list[_Waiting], rest: Iterator[_Waiting]) -> Iterator[_Waiting
 
 
 def _place(waiting: _Waiting) -> tuple[int, int]:
-    return waiting.log_ns, waiting.count
+    return waiting.log_ns, waiting.number

@@ -21,6 +21,7 @@ from tactile_tools.logs.stream import (
     Reading,
     Record,
     Stream,
+    common_profile,
     first_ns,
     read_series,
 )
@@ -83,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
         return check_output(path, options.force, logs)
 
     reading = Reading()
-    with progress("splitting") as report, Parts(place) as parts:
+    with progress("splitting") as report, Parts(place, common_profile(logs)) as parts:
         for item in read_series(logs[0], reading, report):
             if isinstance(item, Record):
                 while cuts and item.log_ns >= cuts[0]:
@@ -105,10 +106,11 @@ def run(options: argparse.Namespace) -> int:
 class Parts:
     """The files of a split; the next begins with what holds. A context manager."""
 
-    def __init__(self, place: Any) -> None:
+    def __init__(self, place: Any, profile: str) -> None:
         self.made: list[tuple[Path, int]] = []
         self.number = 0
         self._place = place
+        self._profile = profile
         self._identity = uuid.uuid4().hex
         self._tables: dict[str, MetadataRecord] = {}
         self._files: dict[str, Attachment] = {}
@@ -169,7 +171,7 @@ class Parts:
             self._output.write(record._replace(log_ns=log_ns))
 
     def _open(self) -> LogOutput:
-        output = LogOutput(self._place(self.number))
+        output = LogOutput(self._place(self.number), self._profile)
         output.metadata(FILE, {"set": self._identity, "file": str(self.number)})
         return output
 

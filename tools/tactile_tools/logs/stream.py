@@ -354,6 +354,18 @@ def first_ns(logs: Sequence[Series]) -> int:
     return min(found, default=0)
 
 
+def common_profile(logs: Sequence[Series]) -> str:
+    """The profile of all files of the logs; empty where they differ."""
+    found = set()
+    for series in logs:
+        for path in series.paths:
+            with LogReader(path) as reader:
+                for _ in reader.events():
+                    break  # the header comes before everything else
+                found.add(reader.profile)
+    return found.pop() if len(found) == 1 else ""
+
+
 def matcher(patterns: Sequence[str] | None) -> Wanted | None:
     """Tells topics that match any of the patterns, the leading slash left out or not; None: all."""
     if not patterns:
