@@ -361,6 +361,11 @@ class _Taker:
         self._changes = 0  # from one channel to another, and those at which the number rose
         self._rises = 0
 
+    @property
+    def watched(self) -> bool:
+        """Whether somebody looks at the first message of each channel."""
+        return self._watch is not None
+
     def take(self, reader: LogReader, later: bool) -> None:
         """Read a file; ``later``: it is not the first one given."""
         result = self.result
@@ -420,7 +425,8 @@ class _Taker:
         result, numbers, without = self.result, self._numbers, self._without
         from_start = result.metadata.get(FILE, {}).get("file") == "0"
         last_channel, last = self._number
-        for message in reader.messages(block, without):
+        unneeded = without if block.packed is None else _Unneeded(self, reader, without)
+        for message in reader.messages(block, unneeded):
             number = message.channel
             taking = numbers.get(number)
             if taking is None:
@@ -483,6 +489,25 @@ class _Taker:
                 AttachmentInfo(record.name[:MAX_NAME], record.media_type[:MAX_NAME], record.size)
             )
             result.attachments[record.name[:MAX_NAME]] = (record.media_type, record.size)
+
+
+class _Unneeded:
+    """Channels of which no data are needed, decided before the first of their messages: in a large
+    chunk that may take all the memory there is."""
+
+    def __init__(self, taker: _Taker, reader: LogReader, known: set[int]) -> None:
+        self._taker = taker
+        self._reader = reader
+        self._known = known
+
+    def __contains__(self, number: object) -> bool:
+        if number in self._known:
+            return True
+        record = self._reader.channels.get(number) if isinstance(number, int) else None
+        if record is None or self._taker.watched or is_latched(record.topic, record.metadata):
+            return False
+        schema = self._reader.schemas.get(record.schema)
+        return schema is None or schema.name not in (DIAGNOSTICS_TYPE, EVENT_TYPE)
 
 
 @dataclass(slots=True)

@@ -240,6 +240,28 @@ def test_small_files_that_unpack_to_much_take_little_memory(tmp_path: Path) -> N
         assert found[0].lost_unknown == damages
 
 
+def test_a_message_that_unpacks_to_much_is_counted_without_being_held(tmp_path: Path) -> None:
+    made = HandMade()
+    size = 150 << 20
+    head = record(5, struct.pack("<HIQQ", 1, 0, BASE_NS, BASE_NS))[:1] + struct.pack(
+        "<Q", 22 + size
+    )
+    inner = head + struct.pack("<HIQQ", 1, 0, BASE_NS, BASE_NS)
+    packer = zstandard.ZstdCompressor().compressobj()
+    packed = packer.compress(inner)
+    for _ in range(150):
+        packed += packer.compress(bytes(1 << 20))
+    packed += packer.flush()
+    made.data += made.schema + made.channel
+    made.data += made.chunk(b"", "zstd", len(inner) + size, 0, packed)
+    path = write(tmp_path, made.end())
+    assert path.stat().st_size < 50_000
+    found: list[Any] = []
+    assert peak_of(lambda: found.append(info(path))) < 16 << 20
+    assert found[0].messages == 1
+    assert found[0].whole
+
+
 def test_large_chunks_are_read_and_checked_piece_by_piece(tmp_path: Path) -> None:
     made = HandMade()
     inner = made.schema + made.channel + b"".join(message(k, bytes(100_000)) for k in range(240))

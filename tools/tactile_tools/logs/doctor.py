@@ -192,8 +192,13 @@ def _content_findings(found: LogInfo, watch: _Watch) -> list[Finding]:
             remedy = "tactile log merge FILE --out OUT writes the messages in the order of time"
             out.append(Finding("time_backwards", True, text, remedy))
         if channel.impossible:
+            many = (
+                "one message is"
+                if channel.impossible == 1
+                else f"{channel.impossible} messages are"
+            )
             text = (
-                f"{channel.topic}: {channel.impossible} messages are stamped later than any clock "
+                f"{channel.topic}: {many} stamped later than any clock "
                 f"goes, the first {channel.impossible_ns} ns: beyond 2^63, in the year "
                 f"{1970 + channel.impossible_ns // (NS_PER_S * 31_556_952)}"
             )

@@ -217,7 +217,7 @@ def _show_quick(found: QuickInfo, series: Series) -> None:
         )
     for row in found.channels:
         topic, msgtype = shown(row["topic"], TEXT_SHOWN), shown(row["msgtype"], TEXT_SHOWN)
-        console.print(f"{topic}  {msgtype}  {row['messages']} messages")
+        console.print(f"{topic}  {msgtype}  messages: {row['messages']}")
     for name in found.tables:
         console.print(f"table: {shown(name, TEXT_SHOWN)}")
     _show_attachments(console, found.files_within, len(found.files_within))
