@@ -12,6 +12,13 @@ from tactile_bus.topics import find_topic
 QOS = "offered_qos_profiles"
 """Key of a channel's metadata under which rosbag2 keeps the QoS of its publishers, in YAML."""
 
+LATCHED_QOS = (
+    "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n"
+    "  deadline: {sec: 0, nsec: 0}\n  lifespan: {sec: 0, nsec: 0}\n  liveliness: 0\n"
+    "  liveliness_lease_duration: {sec: 0, nsec: 0}\n  avoid_ros_namespace_conventions: false\n"
+)
+"""That of a latched topic as rosbag2 writes it: keep the last one, reliable, transient local."""
+
 TRANSIENT_LOCAL = re.compile(r"\bdurability['\"]?:\s*['\"]?(?:1\b|transient_local)")
 
 STAYING = ("tf_static", "robot_description")

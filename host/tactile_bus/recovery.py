@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -60,19 +61,25 @@ class RecoveryReport:
 
 
 def recover(
-    source: Path, target: Path, progress: Progress | None = None, *, keep_suspect: bool = False
+    source: Path,
+    target: Path,
+    progress: Progress | None = None,
+    *,
+    keep_suspect: bool = False,
+    mend: Callable[[ChannelRecord], Mapping[str, str]] | None = None,
 ) -> RecoveryReport:
     """Write everything readable of ``source`` to the new file ``target``. Constant memory.
 
     ``keep_suspect``: of blocks and attachments whose checksum is wrong too what looks readable; a
-    table ``suspect`` in the target tells which messages these are.
+    table ``suspect`` in the target tells which messages these are. ``mend``: the metadata that a
+    channel is to have in the target; None leaves them.
     `LogError` when the source is no log or holds nothing, `RecoveryError` when the target exists
     or cannot be written; then no target is left behind. The source is only read.
     """
     report = RecoveryReport(source, target, 0)
     with LogReader(source, progress, keep_suspect=keep_suspect) as reader:
         report.size = reader.size
-        out = _Copy(reader, target, report)
+        out = _Copy(reader, target, report, mend)
         try:
             for event in reader.events():
                 out.take(event)
@@ -99,7 +106,14 @@ def recover(
 class _Copy:
     """The target of a recovery; made with the first thing that is worth keeping."""
 
-    def __init__(self, reader: LogReader, target: Path, report: RecoveryReport) -> None:
+    def __init__(
+        self,
+        reader: LogReader,
+        target: Path,
+        report: RecoveryReport,
+        mend: Callable[[ChannelRecord], Mapping[str, str]] | None,
+    ) -> None:
+        self._mend = mend
         self._reader = reader
         self._target = target
         self._report = report
@@ -214,5 +228,6 @@ class _Copy:
             file.add_schema(schema.number, schema.name, schema.encoding, schema.data)
             self._schemas.add(schema.number)
         number = 0 if schema is None else schema.number
-        file.add_channel(channel.number, number, channel.topic, channel.encoding, channel.metadata)
+        metadata = channel.metadata if self._mend is None else self._mend(channel)
+        file.add_channel(channel.number, number, channel.topic, channel.encoding, metadata)
         self._channels.add(channel.number)

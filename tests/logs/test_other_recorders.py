@@ -431,6 +431,7 @@ def test_a_bag_of_a_log_without_indexes_is_written_anew(
 def test_the_recorded_qos_is_carried_over_and_latched_topics_stay_latched(
     log_tool: Any, tmp_path: Path
 ) -> None:
+    from rosbags.rosbag2 import Reader
     from rosbags.rosbag2.metadata import dump_qos_v8, parse_qos
     from ruamel.yaml import YAML
 
@@ -445,11 +446,17 @@ def test_the_recorded_qos_is_carried_over_and_latched_topics_stay_latched(
         ("", "/tf_static", 1, 1),
     ):  # fmt: skip
         path = write(tmp_path / "x.mcap", steady(3), (topic,), qos=qos)
-        assert log_tool("rosbag", path, "--force").code == 0
-        bag = YAML(typ="safe").load((tmp_path / "metadata.yaml").read_text())
+        folder = tmp_path / f"bag{len(list(tmp_path.iterdir()))}"
+        assert log_tool("rosbag", path, "--out", folder).code == 0
+        bag = YAML(typ="safe").load((folder / "metadata.yaml").read_text())
+        with Reader(folder) as reader:  # which compares file and YAML
+            assert sum(1 for _ in reader.messages()) == 3
         (told,) = bag["rosbag2_bagfile_information"]["topics_with_message_count"]
         offered = told["topic_metadata"]["offered_qos_profiles"]
         (profile,) = YAML(typ="safe").load(offered)
         assert (profile["depth"], profile["durability"]) == (depth, durability)
         if qos == numbers:
             assert offered == numbers
+        if not qos:
+            beside = log_tool("rosbag", path)
+            assert "not latched when played" in beside.out

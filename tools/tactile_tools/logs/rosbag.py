@@ -17,9 +17,9 @@ from rosbags.rosbag2.metadata import dump_qos_v8, parse_qos
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from tactile_bus.latched import QOS, is_latched
+from tactile_bus.latched import LATCHED_QOS, QOS, is_latched
 from tactile_bus.log_info import LogInfo, info
-from tactile_bus.log_records import LogError
+from tactile_bus.log_records import ChannelRecord, LogError
 from tactile_bus.recovery import RecoveryError, recover
 from tactile_tools.logs.arguments import add_files
 from tactile_tools.logs.sources import Series, find_series
@@ -86,6 +86,11 @@ def run(options: argparse.Namespace) -> int:
     plain_console().print(
         f"{folder}: {len(paths)} files, {bag.messages} messages; ros2 bag play {folder}"
     )
+    if bag.unsaid:
+        plain_console().print(
+            f"not latched when played, for the file does not say so: {', '.join(bag.unsaid)}; "
+            "--out FOLDER writes files that do"
+        )
     return 0
 
 
@@ -99,10 +104,12 @@ def _bring(series: Series, folder: Path) -> list[Path]:
             with progress("reading") as report:
                 found = info(path, report)
             _check_stamps(path, found)
-            if found.whole and found.indexed:
+            streams = _streams(path)
+            same = all(dict(s.metadata).get(QOS, "") == _qos(s.topic, s.metadata) for s in streams)
+            if found.whole and found.indexed and same:
                 _link(path, target)
             else:
-                recover(path, target)
+                recover(path, target, mend=_with_qos)
             paths.append(target)
     except RecoveryError as error:
         raise ToolError(str(error), REFUSED) from error
@@ -136,6 +143,7 @@ class _Bag:
     topics: dict[tuple[str, str], int] = field(default_factory=dict)
     encodings: dict[tuple[str, str], str] = field(default_factory=dict)
     qos: dict[tuple[str, str], str] = field(default_factory=dict)
+    unsaid: dict[str, None] = field(default_factory=dict)  # latched topics whose file says nothing
 
     @property
     def messages(self) -> int:
@@ -152,7 +160,12 @@ class _Bag:
         for stream in streams:
             key = stream.topic, stream.msgtype
             self.encodings[key] = stream.encoding
-            self.qos[key] = self.qos.get(key) or _qos(stream)
+            qos = _qos(stream.topic, stream.metadata)
+            if qos and not dict(stream.metadata).get(QOS):
+                # Readers that compare the two would pass over a topic that differs here alone.
+                self.unsaid[stream.topic] = None
+                qos = ""
+            self.qos[key] = self.qos.get(key) or qos
 
     def yaml(self) -> str:
         """Text of ``metadata.yaml``; texts are quoted as JSON, which YAML takes."""
@@ -205,13 +218,18 @@ DEFAULT: Any = {
 }
 """What holds where a profile does not say it: ROS 2's default."""
 
-LATCHED: Any = DEFAULT | {"depth": 1, "durability": "transient_local"}
-"""Of a topic whose last message holds, where its channel says nothing."""
+
+def _with_qos(channel: ChannelRecord) -> dict[str, str]:
+    """Metadata of a channel with the QoS that stands beside the files: readers compare the two."""
+    qos = _qos(channel.topic, channel.metadata.items())
+    if not qos and QOS not in channel.metadata:
+        return channel.metadata
+    return channel.metadata | {QOS: qos}
 
 
-def _qos(stream: Stream) -> str:
+def _qos(topic: str, pairs: Iterable[tuple[str, str]]) -> str:
     """QoS of a topic's publishers, as version 5 has it: YAML within a text, numbers for names."""
-    metadata = dict(stream.metadata)
+    metadata = dict(pairs)
     text = metadata.get(QOS, "")
     try:
         recorded = YAML(typ="safe").load(text) or []
@@ -221,9 +239,17 @@ def _qos(stream: Stream) -> str:
             return text  # just so
     except (ReaderError, YAMLError, LookupError, TypeError, ValueError, AttributeError):
         profiles = []  # what nobody can read ros2 bag cannot either, and would not play
-    if not profiles and is_latched(stream.topic, metadata):
-        profiles = parse_qos([LATCHED])
+    if not profiles and is_latched(topic, metadata):
+        return LATCHED_QOS
     return dump_qos_v8(profiles) if profiles else ""
+
+
+def _streams(path: Path) -> list[Stream]:
+    """All streams of a file, which need not all be in its summary."""
+    reading = Reading()
+    for _ in read_series(Series((path,)), reading, None, lambda _: False):
+        pass
+    return list(reading.seen)
 
 
 def _survey(paths: list[Path], *, beside: bool) -> _Bag:
@@ -237,8 +263,5 @@ def _survey(paths: list[Path], *, beside: bool) -> _Bag:
         if found.messages and not found.indexed:
             raise ToolError(f"{path} lacks indexes, which ros2 bag needs: {how}")
         _check_stamps(path, found)
-        reading = Reading()
-        for _ in read_series(Series((path,)), reading, None, lambda _: False):
-            pass  # for the channels, which need not all be in the summary
-        bag.add(path, found, reading.seen)
+        bag.add(path, found, _streams(path))
     return bag
