@@ -27,7 +27,7 @@ BATCH = 1024
 BATCH_BYTES = 2 << 20
 """Encoded bytes after which a batch is written in any case: as objects they take ten times that."""
 
-HELD_BYTES = 16 << 20
+HELD_BYTES = 48 << 20
 """Encoded bytes of the messages that wait in all tables together."""
 
 MESSAGE_BYTES = 500
