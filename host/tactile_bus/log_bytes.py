@@ -20,6 +20,9 @@ WINDOW = 1 << 20
 
 CHUNK_START = re.compile(rb"(?=\x06.{4}\x00{4})", re.DOTALL)
 CHUNK_FIXED = 40  # bytes of a chunk record but for its compression's name and its data
+MAX_NAME = 40  # bytes read of that name and the size behind it
+
+FRAME_STARTS = {"zstd": b"\x28\xb5\x2f\xfd", "lz4": b"\x04\x22\x4d\x18"}
 
 
 class LogBytes:
@@ -57,23 +60,40 @@ class LogBytes:
         except OSError as error:
             raise LogError(f"{self.path}: {error.strerror} at byte {position}") from error
 
-    def chunk_head(self, position: int) -> ChunkHead | None:
-        """Header of a chunk at ``position``, or None when its sizes do not agree."""
-        raw = self.read_at(position, 9 + CHUNK_FIXED + 4)
-        if len(raw) < 9 + CHUNK_FIXED or raw[0] != op.CHUNK:
+    def chunk_head(self, position: int) -> tuple[ChunkHead, int] | None:
+        """Header of a chunk at ``position`` and where its data begins; None when it is none.
+
+        The record type is not looked at.
+        """
+        raw = self.read_at(position, 9 + CHUNK_FIXED + MAX_NAME)
+        if len(raw) < 9 + CHUNK_FIXED:
             return None
+        return _chunk_head(raw, position)
+
+    def looks_like_chunk(self, position: int) -> bool:
+        """Whether a chunk begins here for all that can be told: for searching amid other bytes.
+
+        Its sizes agree to the byte, or (fields may have been appended) its data begin as such do.
+        The record type is not looked at.
+        """
+        raw = self.read_at(position, 9 + CHUNK_FIXED + MAX_NAME)
+        if len(raw) < 9 + CHUNK_FIXED:
+            return False
+        found = _chunk_head(raw, position)
+        if found is None or found[0].compression not in ("", "lz4", "zstd"):
+            return False
+        head, place = found
         (length,) = U64.unpack_from(raw, 1)
-        start, end, size, crc = op.CHUNK_HEAD.unpack_from(raw, 9)
-        (name_length,) = U32.unpack_from(raw, 37)
-        name = raw[41 : 41 + name_length]
-        if name_length > 4 or name not in (b"", b"lz4", b"zstd"):
-            return None
-        if len(raw) < 41 + name_length + 8:
-            return None
-        (data_length,) = U64.unpack_from(raw, 41 + name_length)
-        if data_length + CHUNK_FIXED + name_length != length:
-            return None
-        return ChunkHead(start, end, size, crc, name.decode(), data_length)
+        if head.data_length + CHUNK_FIXED + len(head.compression) == length:
+            return True
+        if head.compression:
+            return self.read_at(place, 4) == FRAME_STARTS[head.compression]
+        start = self.read_at(place, 9)
+        if len(start) < 9:
+            return False
+        opcode, size = op.RECORD.unpack(start)
+        known = opcode in (op.SCHEMA, op.CHANNEL, op.MESSAGE)
+        return bool(known and 9 + size <= head.data_length == head.size)
 
     def find_chunk(self, position: int) -> int | None:
         """Offset of the first whole, plausible chunk at or after ``position``."""
@@ -81,24 +101,45 @@ class LogBytes:
             window = self.read_at(position, WINDOW + 16)
             for match in CHUNK_START.finditer(window):
                 at = position + match.start()
-                head = self.chunk_head(at)
-                if head is not None:
-                    end = at + 9 + CHUNK_FIXED + len(head.compression) + head.data_length
-                    if end <= self.end:
-                        return at
+                (length,) = U64.unpack_from(window, match.start() + 1)
+                if at + 9 + length <= self.end and self.looks_like_chunk(at):
+                    return at
             if self._progress is not None:
                 self._progress(position, self.size)
             position += WINDOW
         return None
 
-    def plausible(self, position: int) -> bool:
-        """Whether a record seems to begin here; a chance hit is one in 10^10."""
+    def plausible(self, position: int, steps: int = 4) -> bool:
+        """Whether a record seems to begin here; a chance hit is one in 10^10.
+
+        A record of a type that is not known must be followed by one that is.
+        """
         if position >= self.end:
             return False
         head = self.read_at(position, 9)
         if len(head) < 9:
             return False
         opcode, length = op.RECORD.unpack(head)
+        after = position + 9 + int(length)
         if opcode == op.CHUNK:
-            return self.chunk_head(position) is not None
-        return 0 < opcode <= op.DATA_END and position + 9 + int(length) <= self.size
+            return self.looks_like_chunk(position)
+        if opcode > op.DATA_END:
+            return after <= self.end and steps > 0 and self.plausible(after, steps - 1)
+        return opcode > 0 and after <= self.size
+
+
+def _chunk_head(raw: bytes, position: int) -> tuple[ChunkHead, int] | None:
+    (length,) = U64.unpack_from(raw, 1)
+    start, end, size, crc = op.CHUNK_HEAD.unpack_from(raw, 9)
+    (name_length,) = U32.unpack_from(raw, 37)
+    if name_length > MAX_NAME - 8 or len(raw) < 41 + name_length + 8:
+        return None
+    (data_length,) = U64.unpack_from(raw, 41 + name_length)
+    if data_length + CHUNK_FIXED + name_length > length:
+        return None
+    try:
+        name = raw[41 : 41 + name_length].decode()
+    except UnicodeDecodeError:
+        return None
+    place = position + 9 + CHUNK_FIXED + name_length
+    return ChunkHead(start, end, size, crc, name, data_length), place

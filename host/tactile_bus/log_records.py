@@ -1,14 +1,14 @@
-"""What a log consists of, and how its records are taken apart. Pure: bytes in, values out."""
+"""What a log consists of, and how its records are taken apart. Pure: bytes in, values out.
+
+A record may be longer than its fields: later versions of the format append fields, which a reader
+ignores.
+"""
 
 from __future__ import annotations
 
-import importlib
 import struct
-import zlib
 from dataclasses import dataclass
 from typing import NamedTuple
-
-import zstandard
 
 U16 = struct.Struct("<H")
 U32 = struct.Struct("<I")
@@ -63,12 +63,40 @@ class AttachmentRecord:
 
 
 @dataclass(frozen=True, slots=True)
+class ChunkHead:
+    """Fields of a chunk record before its data. ``size``, ``crc``: of the data unpacked."""
+
+    start_ns: int
+    end_ns: int
+    size: int
+    crc: int
+    compression: str
+    data_length: int
+
+
+@dataclass(frozen=True, slots=True)
+class Packed:
+    """Where the compressed bytes of a chunk stand, for one that is unpacked piece by piece."""
+
+    head: ChunkHead
+    place: int
+    length: int
+
+
+@dataclass(frozen=True, slots=True)
 class Block:
-    """Messages, schemas and channels, as a run of records. ``verified``: its checksum was right."""
+    """Messages, schemas and channels, as a run of records: ``data``, or ``packed`` for a large one.
+
+    ``verified``: its checksum was right. ``partial``: its end is not there, which was reported.
+    ``suspect``: its checksum is wrong, and it is read all the same.
+    """
 
     offset: int
     data: bytes
     verified: bool
+    packed: Packed | None = None
+    partial: bool = False
+    suspect: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,20 +170,13 @@ class Cursor:
             raise BadRecordError("a table is longer than it says")
         return found
 
-    def end(self) -> None:
-        """Check that nothing is left."""
-        if self.at != len(self.data):
-            raise BadRecordError("a record is longer than its fields")
-
 
 def parse_schema(body: bytes) -> SchemaRecord:
     """Schema record; BadRecordError when it is none."""
     cursor = Cursor(body)
     (number,) = cursor.take(U16)
     name, encoding = cursor.string(), cursor.string()
-    record = SchemaRecord(number, name, encoding, cursor.bytes(*cursor.take(U32)))
-    cursor.end()
-    return record
+    return SchemaRecord(number, name, encoding, cursor.bytes(*cursor.take(U32)))
 
 
 def parse_channel(body: bytes) -> ChannelRecord:
@@ -163,56 +184,10 @@ def parse_channel(body: bytes) -> ChannelRecord:
     cursor = Cursor(body)
     number, schema = cursor.take(CHANNEL_HEAD)
     topic, encoding = cursor.string(), cursor.string()
-    record = ChannelRecord(number, schema, topic, encoding, cursor.map())
-    cursor.end()
-    return record
+    return ChannelRecord(number, schema, topic, encoding, cursor.map())
 
 
 def parse_metadata(body: bytes) -> MetadataRecord:
     """Metadata record; BadRecordError when it is none."""
     cursor = Cursor(body)
-    record = MetadataRecord(cursor.string(), cursor.map())
-    cursor.end()
-    return record
-
-
-@dataclass(frozen=True, slots=True)
-class ChunkHead:
-    """Fields of a chunk record before its data. ``size``, ``crc``: of the data unpacked."""
-
-    start_ns: int
-    end_ns: int
-    size: int
-    crc: int
-    compression: str
-    data_length: int
-
-
-def unpack(data: bytes, head: ChunkHead) -> bytes:
-    """Records of a whole chunk, checked."""
-    try:
-        if head.compression == "zstd":
-            if zstandard.frame_content_size(data) not in (-1, head.size):
-                raise BadRecordError("a chunk whose sizes do not agree")
-            data = zstandard.ZstdDecompressor().decompress(data, max_output_size=head.size)
-        elif head.compression == "lz4":
-            data = importlib.import_module("lz4.frame").decompress(data)
-    except (zstandard.ZstdError, RuntimeError, MemoryError):
-        raise BadRecordError("a chunk that does not decompress") from None
-    except ImportError:
-        raise BadRecordError("a chunk in lz4: install the lz4 package") from None
-    if len(data) != head.size or (head.crc and zlib.crc32(data) != head.crc):
-        raise BadRecordError("the checksum of a chunk is wrong")
-    return data
-
-
-def unpack_start(data: bytes, head: ChunkHead) -> bytes:
-    """What can be decompressed of a chunk that is cut off; whole zstd blocks are exact."""
-    if head.compression == "":
-        return data
-    if head.compression != "zstd":
-        return b""
-    try:
-        return zstandard.ZstdDecompressor().decompressobj().decompress(data)
-    except zstandard.ZstdError:
-        return b""
+    return MetadataRecord(cursor.string(), cursor.map())

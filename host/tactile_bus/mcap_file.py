@@ -13,7 +13,7 @@ import os
 import struct
 import zlib
 from array import array
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -253,6 +253,41 @@ class McapFile:
             self._attachment_index.append(_record(ATTACHMENT_INDEX, index))
 
         self._stage(record, note)
+
+    def copy_attachment(
+        self,
+        name: str,
+        media_type: str,
+        size: int,
+        pieces: Iterable[bytes],
+        log_ns: int,
+        create_ns: int,
+    ) -> None:
+        """Write a file within the file at once, a piece at a time, after what is staged.
+
+        OSError: then nothing of it is in the file; so it is where ``pieces`` fail.
+        """
+        self.commit()
+        start = self.size
+        body = struct.pack("<QQ", log_ns, create_ns) + _string(name) + _string(media_type)
+        body += struct.pack("<Q", size)
+        length = len(body) + size + 4
+        try:
+            self._put(RECORD.pack(ATTACHMENT, length) + body)
+            crc, left = zlib.crc32(body), size
+            for piece in pieces:
+                self._put(piece)
+                crc, left = zlib.crc32(piece, crc), left - len(piece)
+            if left:
+                raise OSError(errno.EIO, f"{left} bytes of attachment {name!r} are missing")
+            self._put(struct.pack("<I", crc))
+        except BaseException:
+            self._storage.truncate(self._fd, start)
+            self.size = start
+            raise
+        index = struct.pack("<QQQQQ", start, 9 + length, log_ns, create_ns, size)
+        index += _string(name) + _string(media_type)
+        self._attachment_index.append(_record(ATTACHMENT_INDEX, index))
 
     def add_chunk(self, chunk: SealedChunk) -> None:
         """Stage a chunk and its indexes; its channels must come before it."""

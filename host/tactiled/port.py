@@ -174,6 +174,7 @@ class Port:
             self.trouble = station
             log.error("%s: %s", self.name, station)
         else:
+            station.node = node
             self.stations[node] = station
 
     def drops(self) -> dict[str, int]:

@@ -35,8 +35,10 @@ from tactiled.links.events import (
 from tactiled.outgoing import MessageMaker
 from tactiled.outlet import Sink
 from tactiled.repeats import Repeats, Silences
+from tactiled.replay.state import STATE_PREFIX, describe_state
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 from tactiled.sensing.reasons import REPLUGGED
+from tactiled.sensing.rest_state import RecordedRest
 from tactiled.shelf import Choice, Shelf
 from tactiled.skin_picture import SkinPicture
 
@@ -46,6 +48,8 @@ LATENCIES = 512
 RATE_CYCLES, RATE_OVER = 20, 20
 """Cycles that a rate is taken from, and s it may take until there are as many: one second counts
 too few of a slow board."""
+STATE_EVERY = 10
+"""s between notes of a rest field that follows the drift."""
 
 FIRMWARE_LEVELS = (10, 20, 30, 40)
 
@@ -63,6 +67,10 @@ class Station:
 
     def __init__(self, name: str, outlet: Sink, shelf: Shelf, settings: PipelineSettings) -> None:
         self.name = name
+        self.node = 0
+        """Of the board on its bus; 0 on a serial line."""
+        self.rest_seed: RecordedRest | None = None
+        """Rest field to begin with, of a recording whose beginning is not there."""
         self.identity: Identity | None = None
         self.choice: Choice | None = None
         self.pipeline: BoardPipeline | None = None
@@ -86,6 +94,7 @@ class Station:
         self._maker: MessageMaker | None = None
         self._picture: SkinPicture | None = None
         self._warned = ""
+        self._state_age = 0  # s since the log was last told of the rest field
         self._latencies: deque[float] = deque(maxlen=LATENCIES)
         self._rate_from: deque[tuple[Instant, int]] = deque([(outlet.now(), 0)], RATE_OVER)
         self._repeats = Repeats()
@@ -143,6 +152,12 @@ class Station:
         self.pipeline = BoardPipeline(calibration, self._settings)
         if before is not None:
             self.counters.update({k: v for k, v in asdict(before).items() if k not in ("cycles",)})
+        if self.rest_seed is not None:
+            seed, self.rest_seed = self.rest_seed, None
+            try:
+                self.pipeline.restore_rest(seed)
+            except ValueError as error:
+                self._say(logging.WARNING, f"{error}: tared anew")
         self._maker = MessageMaker(calibration, self._outlet.wall)
         self._picture = SkinPicture(calibration.geometry)
         self.chips = ChipWatch(calibration.geometry)
@@ -155,7 +170,16 @@ class Station:
                 f"board:{self.name}",
                 {"model": identity.model, "firmware": identity.firmware} | summary,
             )
+            self._note_state()
         self.send_geometry()
+
+    def _note_state(self) -> None:
+        """Have every later file of the log say what is needed to run it by itself."""
+        if self.recorder is not None and self.identity is not None:
+            state = None if self.pipeline is None else self.pipeline.rest_to_record()
+            table = describe_state(self.node, self.identity, state)
+            self.recorder.metadata(f"{STATE_PREFIX}{self.name}", table)
+            self._state_age = 0
 
     def _warn(self) -> None:
         """Say once what is to be said of the calibration."""
@@ -299,6 +323,9 @@ class Station:
             self._latencies.clear()
         else:
             self.latency = Latency()
+        self._state_age += 1
+        if self._settings.rest_tracking_s is not None and self._state_age >= STATE_EVERY:
+            self._note_state()  # it moves all the time
 
     def _measure_rate(self, now: Instant) -> None:
         """Cycles a second over the shortest span that holds enough of them."""
@@ -357,6 +384,8 @@ class Station:
             for future in self._tares:
                 future.set_result(result)
             self._tares.clear()
+            if report.accepted:
+                self._note_state()
 
     def _send(self, cycle: Cycle) -> None:
         maker, outlet, name = self._maker, self._outlet, self.name

@@ -181,7 +181,7 @@ def test_a_log_that_was_cut_off_gives_what_its_bytes_give(
 ) -> None:
     data = pressed.read_bytes()
     cut = tmp_path / "cut.mcap"
-    cut.write_bytes(data[: len(data) * 2 // 3])
+    cut.write_bytes(data[: len(data) * 4 // 5])
     outcome = log_tool("reprocess", cut)
     assert outcome.code == 0, outcome.err
     new, old, same = counts(outcome.out)["/tactile/finger/features"]
@@ -207,6 +207,74 @@ def test_a_log_whose_beginning_is_missing_is_only_listened_to(
     assert outcome.code == 0, outcome.err
     assert "estimated anew" in outcome.out
     assert 20 < counts(outcome.out)["/tactile/finger/features"][0] < 60
+
+
+def without_state(part: Path, out: Path) -> None:
+    """The part as versions before wrote it, which says less of its boards."""
+    from tactile_bus.log_records import MetadataRecord
+    from tactile_tools.logs.sources import find_series
+    from tactile_tools.logs.stream import Reading, Record, read_series
+    from tactile_tools.logs.writing import LogOutput
+
+    with LogOutput(out) as output:
+        for item in read_series(find_series([part])[0], Reading()):
+            if isinstance(item, Record):
+                output.write(item)
+            elif not isinstance(item, MetadataRecord):
+                output.attach(item)
+            elif not item.name.startswith("state:"):
+                output.metadata(item.name, item.values)
+
+
+@pytest.mark.parametrize("medium", ["serial", "can"])
+def test_a_later_file_alone_runs_from_what_it_says_itself_or_not_at_all(
+    log_tool: Any, virtual: Any, tmp_path: Path, medium: str
+) -> None:
+    path = tmp_path / "run.mcap"
+    contacts = {"contacts": virtual.press}
+    if medium == "can":
+        boards = [virtual.make_can_board(7, 3, rate=50.0, **contacts)]
+    else:
+        boards = [virtual.make_board(rate=50.0, **contacts)]
+    daemon = virtual.VirtualDaemon(
+        path, boards, [virtual.calibration()], PipelineSettings(auto_tare=True)
+    )
+    daemon.run(2.6)
+    daemon.close()
+    assert log_tool("split", path, "--at", "1.7").code == 0  # pressed: too late to tare
+    part, out = tmp_path / "run_split" / "run_0001.mcap", tmp_path / "out.mcap"
+    outcome = log_tool("reprocess", part, "--out", out)
+    assert outcome.code == 0, outcome.err
+    before, after = features(part), features(out)
+    assert len(after) > 10
+    valid = [f for f in after if f.valid]
+    assert len(valid) > 5
+    assert valid[-1].peak_force == pytest.approx(before[-1].peak_force, rel=0.05)
+    assert before[-1].peak_force > 0.5
+    out.unlink()
+    old = tmp_path / "old.mcap"
+    without_state(part, old)
+    refused = log_tool("reprocess", old, "--out", out)
+    assert refused.code == 1
+    assert "does not say which board sent them" in refused.err.replace("\n", " ")
+    assert {p.name for p in tmp_path.iterdir()} == {"run.mcap", "run_split", "old.mcap"}
+
+
+def test_every_file_of_a_recorder_says_what_it_needs_to_be_run_alone(
+    log_tool: Any, virtual: Any, tmp_path: Path
+) -> None:
+    small = RecorderSettings(min_free_bytes=0, split_bytes=700_000, flush_period=0.02)
+    daemon = virtual.VirtualDaemon(
+        tmp_path / "run.mcap", [virtual.make_board()], [virtual.calibration()], recorder=small
+    )
+    daemon.run(2.0)
+    daemon.close()
+    files = sorted(tmp_path.glob("run_*.mcap"))
+    assert files
+    tables = info(files[-1]).metadata
+    assert tables.keys() >= {"pipeline", "port:finger", "board:finger", "state:finger"}
+    assert tables["state:finger"]["descriptor"]
+    assert tables["state:finger"]["rest"]
 
 
 def test_what_cannot_be_reprocessed_is_refused(

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from sensor_proto.can_errors import BusState
-from sensor_proto.canseg import CanFrame
+from sensor_proto.canseg import CanEncoder, CanFrame
+from sensor_proto.framing import encode_serial
 from sensor_proto.packets import SetRate
 from tactile_bus.calibration import BoardCalibration
 from tactile_bus.instant import Instant
@@ -27,6 +28,7 @@ from tactiled.outlet import Sink
 from tactiled.port import Port, Trouble
 from tactiled.replay import journal as kinds
 from tactiled.replay.recorded import RecordedPort
+from tactiled.replay.state import RecordedState
 from tactiled.sensing.pipeline_settings import PipelineSettings
 from tactiled.shelf import Shelf
 from tactiled.station import Station
@@ -72,6 +74,7 @@ class RecordedSource:
 
 class Rerun:
     """One port of a log. ``journal``: the log has its events; ``versions``: calibrations by hash.
+    ``states``: of boards by name, as they stood where the log begins if that is amid a run.
 
     Hand over chunks and events, each in the order of the log, then `end`. ``exact``: whether all
     so far is as it was; ``chunks``: worked off.
@@ -86,6 +89,7 @@ class Rerun:
         *,
         journal: bool,
         versions: Mapping[str, BoardCalibration],
+        states: Mapping[str, RecordedState] | None = None,
     ) -> None:
         self.chunks = 0
         self._follow: bool | None = None if journal else False  # the journal's instants; not known
@@ -95,6 +99,7 @@ class Rerun:
         self._settings = settings
         self._sink = sink
         self._versions = versions
+        self._states = dict(states or {})
         self._port: Port | None = None
         self._held: deque[Chunk] = deque()
         self._events: deque[Any] = deque()
@@ -213,11 +218,25 @@ class Rerun:
             # Nothing tells how the port was opened: it was, before its first bytes came.
             self._follow = False
             port = self._open(chunk)
-            port.work(PortOpened(), chunk.received)
+            self._introduce(port, chunk)
         self.chunks += 1
         port.work(chunk, chunk.received)
         if not self._follow:
             port.tick(chunk.received)
+
+    def _introduce(self, port: Port, first: Chunk) -> None:
+        """Open the port with what the log says of its boards: they do not say it again."""
+        floats = [s.serial_number for s in self._states.values() if s.descriptor is None]
+        port.work(PortOpened(floats[0] if len(floats) == 1 else ""), first.received)
+        for state in self._states.values():
+            if state.descriptor is None:
+                continue
+            payload: bytes | tuple[CanFrame, ...]
+            if isinstance(first.payload, bytes):
+                payload = encode_serial(state.descriptor)
+            else:
+                payload = CanEncoder(state.node, self._recorded.fd).encode(state.descriptor)
+            port.work(Chunk(first.received, payload), first.received)
 
     def _open(self, first: Chunk | None = None) -> Port:
         recorded, listen_only = self._recorded, not self._follow
@@ -235,7 +254,10 @@ class Rerun:
 
         def open_station(_: Port, node: int, name: str) -> Station | Trouble:
             del node
-            return Station(name, self._sink, self._shelf, self._settings)
+            station = Station(name, self._sink, self._shelf, self._settings)
+            if first is not None and name in self._states:
+                station.rest_seed = self._states[name].rest
+            return station
 
         line = make_line(
             source.name, admit, medium, kind=recorded.kind, rate=recorded.rate, baud=recorded.baud,

@@ -101,6 +101,11 @@ class ForceModel:
             self._drift = MAGNET_DRIFT_PER_K * self.rest
             self._drifts = bool(self._drift.any())
 
+    @property
+    def rested_c(self) -> Float:
+        """(A, n) °C at which the rest field in force was taken."""
+        return self._rested_at
+
     def warmer(self, temperature_c: Float) -> Float:
         """(A, n) K since the rest field was taken."""
         return np.asarray(temperature_c - self._rested_at)

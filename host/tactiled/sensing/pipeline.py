@@ -27,6 +27,7 @@ from tactiled.sensing.net_stage import NetStage
 from tactiled.sensing.pipeline_settings import PipelineSettings
 from tactiled.sensing.readings import Fault
 from tactiled.sensing.rest import RestField, RestState
+from tactiled.sensing.rest_state import RecordedRest
 from tactiled.sensing.rest_watch import RestWatch
 from tactiled.sensing.tare import TareReport
 
@@ -149,6 +150,37 @@ class BoardPipeline:
         self.reset()
         self._rest.forget()
         self._rest.begin(self._noise)
+
+    def rest_to_record(self) -> RecordedRest | None:
+        """The rest field in force and what is known with it; None before the first tare."""
+        rest = self._rest
+        if not rest.known:
+            return None
+        return RecordedRest(
+            rest.rest_ut.tolist(),
+            rest.unrested.tolist(),
+            self._noise.tolist(),
+            rest.rough,
+            rest.bare.tolist(),
+            self._model.rested_c.tolist(),
+        )
+
+    def restore_rest(self, state: RecordedRest) -> None:
+        """Go on from a rest field that was in force before; ValueError when it does not fit."""
+        rest_ut, unrested = np.array(state.rest_ut), np.array(state.unrested, dtype=bool)
+        noise = np.array(state.noise_ut)
+        if rest_ut.shape != self._rest.rest_ut.shape or noise.shape != self._noise.shape:
+            raise ValueError(f"a rest field of shape {rest_ut.shape} for another board")
+        if unrested.shape != self._rest.unrested.shape or not np.isfinite(rest_ut).all():
+            raise ValueError("a rest field that is spoilt")
+        self._rest.restore(rest_ut, unrested, state.rough)
+        bare, rested_c = np.array(state.bare, dtype=bool), np.array(state.rested_c)
+        if bare.shape == unrested.shape:
+            self._rest.bare = bare
+        if rested_c.shape == unrested.shape and np.isfinite(rested_c).all():
+            self._settle_rest(rested_c)
+        self._monitor.set_rest(self._model.chip_rest())
+        self._apply_noise(noise)
 
     def reset(self) -> None:
         """The board began anew: forget sequence, contacts and fits, keep the rest field."""

@@ -170,6 +170,18 @@ class RestField:
     def _make(self, seconds: float, noise_ut: Float) -> Tare:
         return Tare((self._layout.arrays, 3, self._layout.width), seconds, noise_ut)
 
+    def restore(self, rest_ut: Float, unrested: Bool, rough: bool) -> None:
+        """Go on from a rest field that was in force before: (A, 3, n) µT, and (A, n) bool."""
+        self._model.rest[:] = rest_ut
+        self.unrested[:] = unrested
+        self.known, self.rough = True, rough
+        self._tare = None
+
+    @property
+    def rest_ut(self) -> Float:
+        """(A, 3, n) µT: the rest field in force."""
+        return self._model.rest
+
     def note_peak(self, newton: float) -> None:
         """Largest force of a taxel in this cycle, N: a tare under way must not take it for rest."""
         self._peak = max(self._peak, newton)

@@ -12,7 +12,7 @@ from tactile_bus.messages import DecodeError
 from tactile_tools.logs.arguments import add_files, add_selection, select
 from tactile_tools.logs.decode import Decoder, finite
 from tactile_tools.logs.stream import Reading, Record, read_merged
-from tactile_tools.logs.terminal import FAULTY, clock_text
+from tactile_tools.logs.terminal import FAULTY, clock_text, complain, json_text, shown
 
 SHOWN = 6
 """Elements of an array shown to people; --json has them all."""
@@ -37,7 +37,7 @@ def fill(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print; 0 when everything was printed, 1 when some messages could not be decoded."""
+    """Print; 0 when everything was printed, 1 when messages were lost or could not be decoded."""
     chosen = select(options)
     decoder, reading = Decoder(), Reading()
     out = sys.stdout
@@ -59,10 +59,10 @@ def run(options: argparse.Namespace) -> int:
             _print_line(out, item, fields, chosen.start_ns, options.absolute)
     out.flush()
     if remark := reading.remark():
-        print(f"tactile log: {remark}; printed what could be read", file=sys.stderr)
+        complain(f"{remark}; printed what could be read")
     if undecoded:
-        print(f"tactile log: {undecoded} of {count} messages not decoded", file=sys.stderr)
-    return FAULTY if undecoded else 0
+        complain(f"{undecoded} of {count} messages not decoded")
+    return FAULTY if undecoded or reading.lossy else 0
 
 
 def _print_json(out: TextIO, item: Record, fields: Any) -> None:
@@ -74,7 +74,7 @@ def _print_json(out: TextIO, item: Record, fields: Any) -> None:
         "sequence": item.sequence,
         "message": finite(fields),
     }
-    out.write(json.dumps(line, ensure_ascii=False, allow_nan=False) + "\n")
+    out.write(json_text(line) + "\n")
 
 
 def _print_line(out: TextIO, item: Record, fields: Any, start_ns: int, absolute: bool) -> None:
@@ -83,7 +83,7 @@ def _print_line(out: TextIO, item: Record, fields: Any, start_ns: int, absolute:
     text = _text(fields)
     if isinstance(fields, dict):
         text = text[1:-1]
-    out.write(f"{when} {item.stream.topic}  {text}\n")
+    out.write(shown(f"{when} {item.stream.topic}  {text}") + "\n")
 
 
 def _text(value: Any) -> str:

@@ -5,8 +5,9 @@ A column holds numbers, texts, a list of numbers or of texts a row, or the rows 
 
 from __future__ import annotations
 
+import hashlib
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any, Literal
@@ -137,14 +138,35 @@ def comments(stream: Stream) -> dict[tuple[str, str], str]:
     return found
 
 
-def file_names(streams: Iterable[Stream], suffix: str) -> dict[Stream, str]:
-    """A file name for each stream, told apart where two have the same topic."""
-    names: dict[Stream, str] = {}
-    for stream in streams:
+MAX_STEM = 100
+"""Letters of a topic in the name of its file; the rest is told apart by a hash of it."""
+
+RESERVED = re.compile(r"con|prn|aux|nul|com\d|lpt\d", re.IGNORECASE)
+"""Names that some systems keep for devices."""
+
+
+class FileNames:
+    """File names of streams, told apart where two have the same topic, also in small letters."""
+
+    def __init__(self, suffix: str) -> None:
+        self.names: dict[Stream, str] = {}
+        self._suffix = suffix
+        self._taken: set[str] = set()
+        self._next: dict[str, int] = {}
+
+    def add(self, stream: Stream) -> str:
+        """A new name for ``stream``."""
         stem = re.sub(r"[^A-Za-z0-9-]+", "_", stream.topic).strip("_") or "topic"
-        name, number = f"{stem}{suffix}", 1
-        while name in names.values():
+        if len(stem) > MAX_STEM:
+            digest = hashlib.blake2b(stream.topic.encode("utf-8", "replace"), digest_size=4)
+            stem = f"{stem[:MAX_STEM]}_{digest.hexdigest()}"
+        if RESERVED.fullmatch(stem):
+            stem += "_"
+        name, number = stem, self._next.get(stem.lower(), 1)
+        while name.lower() in self._taken:
             number += 1
-            name = f"{stem}_{number}{suffix}"
-        names[stream] = name
-    return names
+            name = f"{stem}_{number}"
+        self._next[stem.lower()] = number
+        self._taken.add(name.lower())
+        self.names[stream] = f"{name}{self._suffix}"
+        return self.names[stream]

@@ -30,6 +30,7 @@ from tactile_tools.logs.terminal import (
     plain_console,
     progress,
     seconds_text,
+    shown,
 )
 
 PROFILES = ("ros2", "ros1", "")
@@ -37,6 +38,9 @@ PROFILES = ("ros2", "ros1", "")
 
 AT_START = frozenset({"backlog", "discarded_bytes", "unidentified"})
 """Drops that come with joining a stream under way: in every log, and no fault."""
+
+LONGEST = 2000
+"""Letters of a finding shown to people; --json has all."""
 
 OUR_LIBRARY = re.compile(r"tactile-reach (\d+(?:\.\d+)*)")
 
@@ -84,19 +88,14 @@ def run(options: argparse.Namespace) -> int:
 
 
 class _Watch:
-    """Whether messages of every channel can be decoded: looks at the first of each."""
+    """Whether messages of every channel can be decoded: is shown the first of each."""
 
     def __init__(self) -> None:
         self.troubles: dict[str, str] = {}
         self._decoder = Decoder()
-        self._seen: set[tuple[int, int, str]] = set()
 
     def take(self, channel: ChannelRecord, schema: SchemaRecord | None, message: Message) -> None:
         """Look at a message."""
-        key = channel.number, channel.schema, channel.topic
-        if key in self._seen:
-            return
-        self._seen.add(key)
         stream: Stream = stream_of(channel, schema)
         try:
             self._decoder.decode(stream, message.data)
@@ -122,6 +121,7 @@ def _file_findings(found: LogInfo, series: Series) -> list[Finding]:
     elif not found.closed:
         text = "not closed: footer and summary are missing, its writer was killed or cut off"
         out.append(Finding("not_closed", True, text, repair))
+    elsewhere = "read it with the tools of its writer: recover leaves out what is not read here"
     by_reason: dict[str, list[Any]] = {}
     for damage in found.damages:
         by_reason.setdefault(damage.reason, []).append(damage)
@@ -136,6 +136,10 @@ def _file_findings(found: LogInfo, series: Series) -> list[Finding]:
             f"{reason}: {places} at byte {damages[0].offset}; {size} unreadable, "
             f"{lost} messages lost" + (" and an unknown number more" if unknown else "")
         )
+        unread = reason.startswith("a chunk compressed with")
+        out.append(Finding("damaged", True, text, elsewhere if unread else repair))
+    if found.damage_count > len(found.damages):
+        text = f"{found.damage_count - len(found.damages)} more damaged places"
         out.append(Finding("damaged", True, text, repair))
     if found.missing_files:
         numbers = ", ".join(map(str, found.missing_files))
@@ -165,6 +169,15 @@ def _content_findings(found: LogInfo, watch: _Watch) -> list[Finding]:
         first = next(gap for gap in found.gaps if gap.reason == reason)
         text = f"gap: {reason}, {count} messages not written, first at {clock_text(first.first_ns)}"
         out.append(Finding("gap", True, f"{text} {first.detail}".rstrip(), gone))
+    if found.one_counter and found.numbers_missing:
+        text = (
+            f"one counter numbers the messages of all channels, and {found.numbers_missing} of its "
+            "numbers are missing: of messages that were lost, or of channels that are not in here"
+        )
+        out.append(Finding("missing_messages", True, text, gone))
+    elif found.one_counter:
+        text = "one counter numbers the messages of all channels; none is missing"
+        out.append(Finding("one_counter", False, text))
     missing = {c.topic: c.missing for c in found.channels if c.missing}
     if missing:
         worst = max(missing, key=lambda topic: missing[topic])
@@ -176,7 +189,21 @@ def _content_findings(found: LogInfo, watch: _Watch) -> list[Finding]:
                 f"{channel.topic}: time goes backwards {channel.backwards} times, by up to "
                 f"{seconds_text(channel.furthest_back_ns)}"
             )
-            out.append(Finding("time_backwards", True, text, "tactile log merge sorts messages"))
+            remedy = "tactile log merge FILE --out OUT writes the messages in the order of time"
+            out.append(Finding("time_backwards", True, text, remedy))
+        if channel.impossible:
+            many = (
+                "one message is"
+                if channel.impossible == 1
+                else f"{channel.impossible} messages are"
+            )
+            text = (
+                f"{channel.topic}: {many} stamped later than any clock "
+                f"goes, the first {channel.impossible_ns} ns: beyond 2^63, in the year "
+                f"{1970 + channel.impossible_ns // (NS_PER_S * 31_556_952)}"
+            )
+            remedy = "they are read and exported as they are; ROS 2 cannot play them"
+            out.append(Finding("impossible_stamps", True, text, remedy))
         for when, change in channel.clock_steps[:1]:
             text = (
                 f"{channel.topic}: at {clock_text(when)} its stamps and the log's clock part by "
@@ -239,7 +266,7 @@ def _show(found: LogInfo, series: Series, findings: list[Finding]) -> None:
     verdict = f"{faults} faults" if faults > 1 else "one fault" if faults else "healthy"
     console.print(f"{series.name}  {bytes_text(found.size)}  {verdict}")
     for finding in findings:
-        console.print(f"{'FAULT' if finding.fault else 'note '} {finding.text}")
+        console.print(f"{'FAULT' if finding.fault else 'note '} {shown(finding.text, LONGEST)}")
         if finding.remedy:
             console.print(f"      → {finding.remedy}")
     span = found.span_ns
@@ -249,7 +276,7 @@ def _show(found: LogInfo, series: Series, findings: list[Finding]) -> None:
     console.print(
         f"{'readable all the same' if faults else 'readable'}: {found.messages} messages, "
         f"{clock_text(span[0])} to {clock_text(span[1])} ({seconds_text(span[1] - span[0])}), "
-        f"{len(found.attachments)} attachments"
+        f"{found.attachment_count} attachments, {found.table_count} tables"
     )
 
 
@@ -262,5 +289,6 @@ def _as_json(found: LogInfo, series: Series, findings: list[Finding]) -> dict[st
         "span_ns": found.span_ns,
         "messages_lost": found.messages_lost,
         "places_of_unknown_loss": found.lost_unknown,
-        "attachments": len(found.attachments),
+        "attachments": found.attachment_count,
+        "tables": found.table_count,
     }

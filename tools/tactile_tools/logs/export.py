@@ -6,11 +6,15 @@ import argparse
 import contextlib
 import json
 import os
+import resource
 import shutil
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_bus.messages import DecodeError
+from tactile_bus.topics import RAW, find_topic
 from tactile_tools.logs.arguments import Selection, add_files, add_selection, select
 from tactile_tools.logs.stream import Reading, Record, Stream, read_merged
 from tactile_tools.logs.terminal import (
@@ -30,6 +34,8 @@ if TYPE_CHECKING:
 
 FORMATS = ("csv", "parquet", "npz")
 
+MAX_FILES = 65_536
+
 CONTENTS = "columns.json"
 """Says what the columns of every file are, with units as the definitions tell them; a folder that
 has it was made by this tool, and may be overwritten with --force."""
@@ -41,7 +47,8 @@ def fill(parser: argparse.ArgumentParser) -> None:
         "Write a folder with one table a topic. Nested fields are flattened "
         f"(header.stamp_ns, wrench.force.x); {CONTENTS} says what each column is. Lists of numbers "
         "are columns name.0, name.1 … in CSV, lists in Parquet, matrices in npz; lists of messages "
-        "are JSON in CSV, lists of structures in Parquet, flat arrays with offsets in npz."
+        "are JSON in CSV, lists of structures in Parquet, flat arrays with offsets in npz. Raw "
+        "bytes of boards are left out unless --topic names them."
     )
     add_files(parser)
     parser.add_argument("--to", dest="format", choices=FORMATS, required=True, help="format")
@@ -54,8 +61,12 @@ def fill(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Export; 0 when every message was written, 1 when some could not be decoded."""
+    """Export; 0 when every message was written, 1 when some were lost or could not be decoded."""
     chosen = select(options)
+    left_out: set[str] = set()
+    if chosen.wanted is None:
+        chosen = replace(chosen, wanted=partial(_is_no_raw, left_out))
+    _allow_files()
     source = chosen.logs[0].paths[0]
     out: Path = options.out or source.with_name(f"{source.stem}_{options.format}")
     _check_folder(out, options.force)
@@ -72,7 +83,25 @@ def run(options: argparse.Namespace) -> int:
     finally:
         with contextlib.suppress(OSError):
             shutil.rmtree(part)
-    return _report(result, out)
+    return _report(result, out, left_out)
+
+
+def _is_no_raw(left_out: set[str], topic: str) -> bool:
+    """Whether a topic is anything but the bytes of a board, which are noted in ``left_out``."""
+    found = find_topic(topic)
+    if found is None or found[0] != RAW:
+        return True
+    left_out.add(topic)
+    return False
+
+
+def _allow_files() -> None:
+    """Have the system let us open as many files as it would: one a topic."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_FILES)
+    if soft != resource.RLIM_INFINITY and soft < most:
+        with contextlib.suppress(ValueError, OSError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 def _check_folder(out: Path, force: bool) -> None:
@@ -94,14 +123,23 @@ class _Export:
     def __init__(self, folder: Path, kind: str, start_ns: int, decoder: Decoder) -> None:
         self.folder = folder
         self.tables: dict[Stream, Table] = {}
-        self.names: dict[Stream, str] = {}
         self.refused: dict[str, str] = {}
         self.undecoded: dict[str, int] = {}
         self.decoder = decoder
         self.reading = Reading()
         self.widths: dict[Stream, dict[str, int]] = {}
+        from tactile_tools.logs.columns import FileNames
+        from tactile_tools.logs.tables import Budget
+
         self._kind = kind
         self._start_ns = start_ns
+        self._files = FileNames(f".{kind}")
+        self._budget = Budget()
+
+    @property
+    def names(self) -> dict[Stream, str]:
+        """Names of the files."""
+        return self._files.names
 
     def take(self, record: Record) -> None:
         """Write one message."""
@@ -116,6 +154,9 @@ class _Export:
         if table is None:
             table = self.tables[stream] = self._make(stream)
         table.add(record, message)
+        if self._budget.spent:
+            for each in self.tables.values():
+                each.relieve()
 
     def columns(self, stream: Stream) -> list[Column]:
         """Columns of a stream."""
@@ -141,18 +182,16 @@ class _Export:
         (self.folder / CONTENTS).write_text(text + "\n", encoding="utf-8")
 
     def _make(self, stream: Stream) -> Table:
-        from tactile_tools.logs.columns import file_names
-
-        self.names = file_names([*self.names, stream], f".{self._kind}")
-        path, columns = self.folder / self.names[stream], self.columns(stream)
+        path, columns = self.folder / self._files.add(stream), self.columns(stream)
         if self._kind == "npz":
             from tactile_tools.logs.npz import NpzTable
 
-            return NpzTable(path, columns, self._start_ns, path.with_suffix(".parts"))
+            scratch = path.with_suffix(".parts")
+            return NpzTable(path, columns, self._start_ns, scratch, self._budget)
         from tactile_tools.logs.tables import ArrowTable
 
         widths = self.widths.get(stream, {}) if self._kind == "csv" else None
-        return ArrowTable(path, stream, columns, self._start_ns, widths)
+        return ArrowTable(path, stream, columns, self._start_ns, widths, self._budget)
 
 
 def _export(chosen: Selection, kind: str, folder: Path) -> _Export:
@@ -199,15 +238,17 @@ def _measure(chosen: Selection, result: _Export, report: Any) -> None:
                 widths[column.name] = length
 
 
-def _report(result: _Export, out: Path) -> int:
+def _report(result: _Export, out: Path, left_out: set[str]) -> int:
     console = plain_console()
     for stream, table in result.tables.items():
         size = bytes_text((out / result.names[stream]).stat().st_size)
         console.print(f"{out / result.names[stream]}: {table.rows} messages, {size}")
     if not result.tables:
         console.print(f"{out}: no message in what was asked for")
+    for topic in sorted(left_out):
+        console.print(f"left out: {topic}, the bytes of a board; --topic {topic} exports them")
     if remark := result.reading.remark():
         complain(f"{remark}; exported what could be read")
     for topic, reason in result.refused.items():
         complain(f"{result.undecoded[topic]} messages of {topic} left out: {reason}")
-    return FAULTY if result.refused else 0
+    return FAULTY if result.refused or result.reading.lossy else 0

@@ -6,8 +6,9 @@ import argparse
 import hashlib
 import heapq
 import uuid
-from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections import Counter, deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from tactile_bus.gaps import GAP
 from tactile_bus.instant import NS_PER_S
 from tactile_bus.log_records import MetadataRecord
 from tactile_tools.logs.arguments import add_output, check_output
+from tactile_tools.logs.ordering import InOrder, Stretches
 from tactile_tools.logs.sources import FILE, Series, find_series
 from tactile_tools.logs.stream import (
     Attachment,
@@ -22,20 +24,21 @@ from tactile_tools.logs.stream import (
     Reading,
     Record,
     Stream,
-    read_merged,
+    common_profile,
     read_series,
 )
 from tactile_tools.logs.terminal import ToolError, complain, plain_console, progress
 from tactile_tools.logs.writing import LogOutput
 
-SORTED_NS = 5 * NS_PER_S
-SORTED_LIMIT = 50_000
-"""Messages within so much time, and so many, are put into order: daemons write theirs within a
-second, however busy the disk."""
+COPY_WITHIN_NS = 10 * NS_PER_S
+"""By how much the log times of a message and its copy may differ: what one daemon heard of another
+it logs within milliseconds, a busy one within seconds."""
 
-REMEMBERED = 8192
-"""Messages of a topic in which another log's copy is looked for: what one daemon heard of another
-it logs within milliseconds."""
+REMEMBERED = 200_000
+"""Messages in which a copy is looked for, if there are as many within that time."""
+
+SHOWN = 20
+"""Topics of which the copies are told; the rest in one sum."""
 
 CLOCKS_APART_NS = NS_PER_S // 20
 
@@ -47,7 +50,7 @@ def fill(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Write several logs, such as those of both daemons, as one: messages in the "
         "order of time, all attachments and tables. What one daemon logged of what another said, "
-        "and that one logged too, is kept once."
+        "and that one logged too (same bytes, same stamp of the sender), is kept once."
     )
     parser.add_argument(
         "files", nargs="+", type=Path, metavar="FILE", help="logs, folders, names of split logs"
@@ -72,28 +75,89 @@ def run(options: argparse.Namespace) -> int:
     shifts = _shifts(logs, options.align)
     reading = Reading()
     with progress("looking through") as report:
-        shared = _shared(logs, report)
+        surveys = [_survey(series, report) for series in logs]
+    streams = Counter(stream for survey in surveys for stream in survey.streams)
+    shared = {stream for stream, count in streams.items() if count > 1}
+    counted = {stream for survey in surveys for stream in survey.counted}
     seen = Copies(shared)
-    with progress("merging") as report, LogOutput(options.out) as output:
+    with progress("merging") as report, LogOutput(options.out, common_profile(logs)) as output:
         output.metadata(FILE, {"set": uuid.uuid4().hex, "file": "0"})
         tables = Tables(logs, output)
-        items = read_merged(logs, reading, report)
-        for number, item in in_order(_shifted(items, shifts)):
-            if isinstance(item, Record):
-                if options.keep_duplicates or not seen.is_copy(number, item):
-                    output.write(item, renumber=item.stream in shared)
-            else:
+        for number, item in _merged(logs, surveys, shifts, reading, report, options.out.parent):
+            if not isinstance(item, Record):
                 tables.take(number, item)
+            elif options.keep_duplicates or not seen.is_copy(number, item, shifts[number]):
+                again = item.stream in shared and item.stream in counted
+                output.write(item, renumber=again)
         for stream in reading.seen:
             output.declare(stream)
         messages = output.messages
     console = plain_console()
     console.print(f"{options.out}: {messages} messages of {len(logs)} logs")
-    if seen.copies:
-        console.print(f"{seen.copies} messages were in several logs and are kept once")
+    for topic, copies in seen.copies.most_common(SHOWN):
+        console.print(f"{topic}: {copies} messages were in several logs and are kept once")
+    rest = seen.copies.total() - sum(n for _, n in seen.copies.most_common(SHOWN))
+    if rest:
+        console.print(f"{rest} messages of other topics likewise")
     if remark := reading.remark():
         console.print(f"{remark}: merged what could be read")
     return 0
+
+
+@dataclass(slots=True)
+class Survey:
+    """What a first pass finds of a log. ``counted``: streams whose messages have numbers."""
+
+    streams: dict[Stream, Stream] = field(default_factory=dict)
+    counted: set[Stream] = field(default_factory=set)
+    stretches: Stretches = field(default_factory=Stretches)
+
+
+def _survey(series: Series, report: Any) -> Survey:
+    survey, reading = Survey(), Reading()
+    for item in read_series(series, reading, report):
+        if isinstance(item, Record):
+            survey.stretches.survey(item)
+            if item.sequence:
+                survey.counted.add(item.stream)
+    survey.stretches.finish()
+    survey.streams = reading.seen
+    return survey
+
+
+def _merged(
+    logs: list[Series],
+    surveys: list[Survey],
+    shifts: list[int],
+    reading: Reading,
+    progress: Any,
+    folder: Path,
+) -> Iterator[tuple[int, Item]]:
+    """Everything of the logs with the number of the log, messages in the order of time."""
+    total = sum(series.size for series in logs)
+    done = [0] * len(logs)
+
+    def numbered(number: int) -> Iterator[tuple[int, int, int, Item]]:
+        def report(position: int, _: int) -> None:
+            done[number] = position
+            progress(sum(done), total)
+
+        shift = shifts[number]
+        time = max(0, surveys[number].stretches.first_ns + shift)
+        items = read_series(logs[number], reading, report if progress is not None else None)
+        ordered = InOrder(surveys[number].stretches, folder).sort(items)
+        for count, item in enumerate(ordered):
+            if isinstance(item, Record):
+                if shift:
+                    item = item._replace(
+                        log_ns=max(0, item.log_ns + shift),
+                        publish_ns=max(0, item.publish_ns + shift),
+                    )
+                time = item.log_ns
+            yield time, number, count, item
+
+    for _, number, _, item in heapq.merge(*(numbered(k) for k in range(len(logs)))):
+        yield number, item
 
 
 def _shifts(logs: list[Series], align: bool) -> list[int]:
@@ -123,111 +187,91 @@ def _shifts(logs: list[Series], align: bool) -> list[int]:
     return [0] * len(logs)
 
 
-def _shared(logs: list[Series], report: Any) -> set[Stream]:
-    """Streams that several of the logs hold."""
-    if len(logs) < 2:
-        return set()
-    shared: set[Stream] = set()
-    seen: set[Stream] = set()
-    for series in logs:
-        reading = Reading()
-        for _ in read_series(series, reading, report, lambda _: False):
-            pass
-        shared |= seen & reading.seen.keys()
-        seen |= reading.seen.keys()
-    return shared
-
-
-def _shifted(items: Iterable[tuple[int, Item]], shifts: list[int]) -> Iterator[tuple[int, Item]]:
-    for number, item in items:
-        shift = shifts[number]
-        if shift and isinstance(item, Record):
-            log_ns, sent_ns = max(0, item.log_ns + shift), item.publish_ns
-            item = item._replace(log_ns=log_ns, publish_ns=max(0, sent_ns + shift))
-        yield number, item
-
-
-def in_order(items: Iterable[tuple[int, Item]]) -> Iterator[tuple[int, Item]]:
-    """The same with messages that are a little out of order put into it; bounded memory."""
-    waiting: list[tuple[int, int, int, Record]] = []
-    count = newest = 0
-    for number, item in items:
-        if not isinstance(item, Record):
-            yield number, item
-            continue
-        heapq.heappush(waiting, (item.log_ns, count, number, item))
-        count += 1
-        newest = max(newest, item.log_ns)
-        while waiting and (waiting[0][0] < newest - SORTED_NS or len(waiting) > SORTED_LIMIT):
-            _, _, number, first = heapq.heappop(waiting)
-            yield number, first
-    while waiting:
-        _, _, number, first = heapq.heappop(waiting)
-        yield number, first
-
-
 class Copies:
-    """Tells messages that another log had already; of the streams that several have."""
+    """Tells messages that another log had already, of the streams that several have.
+
+    A copy has the same bytes and the same stamp of its sender, and was logged about as late. Where
+    the sender's stamp is not known (0), it must have the same log time. What one log has twice is
+    no copy. ``copies``: how many there were, by topic.
+    """
 
     def __init__(self, shared: set[Stream]) -> None:
-        self.copies = 0
+        self.copies: Counter[str] = Counter()
         self._shared = shared
-        self._seen: dict[Stream, OrderedDict[bytes, int]] = {}
+        self._seen: dict[tuple[Stream, bytes], list[int]] = {}  # how often in the result, each log
+        self._order: deque[tuple[int, tuple[Stream, bytes]]] = deque()
 
-    def is_copy(self, number: int, record: Record) -> bool:
-        """Whether log ``number`` repeats what another one had; counted."""
-        if record.stream not in self._shared:
+    def is_copy(self, number: int, record: Record, shift: int = 0) -> bool:
+        """Whether log ``number``, whose times were moved by ``shift``, repeats another; counted."""
+        stream = record.stream
+        if stream not in self._shared:
             return False
-        seen = self._seen.setdefault(record.stream, OrderedDict())
-        digest = hashlib.blake2b(record.data, digest_size=16).digest()
-        owner = seen.get(digest)
-        if owner is not None and owner != number:
-            del seen[digest]
-            self.copies += 1
+        self._forget(record.log_ns)
+        sent = record.publish_ns - shift if record.publish_ns else record.log_ns
+        digest = hashlib.blake2b(
+            record.data, digest_size=16, salt=sent.to_bytes(16, "little", signed=True)
+        )
+        key = stream, digest.digest()
+        counts = self._seen.get(key)
+        if counts is None:
+            counts = self._seen[key] = [0]
+            self._order.append((record.log_ns, key))
+        counts += [0] * (number + 2 - len(counts))
+        counts[number + 1] += 1
+        if counts[number + 1] <= counts[0]:
+            self.copies[stream.topic] += 1
             return True
-        seen[digest] = number
-        if len(seen) > REMEMBERED:
-            seen.popitem(last=False)
+        counts[0] += 1
         return False
+
+    def _forget(self, now_ns: int) -> None:
+        """Drop what is too long ago to be met again."""
+        order = self._order
+        while order and (order[0][0] < now_ns - COPY_WITHIN_NS or len(order) > REMEMBERED):
+            del self._seen[order.popleft()[1]]
 
 
 class Tables:
-    """Metadata and attachments of several logs in one: told apart by the log where they differ."""
+    """Metadata and attachments of several logs in one: told apart by the log where they differ.
+
+    What a log has twice stays twice; what another has just so is not added.
+    """
 
     def __init__(self, logs: list[Series], output: LogOutput) -> None:
         self._logs = logs
         self._output = output
-        self._tables: dict[str, tuple[int, dict[str, str]]] = {}
-        self._files: dict[str, tuple[int, bytes]] = {}
+        self._owners: dict[tuple[type, str], int] = {}
+        self._counts: dict[tuple[str, bytes], list[int]] = {}
 
     def take(self, number: int, item: MetadataRecord | Attachment) -> None:
-        """Write one over, once."""
+        """Write one over, unless another log had it."""
         if isinstance(item, MetadataRecord):
             if item.name == FILE:
                 return
             if item.name == GAP:
                 self._output.metadata(item.name, item.values)
-                return
-            name = item.name
-            owner = self._tables.setdefault(name, (number, {}))[0]
-            if owner != number:
-                if self._tables[name][1] == item.values:
-                    return
-                name = f"{name}@{self._stem(number)}"
-            if self._tables.get(name) == (number, item.values):
-                return  # as every file of a log repeats it
-            self._tables[name] = (number, item.values)
-            self._output.metadata(name, item.values)
-            return
-        name = item.name
-        held = self._files.get(name)
-        if held is not None and held[1] != item.data and held[0] != number:
-            name = f"{self._stem(number)}.{name}"
-            held = self._files.get(name)
-        if held is not None and held[1] == item.data:
-            return
-        self._files[name] = (number, item.data)
-        self._output.attach(item._replace(name=name))
+            elif self._is_new(number, item.name, repr(sorted(item.values.items())).encode()):
+                own = self._is_own(number, item)
+                name = item.name if own else f"{item.name}@{self._stem(number)}"
+                self._output.metadata(name, item.values)
+        elif self._is_new(number, item.name, item.digest()):
+            own = self._is_own(number, item)
+            name = item.name if own else f"{self._stem(number)}.{item.name}"
+            self._output.attach(item._replace(name=name))
+
+    def _is_new(self, number: int, name: str, contents: bytes) -> bool:
+        digest = hashlib.blake2b(contents, digest_size=16).digest()
+        counts = self._counts.setdefault((name, digest), [0])
+        counts += [0] * (number + 2 - len(counts))
+        counts[number + 1] += 1
+        if counts[number + 1] <= counts[0]:
+            return False
+        counts[0] += 1
+        return True
+
+    def _is_own(self, number: int, item: MetadataRecord | Attachment) -> bool:
+        """Whether no other log had a table or an attachment of that name first."""
+        return self._owners.setdefault((type(item), item.name), number) == number
 
     def _stem(self, number: int) -> str:
         return self._logs[number].paths[0].stem

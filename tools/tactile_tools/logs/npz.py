@@ -10,14 +10,14 @@ import zipfile
 from array import array
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 from tactile_tools.logs.columns import Column
 from tactile_tools.logs.decode import finite
 from tactile_tools.logs.stream import Record
-from tactile_tools.logs.tables import NOTES, OWN
+from tactile_tools.logs.tables import NOTES, OWN, Budget
 
 MAX_TEXT_BYTES = 256 << 20
 """Bytes of a column of texts as NumPy keeps them, all as long as the longest; beyond that they
@@ -30,14 +30,14 @@ HELD = 1 << 16
 
 
 class _Growing:
-    """Raw bytes of one array, in a file."""
+    """Raw bytes of one array, in a file that is open only while it is written to."""
 
-    def __init__(self, path: Path, dtype: np.dtype[Any]) -> None:
+    def __init__(self, path: Path, dtype: np.dtype[Any], budget: Budget) -> None:
         self.path = path
         self.dtype = dtype
         self.count = 0
+        self._budget = budget
         self._held = bytearray()
-        self._file: BinaryIO = path.open("wb")
 
     def add(self, values: Any) -> None:
         """Append numbers."""
@@ -48,30 +48,30 @@ class _Growing:
     def add_bytes(self, data: bytes) -> None:
         """Append the bytes of numbers that are counted elsewhere."""
         self._held += data
+        self._budget.held += len(data)
         if len(self._held) >= HELD:
             self.flush()
 
     def flush(self) -> None:
         """Have the file hold everything."""
-        self._file.write(self._held)
-        self._file.flush()
+        with self.path.open("ab") as file:
+            file.write(self._held)
+        self._budget.held -= len(self._held)
         self._held.clear()
-
-    def close(self) -> None:
-        """Nothing more comes."""
-        self.flush()
-        self._file.close()
 
 
 class NpzTable:
     """One archive. Lists of one length make a matrix; others stand flat beside their offsets."""
 
-    def __init__(self, path: Path, columns: list[Column], start_ns: int, scratch: Path) -> None:
+    def __init__(
+        self, path: Path, columns: list[Column], start_ns: int, scratch: Path, budget: Budget
+    ) -> None:
         self.rows = 0
         self._path = path
         self._columns = columns
         self._start_ns = start_ns
         self._scratch = scratch
+        self._budget = budget
         scratch.mkdir()
         self._growing: dict[str, _Growing] = {}
         self._lengths: dict[str, tuple[int, bool]] = {}  # of the first list, and whether all agree
@@ -83,15 +83,19 @@ class NpzTable:
         self.rows += 1
         self._numbers(OWN[0], np.float64, (record.log_ns - self._start_ns) / 1e9)
         for name, value in zip(OWN[1:3], (record.log_ns, record.publish_ns), strict=True):
-            self._numbers(name, np.int64, value)
+            self._numbers(name, np.uint64, value)
         self._numbers(OWN[3], np.uint32, record.sequence)
         for column in self._columns:
             self._add(column, column.name, message)
 
+    def relieve(self) -> None:
+        """Write what waits in memory."""
+        for growing in self._growing.values():
+            growing.flush()
+
     def close(self) -> list[dict[str, str]]:
         """Pack the archive; returns what its arrays are."""
-        for growing in self._growing.values():
-            growing.close()
+        self.relieve()
         told = []
         with zipfile.ZipFile(
             self._path, "w", zipfile.ZIP_DEFLATED, allowZip64=True, compresslevel=1
@@ -110,7 +114,7 @@ class NpzTable:
         growing = self._growing.get(name)
         if growing is None:
             path = self._scratch / str(len(self._growing))
-            growing = self._growing[name] = _Growing(path, np.dtype(dtype))
+            growing = self._growing[name] = _Growing(path, np.dtype(dtype), self._budget)
         return growing
 
     def _numbers(self, name: str, dtype: Any, values: Any) -> None:

@@ -32,6 +32,12 @@ def fill(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, metavar="OUT", help="new log (default: FILE's name with _recovered)"
     )
     parser.add_argument("--force", action="store_true", help="overwrite what is there")
+    parser.add_argument(
+        "--keep-suspect",
+        action="store_true",
+        help="also what looks readable of blocks and attachments whose checksum is wrong, as after "
+        "a flipped bit; the new log says which messages these are",
+    )
     parser.add_argument("--json", action="store_true", help="report as JSON")
     parser.set_defaults(func=run)
 
@@ -49,7 +55,7 @@ def run(options: argparse.Namespace) -> int:
         try:
             part.unlink(missing_ok=True)
             with progress("recovering") as report:
-                result = recover(source, part, report)
+                result = recover(source, part, report, keep_suspect=options.keep_suspect)
             part.replace(target)
         except OSError as error:
             raise ToolError(
@@ -86,6 +92,8 @@ def _show(result: RecoveryReport) -> None:
         if result.lost_unknown:
             text += f", and those of {result.lost_unknown} places without one"
         console.print(text)
+    if result.suspect:
+        console.print(f"{result.suspect} messages are kept of blocks whose checksum is wrong")
     if result.orphans:
         console.print(f"left out: {result.orphans} messages of channels that are defined nowhere")
     show_damages(console, result.damages, result.damage_count)

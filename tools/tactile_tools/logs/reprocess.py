@@ -50,7 +50,7 @@ def fill(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Reprocess; 0 when the new log was written."""
+    """Reprocess; 0 when the new log was written, 1 when nothing could be made of the raw bytes."""
     from tactile_tools.logs.reprocessing import Reprocessing, survey
     from tactiled.replay.recorded import RecordedError
 
@@ -75,6 +75,7 @@ def run(options: argparse.Namespace) -> int:
         for item in read_series(series, work.reading, report):
             work.take(item, output)
         work.finish(output)
+        work.check(series)
         output.metadata("reprocessed", work.summary(series, given))
     _show(work, out, same=not given and settings == known.settings)
     return 0

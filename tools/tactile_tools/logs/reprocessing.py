@@ -31,7 +31,7 @@ from tactile_bus.topics import (
 )
 from tactile_tools.logs.sources import FILE, Series
 from tactile_tools.logs.stream import Attachment, Reading, Record, Stream, read_series
-from tactile_tools.logs.terminal import ToolError
+from tactile_tools.logs.terminal import FAULTY, ToolError
 from tactile_tools.logs.writing import LogOutput
 from tactiled.replay.recorded import (
     PIPELINE,
@@ -42,6 +42,7 @@ from tactiled.replay.recorded import (
     recorded_port,
 )
 from tactiled.replay.rerun import Rerun
+from tactiled.replay.state import STATE_PREFIX, RecordedState, recorded_state
 from tactiled.sensing.pipeline_settings import PipelineSettings
 from tactiled.shelf import Shelf
 from tactiled.transports.raw_chunk import from_raw
@@ -65,6 +66,7 @@ class Known:
     has_settings: bool = False
     versions: dict[str, BoardCalibration] = field(default_factory=dict)
     first: dict[str, BoardCalibration] = field(default_factory=dict)  # by name of the board
+    states: dict[str, RecordedState] = field(default_factory=dict)  # by name of the board
     serials: set[str] = field(default_factory=set)
     raw: set[str] = field(default_factory=set)
     journals: set[str] = field(default_factory=set)
@@ -81,10 +83,15 @@ def survey(series: Series, report: Progress | None = None) -> Known:
                 elif item.name.startswith(PORT_PREFIX):
                     name = item.name.removeprefix(PORT_PREFIX)
                     known.ports.setdefault(name, recorded_port(name, item.values))
+                elif item.name.startswith(STATE_PREFIX):
+                    name = item.name.removeprefix(STATE_PREFIX)
+                    state = recorded_state(name, item.values)
+                    if state is not None:
+                        known.states.setdefault(name, state)
                 elif item.name.startswith("board:"):
                     known.serials.add(item.values.get("serial_number", ""))
             elif isinstance(item, Attachment) and item.name.endswith(SUFFIX):
-                text = item.data.decode("utf-8", "replace")
+                text = item.read().decode("utf-8", "replace")
                 calibration = loads(text, f"{series.name}: {item.name}")
                 known.versions.setdefault(calibration.hash, calibration)
                 known.first.setdefault(item.name.removesuffix(SUFFIX), calibration)
@@ -223,6 +230,7 @@ class Reprocessing:
                 self.sink,
                 journal=name in known.journals,
                 versions=versions,
+                states={b: s for b, s in known.states.items() if self._belongs(b, name)},
             )
         self._given = own
         self._numbers: dict[str, int] = {}
@@ -249,7 +257,24 @@ class Reprocessing:
                     data = saves(choice.calibration).encode()
                     name = f"{station.name}{SUFFIX}"
                     now = self.sink.wall.wall_ns(self.sink.now())
-                    output.attach(Attachment(name, "application/toml", now, now, data))
+                    output.attach(Attachment.of(name, "application/toml", now, now, data))
+
+    def check(self, series: Series) -> None:
+        """`ToolError`, exit code 1, when nothing came of the raw bytes of a port."""
+        for name, rerun in self.reruns.items():
+            boards = {
+                found[1]
+                for topic in self.sink.compare.before
+                if (found := find_topic(topic)) is not None and self._belongs(found[1], name)
+            }
+            made = any(station.sent for station in rerun.stations)
+            if rerun.chunks and not made and (boards or not rerun.exact):
+                raise ToolError(
+                    f"{series.name}: nothing can be made of the raw bytes of {name}: the file does "
+                    "not say which board sent them, and its beginning, in which the board does, is "
+                    "not here; give all files of the log",
+                    FAULTY,
+                )
 
     def summary(self, series: Series, given: list[BoardCalibration]) -> dict[str, str]:
         """What the new log says of how it was made."""
@@ -290,13 +315,13 @@ class Reprocessing:
             self._feed(found[0], found[1], item)
 
     def _is_of_ours(self, board: str) -> bool:
-        """Whether a board's messages will be made anew: on a bus its name has a number behind."""
-        return any(
-            board == name
-            or board.startswith(f"{name}-")
-            or board in (self._known.ports.get(name, RecordedPort(name)).nodes or {}).values()
-            for name in self.reruns
-        )
+        """Whether a board's messages will be made anew."""
+        return any(self._belongs(board, name) for name in self.reruns)
+
+    def _belongs(self, board: str, name: str) -> bool:
+        """Whether a board is one of port ``name``: on a bus its name has a number behind."""
+        nodes = self._known.ports.get(name, RecordedPort(name)).nodes or {}
+        return board == name or board.startswith(f"{name}-") or board in nodes.values()
 
     def _feed(self, topic: Topic, name: str, item: Record) -> None:
         rerun = self.reruns.get(name)

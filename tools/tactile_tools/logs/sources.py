@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from tactile_bus.log_reader import LogReader
 from tactile_bus.log_records import Block, LogError, MetadataRecord
-from tactile_tools.logs.terminal import ToolError
+from tactile_tools.logs.terminal import ToolError, complain
 
 FILE = "file"
 """Metadata record of our logs that says which file of which set this is."""
@@ -98,7 +97,7 @@ def _folder(folder: Path) -> list[_Place]:
         try:
             places.append(_place(path))
         except LogError as error:
-            print(f"tactile log: left out: {error}", file=sys.stderr)
+            complain(f"left out: {error}")
     if not places:
         raise ToolError(f"{folder} is a folder without a readable .mcap file; name one that has")
     return places

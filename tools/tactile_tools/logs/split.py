@@ -10,9 +10,9 @@ from typing import Any
 
 from tactile_bus.gaps import GAP
 from tactile_bus.instant import NS_PER_S
+from tactile_bus.latched import is_latched
 from tactile_bus.log_records import MetadataRecord
 from tactile_bus.options import finite_above_zero
-from tactile_bus.topics import find_topic
 from tactile_tools.logs.arguments import add_files, check_output, moment, size_bytes
 from tactile_tools.logs.sources import FILE, find_series
 from tactile_tools.logs.stream import (
@@ -21,14 +21,16 @@ from tactile_tools.logs.stream import (
     Reading,
     Record,
     Stream,
+    common_profile,
     first_ns,
     read_series,
 )
 from tactile_tools.logs.terminal import ToolError, bytes_text, cannot_write, plain_console, progress
 from tactile_tools.logs.writing import LogOutput
 
-STAYING = ("tf_static", "robot_description")
-"""Topics of other programs whose last message holds until the next."""
+REPEATED_BYTES = 1 << 20
+"""Attachments up to that size are in every part, so that each can be used alone; calibrations and
+configurations have kilobytes."""
 
 MAX_PARTS = 9999
 
@@ -36,8 +38,9 @@ MAX_PARTS = 9999
 def fill(parser: argparse.ArgumentParser) -> None:
     """Give ``tactile log split`` its arguments."""
     parser.description = (
-        "Write a log as several files, which the other tools take as one again. Each "
-        "has the attachments and tables of the log and the last values that hold."
+        "Write a log as several files, which the other tools take as one again, nothing twice. "
+        "Each begins with the tables, small attachments and latched messages that hold there, so "
+        "that it can be used alone."
     )
     add_files(parser)
     how = parser.add_mutually_exclusive_group(required=True)
@@ -81,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
         return check_output(path, options.force, logs)
 
     reading = Reading()
-    with progress("splitting") as report, Parts(place) as parts:
+    with progress("splitting") as report, Parts(place, common_profile(logs)) as parts:
         for item in read_series(logs[0], reading, report):
             if isinstance(item, Record):
                 while cuts and item.log_ns >= cuts[0]:
@@ -103,10 +106,11 @@ def run(options: argparse.Namespace) -> int:
 class Parts:
     """The files of a split; the next begins with what holds. A context manager."""
 
-    def __init__(self, place: Any) -> None:
+    def __init__(self, place: Any, profile: str) -> None:
         self.made: list[tuple[Path, int]] = []
         self.number = 0
         self._place = place
+        self._profile = profile
         self._identity = uuid.uuid4().hex
         self._tables: dict[str, MetadataRecord] = {}
         self._files: dict[str, Attachment] = {}
@@ -143,7 +147,8 @@ class Parts:
                 self._tables[item.name] = item
         elif isinstance(item, Attachment):
             output.attach(item)
-            self._files[item.name] = item
+            if item.size <= REPEATED_BYTES:
+                self._files[item.name] = Attachment.of(*item[:4], item.read())
         else:
             output.write(item)
             if self._stays(item.stream):
@@ -166,7 +171,7 @@ class Parts:
             self._output.write(record._replace(log_ns=log_ns))
 
     def _open(self) -> LogOutput:
-        output = LogOutput(self._place(self.number))
+        output = LogOutput(self._place(self.number), self._profile)
         output.metadata(FILE, {"set": self._identity, "file": str(self.number)})
         return output
 
@@ -184,7 +189,5 @@ class Parts:
     def _stays(self, stream: Stream) -> bool:
         stays = self._kept.get(stream)
         if stays is None:
-            found = find_topic(stream.topic)
-            named = stream.topic.rpartition("/")[2] in STAYING
-            stays = self._kept[stream] = named or (found is not None and found[0].latched)
+            stays = self._kept[stream] = is_latched(stream.topic, dict(stream.metadata))
         return stays

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+
+# Arrow's own pool keeps what it was given: 20 to 40 MB more for batches as small as these. It is
+# chosen when Arrow is first imported.
+os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
+
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
@@ -18,10 +24,18 @@ from tactile_tools.logs.stream import Record, Stream
 BATCH = 1024
 """Rows written at once: some MB of the widest topic (80 taxels); a Parquet row group has ten."""
 
-BATCH_BYTES = 8 << 20
-"""Encoded bytes after which a batch is written in any case."""
+BATCH_BYTES = 2 << 20
+"""Encoded bytes after which a batch is written in any case: as objects they take ten times that."""
+
+HELD_BYTES = 48 << 20
+"""Encoded bytes of the messages that wait in all tables together."""
+
+MESSAGE_BYTES = 500
+"""What a message is counted beside its bytes."""
 
 GROUP = 10
+GROUP_BYTES = 1 << 20
+"""Encoded bytes after which a row group of a Parquet file is written in any case."""
 
 OWN = ("time_s", "log_time_ns", "publish_time_ns", "log_sequence")
 """Columns in front: seconds since the start of the log, then what the log says of the message."""
@@ -34,6 +48,19 @@ NOTES = {
 }
 
 
+class Budget:
+    """What all tables of an export hold together; when it is spent, all are to write."""
+
+    def __init__(self, limit: int = HELD_BYTES) -> None:
+        self.held = 0
+        self._limit = limit
+
+    @property
+    def spent(self) -> bool:
+        """Whether more is held than may be."""
+        return self.held > self._limit
+
+
 class Table(Protocol):
     """A table being written; ``rows`` so far."""
 
@@ -41,6 +68,9 @@ class Table(Protocol):
 
     def add(self, record: Record, message: Any) -> None:
         """One more row."""
+
+    def relieve(self) -> None:
+        """Write what waits in memory."""
 
     def close(self) -> list[dict[str, str]]:
         """Write what is left; returns what its columns are."""
@@ -56,8 +86,10 @@ class ArrowTable:
         columns: list[Column],
         start_ns: int,
         widths: dict[str, int] | None,
+        budget: Budget,
     ) -> None:
         self.rows = 0
+        self._budget = budget
         self._path = path
         self._stream = stream
         self._start_ns = start_ns
@@ -69,6 +101,7 @@ class ArrowTable:
         self._messages: list[Any] = []
         self._bytes = 0
         self._batches: list[pa.RecordBatch] = []
+        self._group_bytes = 0
         self._writer: Any = None
         self._schema: pa.Schema | None = None
 
@@ -76,10 +109,18 @@ class ArrowTable:
         """One more row."""
         self._records.append((record.log_ns, record.publish_ns, record.sequence))
         self._messages.append(message)
-        self._bytes += len(record.data)
+        size = len(record.data) + MESSAGE_BYTES
+        self._bytes += size
+        self._budget.held += size
         self.rows += 1
         if len(self._messages) >= BATCH or self._bytes >= BATCH_BYTES:
             self._flush()
+
+    def relieve(self) -> None:
+        """Write what waits in memory."""
+        if self._messages:
+            self._flush()
+        self._write_group()
 
     def close(self) -> list[dict[str, str]]:
         """Write what is left; returns what its columns are."""
@@ -106,8 +147,11 @@ class ArrowTable:
         if self._schema is None:
             self._schema = self._with_notes(batch.schema)
         self._batches.append(batch.replace_schema_metadata(None))
+        self._group_bytes += self._bytes
+        self._budget.held -= self._bytes
         self._records, self._messages, self._bytes = [], [], 0
-        if self._widths is not None or len(self._batches) >= GROUP:
+        full = len(self._batches) >= GROUP or self._group_bytes >= GROUP_BYTES
+        if self._widths is not None or full:
             self._write_group()
 
     def _write_group(self) -> None:
@@ -125,13 +169,14 @@ class ArrowTable:
         if self._batches:
             table = pa.Table.from_batches([b.cast(schema) for b in self._batches], schema)
             self._writer.write_table(table)
-        self._batches = []
+        self._batches, self._group_bytes = [], 0
 
     def _own_arrays(self) -> tuple[list[str], list[pa.Array]]:
-        log = np.array([each[0] for each in self._records], np.int64)
-        sent = np.array([each[1] for each in self._records], np.int64)
+        log = np.array([each[0] for each in self._records], np.uint64)
+        sent = np.array([each[1] for each in self._records], np.uint64)
         sequence = np.array([each[2] for each in self._records], np.uint32)
-        seconds = (log - self._start_ns) / 1e9
+        start = self._start_ns  # may be later than a message, which unsigned numbers do not tell
+        seconds = np.array([(each[0] - start) / 1e9 for each in self._records])
         return list(self._own), [pa.array(each) for each in (seconds, log, sent, sequence)]
 
     def _arrays(self, column: Column) -> list[tuple[str, pa.Array]]:

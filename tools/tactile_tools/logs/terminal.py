@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import errno
+import json
 import math
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
 from tactile_bus.instant import NS_PER_S
 from tactile_bus.log_bytes import Progress as Report
@@ -33,9 +37,39 @@ class ToolError(Exception):
         self.code = code
 
 
+def shown(text: object, limit: int | None = None) -> str:
+    """A text that may come from anybody, safe to be printed on one line.
+
+    Control and format characters (which move the cursor, change colours or turn the direction of
+    writing) become escapes such as ``\\x1b``. ``limit``: letters after which it is cut, told.
+    """
+    text = str(text)
+    rest = 0 if limit is None else len(text) - limit
+    if rest > 0:
+        text = text[:limit]
+    if not text.isprintable():
+        text = "".join(c if c.isprintable() else _escape(c) for c in text)
+    return f"{text}… ({rest} more letters)" if rest > 0 else text
+
+
+def _escape(letter: str) -> str:
+    return letter.encode("unicode_escape", "backslashreplace").decode()
+
+
+NOT_IN_JSON = re.compile("[\x7f-\uffff]|[\U00010000-\U0010ffff]")
+
+
+def json_text(value: Any, **options: Any) -> str:
+    """JSON with letters as they are, but none that a terminal takes for a command."""
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, **options)
+    if text.isascii() and "\x7f" not in text:
+        return text
+    return NOT_IN_JSON.sub(lambda m: m[0] if m[0].isprintable() else json.dumps(m[0])[1:-1], text)
+
+
 def complain(text: str, code: int = BAD_ARGUMENT) -> int:
     """Say what is wrong; returns the exit code."""
-    print(f"tactile log: {text}", file=sys.stderr)
+    print(f"tactile log: {shown(text)}", file=sys.stderr)
     return code
 
 
@@ -51,6 +85,9 @@ def fail(error: LogError) -> int:
 
 def cannot_write(what: object, error: OSError) -> ToolError:
     """`ToolError` for an output that the system refuses, with the remedy."""
+    if error.errno == errno.EMFILE:
+        remedy = "take fewer topics at a time with --topic"
+        return ToolError(f"cannot write {what}: {error.strerror}; {remedy}", REFUSED)
     full = error.errno in (errno.ENOSPC, errno.EDQUOT)
     remedy = "make room, or name a place on another disk" if full else "name a place to write to"
     return ToolError(f"cannot write {what}: {error.strerror or error}; {remedy}", REFUSED)
@@ -69,10 +106,19 @@ def progress(what: str) -> Iterator[Report | None]:
         yield lambda done, size: bar.update(task, completed=done, total=size)
 
 
+class PlainConsole(Console):
+    """Prints texts on one line each, as they are: no markup, no emoji, escapes made visible."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print; a text may hold whatever a log does."""
+        safe = (Text(shown(each)) if isinstance(each, str) else each for each in objects)
+        super().print(*safe, **options)
+
+
 def plain_console() -> Console:
-    """Standard output; wide where it is no terminal, and texts of a log as they are."""
+    """Standard output; wide where it is not a terminal, and texts of a log safe to be seen."""
     width = None if sys.stdout.isatty() else PLAIN_WIDTH
-    return Console(width=width, soft_wrap=True, highlight=False, markup=False)
+    return PlainConsole(width=width, soft_wrap=True, highlight=False, markup=False, emoji=False)
 
 
 def clock_text(wall_ns: int) -> str:

@@ -96,9 +96,10 @@ class LogOutput:
         self._file.add_metadata(name, values)
 
     def attach(self, item: Attachment) -> None:
-        """Add a file within the file."""
-        self._file.add_attachment(
-            item.name, item.media_type, item.data, item.log_ns, item.create_ns
+        """Add a file within the file, a piece at a time."""
+        self._flush()
+        self._file.copy_attachment(
+            item.name, item.media_type, item.size, item.pieces(), item.log_ns, item.create_ns
         )
 
     def _define(self, stream: Stream) -> int:
