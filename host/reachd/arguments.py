@@ -10,6 +10,7 @@ from pathlib import Path
 from reachd.parameters import SETS
 from reachd.settings import DEFAULT_SET, DEFAULT_STRATEGY, DEFAULT_WAIT
 from reachd.strategies.registry import BUILT_IN
+from tactile_bus.arguments import Parser
 from tactile_bus.options import add_log_and_bus, finite_above_zero
 from tactile_bus.session import PORTS
 
@@ -30,7 +31,7 @@ moved.
 
 def make_parser() -> argparse.ArgumentParser:
     """Parser of the command line."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="reachd",
         usage="reachd --target X,Y [--strategy S] [option ...] | --serve [option ...]",
         description="Reaches for a target in a cluttered cupboard by touch: runs a strategy on the "

@@ -9,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from tactile_bus.arguments import Parser
 from tactile_bus.options import add_log_and_bus, finite_above_zero
 from tactile_bus.session import PORTS
 from tactiled.links.line import KINDS, board_kind
@@ -60,7 +61,7 @@ class _Port(argparse.Action):
 
 def make_parser() -> argparse.ArgumentParser:
     """Parser of the command line."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="tactiled",
         usage="tactiled --port P | --can SPEC | --mcap FILE | --config FILE [option ...]",
         description="Reads taxel boards and publishes and logs calibrated forces and contact "

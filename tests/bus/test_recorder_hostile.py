@@ -1,4 +1,4 @@
-"""Nothing that is handed over ends the log: it is refused, cut or marked, and counted (row 42, 43)."""
+"""Nothing that is handed over ends the log: it is refused or marked, and counted (rows 42, 43)."""
 
 from __future__ import annotations
 
