@@ -22,10 +22,10 @@ examples:
 
 The target is in m from the middle of the cupboard's front edge, x into the cupboard, y left.
 
-exit status: 0 target reached (--serve: ended in order); 1 not reached, or failed while running;
-2 bad argument or configuration; 3 refused by the environment: no features, no arm, an arm that
-refuses its limits or is not fit to be armed, a second reachd on the arm. With 2 and 3 nothing has
-moved.
+exit status: 0 target reached (--serve: ended in order); 1 not reached, or failed while running,
+or its log did; 2 bad argument or configuration; 3 refused by the environment: no features, no arm,
+an arm that refuses its limits or is not fit to be armed, a second reachd on the arm. With 2 and 3
+nothing has moved.
 """
 
 

@@ -38,8 +38,9 @@ boards that write in a way of their own are declared with
   lead=N   numbers of a text line before those of the chips
   lines=N  lines of one frame of text
 
-exit status: 0 done; 1 failed while running; 2 bad argument or configuration; 3 refused by the
-environment: port missing, busy or not permitted, no board or the wrong one, log not writable.
+exit status: 0 done; 1 failed while running, or the log did; 2 bad argument or configuration;
+3 refused by the environment: port missing, busy or not permitted, no board or the wrong one, log
+not writable.
 """
 
 
