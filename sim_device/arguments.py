@@ -13,6 +13,7 @@ from sensor_proto.anyskin_search import MAX_MAGNETOMETERS
 from sim_device.formats import SKETCHES
 from sim_device.slcan import DIALECTS
 from sim_device.world.engines import ENGINES
+from tactile_bus.arguments import Parser
 
 if TYPE_CHECKING:
     Commands = argparse._SubParsersAction[argparse.ArgumentParser]
@@ -46,7 +47,7 @@ twin (another chip's bits), dither (dead but for the last bits), hot (99 °C), i
 
 def make_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     """Parser whose result has the ``handler`` of its command, from ``handlers`` by name."""
-    parser = argparse.ArgumentParser(
+    parser: argparse.ArgumentParser = Parser(
         "simdevice",
         description="Simulated taxel boards on pseudo-terminals and CAN buses, on their own or on "
         "the finger of a simulated arm in a cupboard.",

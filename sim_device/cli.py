@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from sim_device.arguments import Handler, make_parser
+from tactile_bus.ending import leave
 
 if TYPE_CHECKING:
     from sim_device.cupboard_plan import CupboardRequest
@@ -28,7 +29,17 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; 0 done, 2 bad argument, 3 refused by the environment."""
+    """Run the command; 0 done, 2 bad argument, 3 refused by the environment.
+
+    Without ``argv`` this is the whole process, which then ends here.
+    """
+    code = _main(argv)
+    if argv is None:
+        leave(code)
+    return code
+
+
+def _main(argv: list[str] | None) -> int:
     handlers: dict[str, Handler] = {
         "boards": _boards,
         "cupboard": _cupboard,

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NoReturn
+
+from tactile_bus.toml_text import TomlError, parse, printable, read_text
+
+MAX_SCRIPT = 1 << 20
+"""Bytes of a script: real ones have a few kB."""
 
 
 class ScriptError(ValueError):
@@ -35,7 +39,7 @@ class Table:
         """Raise a `ScriptError` about ``key``."""
         line = self._lines.get(key, self._lines.get("", 0))
         place = f"{self._where}:{line}" if line else self._where
-        raise ScriptError(f"{place}: {key}: {problem}")
+        raise ScriptError(f"{place}: {printable(key)}: {printable(problem, 300)}")
 
     def take(self, key: str) -> object:
         """Raw value of ``key``; None when absent."""
@@ -113,17 +117,10 @@ class Table:
 def read_toml(path: Path) -> tuple[dict[str, object], str]:
     """Parsed TOML and its text; ScriptError for what cannot be read or parsed."""
     try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ScriptError(f"{path}: there is no such file") from None
-    except OSError as error:
-        raise ScriptError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ScriptError(f"{path}: is not UTF-8 text: {error.reason}") from error
-    try:
-        return tomllib.loads(text), text
-    except tomllib.TOMLDecodeError as error:
-        raise ScriptError(f"{path}: is no valid TOML: {error}") from error
+        text = read_text(path, MAX_SCRIPT)
+        return parse(text, str(path)), text
+    except TomlError as error:
+        raise ScriptError(str(error)) from error
 
 
 _HEADER = re.compile(r"\s*\[+\s*([A-Za-z0-9_.-]+)\s*\]+")

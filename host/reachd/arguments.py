@@ -10,6 +10,7 @@ from pathlib import Path
 from reachd.parameters import SETS
 from reachd.settings import DEFAULT_SET, DEFAULT_STRATEGY, DEFAULT_WAIT
 from reachd.strategies.registry import BUILT_IN
+from tactile_bus.arguments import Parser
 from tactile_bus.options import add_log_and_bus, finite_above_zero
 from tactile_bus.session import PORTS
 
@@ -21,16 +22,16 @@ examples:
 
 The target is in m from the middle of the cupboard's front edge, x into the cupboard, y left.
 
-exit status: 0 target reached (--serve: ended in order); 1 not reached, or failed while running;
-2 bad argument or configuration; 3 refused by the environment: no features, no arm, an arm that
-refuses its limits or is not fit to be armed, a second reachd on the arm. With 2 and 3 nothing has
-moved.
+exit status: 0 target reached (--serve: ended in order); 1 not reached, or failed while running,
+or its log did; 2 bad argument or configuration; 3 refused by the environment: no features, no arm,
+an arm that refuses its limits or is not fit to be armed, a second reachd on the arm. With 2 and 3
+nothing has moved.
 """
 
 
 def make_parser() -> argparse.ArgumentParser:
     """Parser of the command line."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="reachd",
         usage="reachd --target X,Y [--strategy S] [option ...] | --serve [option ...]",
         description="Reaches for a target in a cluttered cupboard by touch: runs a strategy on the "

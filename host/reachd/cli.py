@@ -21,6 +21,7 @@ from reachd.seam import Strategy
 from reachd.settings import Settings, SettingsError, make_settings
 from reachd.status import StatusLine
 from reachd.strategies import StrategyError, load_strategy
+from tactile_bus.ending import leave
 from tactile_bus.terminal import set_up_logging
 
 log = logging.getLogger(__name__)
@@ -35,7 +36,17 @@ HUNG = 20
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run reachd; returns the exit status: 0 reached, 1 not, 2 usage, 3 refused."""
+    """Run reachd; the exit status: 0 reached, 1 not, 2 usage, 3 refused.
+
+    Without ``argv`` this is the whole process, which then ends here.
+    """
+    code = _main(argv)
+    if argv is None:
+        leave(code)
+    return code
+
+
+def _main(argv: Sequence[str] | None) -> int:
     options = make_parser().parse_args(argv)
     console = Console(stderr=True)
     set_up_logging(console, verbose=options.verbose)
@@ -88,9 +99,7 @@ def _run(
     code = session.conclude(code)
     if not clean:
         log.warning("a thread did not end in time; leaving without it")
-        logging.shutdown()
-        sys.stdout.flush()
-        os._exit(code)
+        leave(code)
     return code
 
 
@@ -135,6 +144,9 @@ class _Session:
             cycle = daemon.loop.last
             why = "" if cycle is None else cycle.status.text
             print(f"reachd: no reach: {why or 'told to stop before it began'}", file=sys.stderr)
+        if daemon.recorder is not None and (problem := daemon.recorder.trouble) is not None:
+            print(f"reachd: {problem}", file=sys.stderr)
+            return FAILED if code == REACHED else code
         return code
 
     def _ended(self) -> bool:

@@ -16,6 +16,7 @@ import platform
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -114,8 +115,13 @@ class Daemon:
 
     def start(self) -> None:
         """Bring everything up, disarmed; `StartError`, and all down again, when that cannot be."""
+        if self._wall.problem:
+            log.warning("%s", self._wall.problem)
         try:
             self._start()
+        except zenoh.ZError as error:
+            self.stop()
+            raise StartError(f"the bus has closed by itself: {error}") from error
         except (LockError, BusError, RecorderError, ArmError) as error:
             self.stop()
             raise StartError(str(error)) from error
@@ -153,7 +159,9 @@ class Daemon:
             settings.strategy,
             self.fail,
         )
-        self._requests = OperatorRequests(self.loop, self._arm, settings.parameters, self._reporter)
+        self._requests = OperatorRequests(
+            self.loop, self._arm, settings.parameters, self._reporter, self._log_trouble
+        )
         # What lives now is taken out of the collector's sight, which must not stop the loop.
         gc.collect()
         gc.freeze()
@@ -241,18 +249,33 @@ class Daemon:
                 log.log(level, "log %s: %s %s", stats.path, stats.state, stats.last_error)
         cycle, now = self.loop.last, monotonic_now()
         if self._listener is not None and cycle is not None and cycle.inputs.touch is not None:
-            self._listener.ask_geometry()
+            try:
+                self._listener.ask_geometry()
+            except zenoh.ZError as error:  # a picture less in the log
+                log.debug("the geometry of the board cannot be asked for: %s", error)
         if not self.moving and seconds_between(self._collected, now) > COLLECT_EVERY:
             self._collected = now
             gc.collect()
 
+    def _log_trouble(self) -> str | None:
+        """Why the log that was asked for is not being written."""
+        if self.recorder is None:
+            return None
+        stats = self.recorder.stats
+        if stats.state == "recording":
+            return None
+        return (
+            f"the log {stats.path} is not being written ({stats.state}: {stats.last_error}): mend "
+            "that, or start reachd with --no-log"
+        )
+
     def stop(self) -> bool:
         """End in order: zero twist, services, reports, log (at most 1 s), arm, bus, lock.
 
-        False when a thread is still inside somebody's code: the interpreter must then not be taken
-        down under it, which would abort the process.
+        Nothing publishes once the session closes, which it does last. False when a thread is still
+        inside somebody's code: it must then be left behind.
         """
-        clean = self.loop.stop(STOP_TIMEOUT)
+        clean = ended = self.loop.stop(STOP_TIMEOUT)
         if self._services is not None:
             self._services.close()
         if self._listener is not None:
@@ -263,10 +286,11 @@ class Daemon:
             self.recorder.metadata("lateness", _texts(self.loop.lateness.summary()))
             if not self.recorder.close():
                 log.error("the log was not closed in time; see `tactile log recover`")
-        if self._arm is not None and clean:
-            self._arm.close()
-        if self._touch is not None:
-            self._touch.close()
+                clean = False
+        for part in (self._arm if ended else None, self._touch):
+            with suppress(zenoh.ZError):  # the session has closed by itself
+                if part is not None:
+                    part.close()
         if self._session is not None:
             clean &= close_session(self._session)
             self._session = None
@@ -286,6 +310,8 @@ class Daemon:
             "features": {} if touch is None else touch.counters(),
             "arm_state": {} if arm is None else arm.counters(),
             "reports_dropped": 0 if self._reporter is None else self._reporter.dropped,
+            "reports_unsent": 0 if self._reporter is None else self._reporter.unsent,
+            "clock_problem": self._wall.problem,
         }
         # Asked themselves, for the last cycle may be older than a request that was just granted.
         status = self.loop.controller.supervisor.status(monotonic_now())

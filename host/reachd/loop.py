@@ -190,7 +190,7 @@ class ControlLoop:
             work, future = self._calls.popleft()
             try:
                 future.set_result(work(monotonic_now()))
-            except (ValueError, TypeError) as error:
+            except Exception as error:  # noqa: BLE001 - whoever asked is told; the loop goes on
                 future.set_exception(error)
 
     def _halt(self) -> None:

@@ -40,12 +40,19 @@ class OperatorRequests:
     """Arm, reach, stop and reset; from any thread but the control loop's. Raise `RefusedError`."""
 
     def __init__(
-        self, loop: ControlLoop, arm: Arm, parameters: Parameters, reporter: Reporter
+        self,
+        loop: ControlLoop,
+        arm: Arm,
+        parameters: Parameters,
+        reporter: Reporter,
+        log_trouble: Callable[[], str | None] = lambda: None,
     ) -> None:
+        """``log_trouble``: why the log that was asked for is not being written, None if it is."""
         self._loop = loop
         self._arm = arm
         self._parameters = parameters
         self._reporter = reporter
+        self._log_trouble = log_trouble
         self._arming = threading.Lock()
 
     def arm(self, *, free_air: bool = True) -> None:
@@ -69,7 +76,14 @@ class OperatorRequests:
     def reach(
         self, x: float, y: float, radius: float | None = None, time_limit: float | None = None
     ) -> Goal:
-        """Begin a trial. `SettingError` for a goal that cannot be."""
+        """Begin a trial. `SettingError` for a goal that cannot be.
+
+        Without the log that was asked for none begins; one that is under way when the log fails
+        goes on.
+        """
+        trouble = self._log_trouble()
+        if trouble is not None:
+            raise RefusedError(trouble)
         goal = make_goal(x, y, self._parameters, radius=radius, time_limit=time_limit)
         text = f"{x:g}, {y:g} m, radius {goal.radius:g} m, {goal.time_limit:g} s"
         self._granted(lambda now: self._loop.controller.reach(goal, now))

@@ -10,6 +10,7 @@ import math
 import queue
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,12 +25,17 @@ from tactile_bus.instant import Instant, WallClock, monotonic_now
 from tactile_bus.messages import MSG, codec, header
 from tactile_bus.recorder import Recorder
 from tactile_bus.streams import declare_publisher
+from tactile_bus.throttle import Throttle
+from tactile_bus.toml_text import printable
 from tactile_bus.topics import COMMAND, REACH_EVENT, REACH_STATE, Topic
 
 log = logging.getLogger(__name__)
 
 MAX_WAITING = 1000
 """Cycles and events that may wait for the thread: ten seconds' worth; then the oldest go."""
+
+MAX_TEXT = 1000
+"""Characters of an event's text; some of it comes from whoever asks for a stop."""
 
 NO_TWIST = Twist(math.nan, math.nan, math.nan)
 """Shown as wanted where the strategy gave none."""
@@ -59,6 +65,11 @@ class Reporter:
         failed: Callable[[BaseException], None],
     ) -> None:
         self.dropped = 0
+        self.unsent = 0
+        """Messages that could not be encoded, or that the bus did not take."""
+        self._ended = False
+        self._publishing = threading.Lock()
+        self._complaints = Throttle(rate=0.1, burst=3)
         self._recorder = recorder
         self._wall = wall
         self._name = name
@@ -87,13 +98,19 @@ class Reporter:
         self._put(Event(monotonic_now() if at is None else at, kind, code, text))
 
     def close(self, timeout: float = 0.5) -> bool:
-        """Report what waits and end; False when that takes longer than ``timeout`` s."""
+        """Report what waits and end; False when that takes longer than ``timeout`` s.
+
+        Either way nothing is published after it.
+        """
         self._queue.put(None)
         self._thread.join(timeout)
+        with self._publishing:
+            self._ended = True
         if self._thread.is_alive():
             return False
         for publisher in self._publishers.values():
-            publisher.close()
+            with suppress(zenoh.ZError):  # the session has closed by itself
+                publisher.close()
         return True
 
     def _put(self, item: tuple[int, Cycle] | Event) -> None:
@@ -110,12 +127,20 @@ class Reporter:
     def _run(self) -> None:
         try:
             while (item := self._queue.get()) is not None:
-                if isinstance(item, Event):
-                    self._send_event(item)
-                else:
-                    self._send_cycle(*item)
+                try:
+                    if isinstance(item, Event):
+                        self._send_event(item)
+                    else:
+                        self._send_cycle(*item)
+                except Exception as error:  # noqa: BLE001 - one report must not end the others
+                    self._note_unsent(error)
         except BaseException as error:  # noqa: BLE001 - thread boundary: the daemon must end loudly
             self._failed(error)
+
+    def _note_unsent(self, error: Exception) -> None:
+        self.unsent += 1
+        if self._complaints.allow(monotonic_now()):
+            log.error("a report could not be sent, %d so far", self.unsent, exc_info=error)
 
     def _send_cycle(self, sequence: int, cycle: Cycle) -> None:
         now, status = cycle.now, cycle.status
@@ -167,16 +192,17 @@ class Reporter:
 
     def _send_event(self, event: Event) -> None:
         wall_ns = self._wall.wall_ns(event.at)
-        message = MSG.ReachEvent(
-            header(wall_ns, FRAME), event.at, event.kind, event.code, event.text
-        )
+        text = printable(event.text, MAX_TEXT)
+        message = MSG.ReachEvent(header(wall_ns, FRAME), event.at, event.kind, event.code, text)
         self._send(REACH_EVENT, message, wall_ns)
         log.debug("%s %s %s", event.kind, event.code, event.text)
 
     def _send(self, topic: Topic, message: Any, wall_ns: int) -> None:
         data = self._codec.encode(topic, message)
-        self._publishers[topic.template].put(data, wall_ns)
         self._record(topic, self._name, data, wall_ns)
+        with self._publishing:
+            if not self._ended:
+                self._publishers[topic.template].put(data, wall_ns)
 
     def _record(self, topic: Topic, name: str, data: bytes, wall_ns: int) -> None:
         if self._recorder is not None:

@@ -11,7 +11,11 @@ import zenoh
 from reachd.fields import SettingError
 from reachd.operator_requests import OperatorRequests, RefusedError
 from tactile_bus.services import Service, ServiceError, declare_service
+from tactile_bus.toml_text import printable
 from tactile_bus.topics import service_key
+
+MAX_REASON = 200
+"""Characters of a reason that are kept: it is shown to people and logged."""
 
 
 class Nothing(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -77,7 +81,8 @@ class ReachServices:
         return {"x": goal.x, "y": goal.y, "radius": goal.radius, "time_limit": goal.time_limit}
 
     def _stop(self, request: StopRequest) -> dict[str, Any]:
-        self._granted(lambda: self._requests.stop(request.reason))
+        reason = printable(request.reason, MAX_REASON)
+        self._granted(lambda: self._requests.stop(reason))
         return self._status()
 
     def _reset(self, _: Nothing) -> dict[str, Any]:

@@ -6,7 +6,6 @@ Floats are written as their shortest exact decimals, so a file gives back the ve
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from tactile_bus.calibration_types import (
 )
 from tactile_bus.geometry import ArrayGeometry, Side
 from tactile_bus.net_file import net_lines, read_net
+from tactile_bus.toml_text import TomlError, parse, read_text
 
 Float = NDArray[np.float64]
 
@@ -32,6 +32,8 @@ is not known. A file is written in the oldest version that holds what it says.""
 SUFFIX = ".cal.toml"
 MAX_FILE_BYTES = 64 * 1024 * 1024
 """Four arrays of 128 taxels with every coupling block come to about 13 MB of text."""
+WHOLLY_FOREIGN = 1 << 16
+"""Bytes within which a calibration says what it is: 64 MB of what is not take minutes."""
 MAX_TAXELS = 128
 """Largest array of the wire protocol."""
 ORTHONORMAL_TOLERANCE = 1e-6
@@ -55,17 +57,10 @@ def save(calibration: BoardCalibration, path: Path | str) -> None:
 
 def load(path: Path | str) -> BoardCalibration:
     """Calibration in the file ``path``; `CalibrationError` names file, key, given and allowed."""
-    path = Path(path)
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise CalibrationError(f"{path}: larger than {MAX_FILE_BYTES} bytes: no calibration")
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise CalibrationError(f"{path}: not a text file, so not a {SUFFIX} file") from error
-    except OSError as error:
-        raise CalibrationError(
-            f"{path}: cannot be read ({error.strerror}); give the path of a {SUFFIX} file"
-        ) from error
+        text = read_text(path, MAX_FILE_BYTES)
+    except TomlError as error:
+        raise CalibrationError(f"{error}: a {SUFFIX} file") from error
     return loads(text, str(path))
 
 
@@ -92,10 +87,12 @@ def saves(calibration: BoardCalibration) -> str:
 
 def loads(text: str, source: str = "calibration") -> BoardCalibration:
     """Calibration from the text of a file; ``source`` names it in errors."""
+    if len(text) > WHOLLY_FOREIGN and FORMAT_NAME not in text[:WHOLLY_FOREIGN]:
+        raise CalibrationError(f"{source}: not a calibration: it does not say {FORMAT_NAME!r}")
     try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise CalibrationError(f"{source}: not TOML: {error}") from error
+        table = parse(text, source)
+    except TomlError as error:
+        raise CalibrationError(str(error)) from error
     top = Table(source, "", table)
     if top.text("format") != FORMAT_NAME:
         raise top.wrong("format", table["format"], repr(FORMAT_NAME))
@@ -105,7 +102,7 @@ def loads(text: str, source: str = "calibration") -> BoardCalibration:
             f"{source}: format_version is {version}, newer than {FORMAT_VERSION}, the newest that "
             f"this program reads; update it, or save the calibration in version {FORMAT_VERSION}"
         )
-    serial, model, frame = top.text("serial_number"), top.text("model"), top.text("frame")
+    serial, model, frame = top.word("serial_number"), top.word("model"), top.word("frame")
     created, provenance = top.text("created"), top.text("provenance")
     nominal = top.take("nominal")
     if not isinstance(nominal, bool):
@@ -164,7 +161,7 @@ def _array_lines(array: ArrayCalibration) -> Iterable[str]:
 
 
 def _read_array(table: Table) -> ArrayCalibration:
-    name = table.text("name")
+    name = table.word("name")
     side = table.text("side")
     if side not in _SIDES:
         raise table.wrong("side", side, "one of " + ", ".join(_SIDES))

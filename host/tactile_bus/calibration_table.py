@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bus.calibration_types import CalibrationError
+from tactile_bus.toml_text import printable
 
 Float = NDArray[np.float64]
 
@@ -50,8 +51,7 @@ class Table:
     def wrong(self, key: str, given: object, allowed: str) -> CalibrationError:
         """What to raise for ``key``."""
         shown = repr(given) if not isinstance(given, str) or not given else given
-        if len(shown) > 80:
-            shown = shown[:77] + "..."
+        shown = printable(shown, 80)
         return CalibrationError(
             f"{self._source}: {self._prefix}{key} is {shown}; allowed: {allowed}"
         )
@@ -65,7 +65,7 @@ class Table:
     def done(self) -> None:
         """Refuse keys that nobody took."""
         if self._values:
-            unknown = ", ".join(f"{self._prefix}{key}" for key in self._values)
+            unknown = printable(", ".join(f"{self._prefix}{key}" for key in self._values), 200)
             raise CalibrationError(
                 f"{self._source}: unknown key {unknown}; no calibration file has one of that name"
             )
@@ -75,6 +75,13 @@ class Table:
         value = self.take(key)
         if not isinstance(value, str) or not value:
             raise self.wrong(key, value, "a text that is not empty")
+        return value
+
+    def word(self, key: str) -> str:
+        """A text that is not empty and can be shown: messages name boards by such."""
+        value = self.text(key)
+        if not value.isprintable():
+            raise self.wrong(key, value, "printable characters")
         return value
 
     def integer(self, key: str, low: int, high: int) -> int:

@@ -9,8 +9,6 @@ from __future__ import annotations
 import difflib
 import math
 import re
-import tomllib
-from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
 from types import GenericAlias
@@ -22,6 +20,16 @@ from msgspec import inspect as types
 
 from tactile_bus.toml_lines import Path as KeyPath
 from tactile_bus.toml_lines import key_lines
+from tactile_bus.toml_text import (
+    SHOWN,
+    TomlError,
+    dotted,
+    leaves,
+    line_of,
+    parse,
+    printable,
+    read_text,
+)
 
 T = TypeVar("T")
 
@@ -38,7 +46,6 @@ MAX_CONFIG = 1 << 20
 
 LOCATION = re.compile(r" - at `(key in )?\$(.*)`$")
 STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+|\.\.\.)\]")
-TOML_LINE = re.compile(r" \(at line (\d+), column \d+\)$")
 
 
 class ConfigError(Exception):
@@ -49,33 +56,19 @@ def load_toml(path: Path | str, kind: type[T]) -> T:
     """Read ``path`` as a ``kind`` (a msgspec struct). `ConfigError` for anything wrong with it."""
     path = Path(path)
     try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_CONFIG + 1)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; name a TOML file that can be read") from error
-    if len(raw) > MAX_CONFIG:
-        raise ConfigError(f"{path}: over {MAX_CONFIG} bytes; this is no configuration file")
-    try:
-        text = raw.decode()
-    except UnicodeDecodeError as error:
-        line = raw.count(b"\n", 0, error.start) + 1
-        raise ConfigError(f"{path}:{line}: not UTF-8 text; TOML must be") from error
-    return parse_toml(text, kind, str(path))
+        return parse_toml(read_text(path, MAX_CONFIG), kind, str(path))
+    except TomlError as error:
+        raise ConfigError(str(error)) from error
 
 
 def parse_toml(text: str, kind: type[T], name: str = "configuration") -> T:
     """Like `load_toml`, from a text; ``name`` stands for the file in messages."""
     try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        message = str(error)
-        match = TOML_LINE.search(message)
-        line = match.group(1) if match else str(text.count("\n") + 1)
-        raise ConfigError(f"{name}:{line}: {TOML_LINE.sub('', message)}") from error
-    except RecursionError as error:
-        raise ConfigError(f"{name}: nested too deeply") from error
+        data = parse(text, name)
+    except TomlError as error:
+        raise ConfigError(str(error)) from error
     lines = key_lines(text)
-    for keys, value in _leaves(data, ()):
+    for keys, value in leaves(data):
         if isinstance(value, float) and not math.isfinite(value):
             allowed = _allowed(_type_at(types.type_info(kind), keys))
             raise ConfigError(_message(name, lines, keys, value, allowed))
@@ -86,18 +79,6 @@ def parse_toml(text: str, kind: type[T], name: str = "configuration") -> T:
         return msgspec.convert(data, kind, strict=True)
     except msgspec.ValidationError as error:
         raise ConfigError(_explain(error, name, lines, data, kind)) from error
-
-
-def _leaves(value: Any, keys: KeyPath) -> Iterator[tuple[KeyPath, Any]]:
-    """Every value that is no table or array, with its path."""
-    if isinstance(value, dict):
-        for key, item in value.items():
-            yield from _leaves(item, (*keys, key))
-    elif isinstance(value, list):
-        for index, item in enumerate(value):
-            yield from _leaves(item, (*keys, index))
-    else:
-        yield keys, value
 
 
 def _explain(
@@ -114,8 +95,8 @@ def _explain(
     missing = re.fullmatch(r"Object missing required field `(.+)`", reason)
     if missing is not None:
         wanted = _allowed(_type_at(types.type_info(kind), (*keys, missing.group(1))))
-        where = f"{name}:{_line(lines, keys)}"
-        return f"{where}: {_dotted((*keys, missing.group(1)))} is missing; it must be {wanted}"
+        where = f"{name}:{line_of(lines, keys)}"
+        return f"{where}: {dotted((*keys, missing.group(1)))} is missing; it must be {wanted}"
     keys = _resolve(keys, data, kind)
     value = _value_at(data, keys)
     allowed = _allowed(_type_at(types.type_info(kind), keys))
@@ -171,26 +152,11 @@ LIMITS = ("gt", "ge", "lt", "le", "multiple_of", "pattern", "min_length", "max_l
 
 def _message(name: str, lines: dict[KeyPath, int], keys: KeyPath, value: Any, allowed: str) -> str:
     given = str(value).lower() if isinstance(value, bool | float) else _shown(value)
-    return f"{name}:{_line(lines, keys)}: {_dotted(keys)} = {given}; allowed: {allowed}"
+    return f"{name}:{line_of(lines, keys)}: {dotted(keys)} = {given}; allowed: {allowed}"
 
 
 def _shown(value: Any) -> str:
-    text = f'"{value}"' if isinstance(value, str) else str(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _dotted(keys: KeyPath) -> str:
-    text = ""
-    for key in keys:
-        text += f"[{key}]" if isinstance(key, int) else f".{key}" if text else str(key)
-    return text
-
-
-def _line(lines: dict[KeyPath, int], keys: KeyPath) -> int:
-    """Line of a key, or of the nearest thing around it."""
-    while keys and keys not in lines:
-        keys = keys[:-1]
-    return lines.get(keys, 1)
+    return printable(f'"{value}"' if isinstance(value, str) else str(value))
 
 
 def _value_at(data: Any, keys: KeyPath) -> Any:
@@ -203,10 +169,10 @@ def _unknown_message(
     name: str, lines: dict[KeyPath, int], keys: KeyPath, allowed: list[str]
 ) -> str:
     key = str(keys[-1])
-    near = difflib.get_close_matches(key, allowed, 1)
+    near = difflib.get_close_matches(key[:SHOWN], allowed, 1)
     hint = f" (did you mean {near[0]}?)" if near else ""
-    where = f"{name}:{_line(lines, keys)}"
-    return f"{where}: unknown key {_dotted(keys)}{hint}; allowed: {', '.join(sorted(allowed))}"
+    where = f"{name}:{line_of(lines, keys)}"
+    return f"{where}: unknown key {dotted(keys)}{hint}; allowed: {', '.join(sorted(allowed))}"
 
 
 def _unknown(data: Any, info: types.Type | None, keys: KeyPath) -> tuple[KeyPath, list[str]] | None:

@@ -12,6 +12,12 @@ DROPPED = "dropped:"
 """Keys of a gap record that start so count the messages one channel lost."""
 
 
+MAX_CHANNELS = 64
+"""Channels that one gap record names; what others lost is counted under `OTHERS`."""
+
+OTHERS = "others"
+
+
 @dataclass(slots=True)
 class Gap:
     """Losses of one kind. ``first_ns`` to ``last_ns``: wall-clock times it covers, ends included.
@@ -24,6 +30,13 @@ class Gap:
     messages: int = 0
     detail: str = ""
     channels: dict[str, int] = field(default_factory=dict)
+
+    def count(self, channel: str, messages: int) -> None:
+        """Add what one channel lost."""
+        self.messages += messages
+        if channel not in self.channels and len(self.channels) >= MAX_CHANNELS:
+            channel = OTHERS
+        self.channels[channel] = self.channels.get(channel, 0) + messages
 
     def cover(self, first_ns: int, last_ns: int) -> None:
         """Stretch over another span."""
@@ -60,12 +73,11 @@ class Gaps:
     def __delitem__(self, reason: str) -> None:
         del self._gaps[reason]
 
-    def count(self, reason: str, channel: str, log_ns: int) -> None:
-        """One message of ``channel`` was lost."""
+    def count(self, reason: str, channel: str, log_ns: int, messages: int = 1) -> None:
+        """One message of ``channel`` was lost, or several at about that time."""
         gap = self._gaps.setdefault(reason, Gap(log_ns, log_ns))
         gap.cover(log_ns, log_ns)
-        gap.messages += 1
-        gap.channels[channel] = gap.channels.get(channel, 0) + 1
+        gap.count(channel, messages)
 
     def note(self, reason: str, detail: str, now_ns: int) -> None:
         """Something went wrong at ``now_ns``, whether or not messages are lost by it."""
@@ -78,7 +90,6 @@ class Gaps:
         for reason, gap in other._gaps.items():
             mine = self._gaps.setdefault(reason, Gap(gap.first_ns, gap.last_ns))
             mine.cover(gap.first_ns, gap.last_ns)
-            mine.messages += gap.messages
             mine.detail = gap.detail or mine.detail
             for channel, count in gap.channels.items():
-                mine.channels[channel] = mine.channels.get(channel, 0) + count
+                mine.count(channel, count)

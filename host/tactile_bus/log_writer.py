@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import struct
 import time
 import uuid
 from collections.abc import Callable, Iterable
@@ -21,6 +22,9 @@ from tactile_bus.retention import LogSet, enforce
 from tactile_bus.topics import Topic
 
 log = logging.getLogger(__name__)
+
+WRITER_FAILED = "writer_failed"
+"""Reason of what is lost when writing fails for no fault of the disk."""
 
 RETRY_MAX = 10.0
 """s: longest pause between attempts to open a file again."""
@@ -78,6 +82,7 @@ class LogWriter:
 
     When a file cannot be written on, the chunk in hand is kept for the next file, which begins
     with a gap record; `blocked` says so, and whoever feeds the writer must hold on to the rest.
+    Whatever else goes wrong costs what is in hand, which is counted, and the next file begins.
     """
 
     def __init__(
@@ -93,6 +98,8 @@ class LogWriter:
         self.errors = 0
         self.written = 0
         self.files = 0
+        self.lost = 0
+        """Messages counted in ``gaps`` here, for `WRITER_FAILED`."""
         self.gaps = Gaps()
         self._set = log_set
         self._settings = settings
@@ -166,28 +173,53 @@ class LogWriter:
                 self._set.advance()
         enforce(self._set, self._settings.max_files, self._settings.max_bytes)
 
-    def add(self, item: Item) -> None:
-        """Take one message into the chunk to come; flushes when that is full."""
+    def add(self, item: Item) -> bool:
+        """Take one message into the chunk to come; flushes when that is full.
+
+        False, and nothing else, for a message that no record can hold.
+        """
         channel = item.channel
+        try:
+            self._chunk.add(channel.number, item.sequence, item.log_ns, item.publish_ns, item.data)
+        except (struct.error, OverflowError, TypeError, ValueError):
+            return False
         self._channels[channel.number] = channel
         if channel.topic.latched and (
             channel.number in self._latched or len(self._latched) < LATCHED_MAX
         ):
             self._new_latched[channel.number] = item
-        self._chunk.add(channel.number, item.sequence, item.log_ns, item.publish_ns, item.data)
         if len(self._chunk.data) >= self._settings.chunk_bytes:
             self.flush()
+        return True
 
     def flush(self, last: bool = False) -> None:
         """Write all that waits. ``last``: try at once, without the pause after a failure."""
-        if self._pending is None and self._chunk.messages:
-            self._pending = self._chunk.seal(self._compressor)
-            self._chunk = ChunkBuffer()
         try:
+            if self._pending is None and self._chunk.messages:
+                self._pending = self._chunk.seal(self._compressor)
+                self._chunk = ChunkBuffer()
             if self._ready(last):
                 self._write_waiting()
         except OSError as error:
             self._fail(error)
+        except Exception as error:  # noqa: BLE001 - whatever it is, the log goes on without this
+            self.give_up(error)
+
+    def give_up(self, error: Exception) -> None:
+        """Count what is in hand as lost, leave the file, and go on with the next one."""
+        now_ns = self._now_ns()
+        counts = {c: len(times) // 2 for c, times in self._chunk.index.items()}
+        for held in (counts, self._pending.counts if self._pending else {}):
+            for number, messages in held.items():
+                channel = self._channels.get(number)
+                name = "unknown" if channel is None else channel.path
+                self.gaps.count(WRITER_FAILED, name, now_ns, messages)
+                self.lost += messages
+        self._pending, self._chunk, self._new_latched = None, ChunkBuffer(), {}
+        if self._file is not None:
+            self._file.forget()
+        log.error("log: the writer failed", exc_info=error)
+        self._leave(WRITER_FAILED, f"{type(error).__name__}: {error}", "going on in another file")
 
     def finish(self) -> None:
         """Finish the file after the last flush; ``state`` is closed unless something went wrong."""
@@ -195,6 +227,8 @@ class LogWriter:
             self._end_file()
         except OSError as error:
             self._fail(error)
+        except Exception as error:  # noqa: BLE001 - whatever it is, it must be told
+            self.give_up(error)
         if not self.waiting and self.state == "recording":
             self.state = "closed"
 
@@ -205,6 +239,8 @@ class LogWriter:
             return False
         if now - self._space_checked >= SPACE_PERIOD or self._file is None:
             self._space_checked = now
+            if self._file is not None and not self._file.path.exists():
+                raise OSError(errno.ENOENT, "it was deleted or moved while it was written")
             if self._storage.free(self._set.directory) < self._settings.min_free_bytes:
                 self._stop_for_space()
                 return False
@@ -221,6 +257,7 @@ class LogWriter:
         return self._file is not None
 
     def _open_next(self) -> None:
+        self._set.directory.mkdir(parents=True, exist_ok=True)  # it may have been deleted, too
         while True:
             try:
                 self._open()
@@ -243,13 +280,13 @@ class LogWriter:
             started_ns = str(self._now_ns())
             place = {"set": self._identity, "file": str(self.files), "started_ns": started_ns}
             file.add_metadata("file", place)
-            for write in self._extras.values():
-                write(file)
+            for extra in tuple(self._extras):
+                self._write_extra(extra, file)
             self._in_file = set()
             self._define(file, self._channels)
             file.commit()
             file.sync()
-        except OSError:
+        except Exception:
             file.abandon()
             raise
         self._in_file = set(self._channels)
@@ -263,8 +300,8 @@ class LogWriter:
         file, pending = self._file, self._pending
         if file is None:
             return
-        for extra in self._unwritten:
-            self._extras[extra](file)
+        for extra in tuple(self._unwritten):
+            self._write_extra(extra, file)
         for reason in self.gaps:
             file.add_metadata(GAP, self.gaps[reason].metadata(reason))
         if pending is not None:
@@ -283,6 +320,19 @@ class LogWriter:
         if now + self._settings.flush_period - self._synced > SYNC_PERIOD:
             file.sync()
             self._synced = now
+
+    def _write_extra(self, extra: tuple[str, str], file: McapFile) -> None:
+        """Stage a table or an attachment; one that cannot be written is left out for good."""
+        write = self._extras.get(extra)
+        if write is None:
+            return
+        try:
+            write(file)
+        except Exception as error:  # noqa: BLE001 - one table must not keep every file from opening
+            del self._extras[extra]
+            self.errors += 1
+            self.last_error = f"the {extra[0]} {extra[1]!r} cannot be written: {error}"
+            log.error("log: %s", self.last_error)
 
     def _define(self, file: McapFile, numbers: Iterable[int]) -> None:
         """Stage the schemas and channels that this file does not have yet."""
@@ -342,6 +392,8 @@ class LogWriter:
                 self._end_file()
         except OSError as error:
             log.error("log: %s is left without a summary: %s", self.path, error.strerror)
+        except Exception as error:  # noqa: BLE001 - the file is closed; the next one must begin
+            log.error("log: %s is left without a summary: %s", self.path, error)
         self._set.advance()
         self._retry_at = time.monotonic() + self._retry_pause
         self._retry_pause = min(self._retry_pause * 2, RETRY_MAX)

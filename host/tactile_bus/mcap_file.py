@@ -95,7 +95,8 @@ class DiskStorage:
 
 
 def _string(text: str) -> bytes:
-    data = text.encode()
+    # The name of a file may hold what UTF-8 has no bytes for.
+    data = text.encode("utf-8", "backslashreplace")
     return struct.pack("<I", len(data)) + data
 
 
@@ -121,7 +122,12 @@ class ChunkBuffer:
         self.end_ns = 0
 
     def add(self, channel: int, sequence: int, log_ns: int, publish_ns: int, data: bytes) -> None:
-        """Append one message; channel ids and sequence numbers as in the MCAP records."""
+        """Append one message; channel ids and sequence numbers as in the MCAP records.
+
+        struct.error, and nothing appended, for numbers that a record cannot hold.
+        """
+        size = MESSAGE_FIXED + len(data)
+        head = MESSAGE_HEAD.pack(MESSAGE, size, channel, sequence, log_ns, publish_ns)
         times = self.index.get(channel)
         if times is None:
             times = self.index[channel] = array("Q")
@@ -134,8 +140,7 @@ class ChunkBuffer:
         elif log_ns < self.start_ns:
             self.start_ns = log_ns
         self.messages += 1
-        size = MESSAGE_FIXED + len(data)
-        self.data += MESSAGE_HEAD.pack(MESSAGE, size, channel, sequence, log_ns, publish_ns)
+        self.data += head
         self.data += data
 
     def seal(self, compressor: zstandard.ZstdCompressor) -> SealedChunk:
@@ -316,6 +321,10 @@ class McapFile:
             self.sync()
         finally:
             self._storage.close(self._fd)
+
+    def forget(self) -> None:
+        """Drop what is staged and was not committed."""
+        self._staged = []
 
     def abandon(self) -> None:
         """Close without a summary: every record so far stays readable."""

@@ -20,7 +20,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.base import TypesysError
 
-from tactile_bus.instant import NS_PER_S
+from tactile_bus.instant import NS_PER_S, STAMP_END_NS
 from tactile_bus.topics import Topic
 
 MAX_PAYLOAD = 65536
@@ -258,7 +258,13 @@ def message_class(msgtype: str) -> Any:
 
 
 def stamp(wall_ns: int) -> Any:
-    """``builtin_interfaces/Time`` of nanoseconds since the Unix epoch."""
+    """``builtin_interfaces/Time`` of nanoseconds since the Unix epoch.
+
+    Its seconds are an int32, and readers take none below 0: a time before 1970 or after
+    2038-01-19 becomes 0, which in ROS means that there is no stamp.
+    """
+    if not 0 <= wall_ns < STAMP_END_NS:
+        return MSG.Time(0, 0)
     seconds, nanoseconds = divmod(wall_ns, NS_PER_S)
     return MSG.Time(seconds, nanoseconds)
 

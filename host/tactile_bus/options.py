@@ -11,6 +11,7 @@ import msgspec
 
 from tactile_bus.recorder import RecorderSettings
 from tactile_bus.session import BusConfig, Role, TlsConfig
+from tactile_bus.toml_text import printable
 
 DEFAULT_LOG = "tactile-logs"
 """Folder of the logs, below the folder a daemon was started in."""
@@ -103,6 +104,6 @@ def finite_above_zero(text: str, unit: str) -> float:
         value = math.nan
     if not (math.isfinite(value) and value > 0):
         raise argparse.ArgumentTypeError(
-            f"{text} given; allowed: a finite number of {unit} above 0"
+            f"{printable(text)} given; allowed: a finite number of {unit} above 0"
         )
     return value

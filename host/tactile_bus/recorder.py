@@ -5,6 +5,9 @@ handed over, so a number that is missing in the log is a message that was droppe
 next flush writes a metadata record called ``gap`` that says why, how many of each channel, and
 the times of the first and last. The sum of ``messages`` over all gap records is the number of
 dropped messages. A file that could not be written on has its gap record in the file after it.
+
+Nothing that is handed over ends the log. A message that no log can hold is refused and counted; a
+stamp that none can hold gives way to the time of logging, and is counted as marked.
 """
 
 from __future__ import annotations
@@ -20,9 +23,9 @@ from pathlib import Path
 
 from tactile_bus.gaps import Gaps
 from tactile_bus.instant import WallClock, monotonic_now
-from tactile_bus.log_writer import Channel, Item, LogWriter, RecorderSettings
+from tactile_bus.log_writer import WRITER_FAILED, Channel, Item, LogWriter, RecorderSettings
 from tactile_bus.mcap_file import DiskStorage, Storage
-from tactile_bus.messages import MAX_PAYLOAD
+from tactile_bus.messages import MAX_PAYLOAD, message_class
 from tactile_bus.retention import LogSet
 from tactile_bus.topics import Topic
 
@@ -36,6 +39,15 @@ BATCH = 512
 POLL = 0.02
 """s between looks at the queue: waking the writer for every message would cost both threads."""
 
+MAX_CHANNELS = 1024
+"""Streams of one log: a dozen a board, more boards than one host has. MCAP ends at 65,535."""
+
+TIME_END_NS = 1 << 64
+"""First time, in ns since 1970, that an MCAP file cannot hold."""
+
+REFUSALS = ("too_large", "not_bytes", "bad_name", "unknown_type", "too_many_channels", "unwritable")
+"""Why a message is refused: for what it is, whatever the disk does."""
+
 
 class RecorderError(Exception):
     """The log cannot be started as asked; the message names the remedy."""
@@ -43,10 +55,12 @@ class RecorderError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class RecorderStats:
-    """State of a log. ``state``: recording, disk_full, io_error, low_space, failed or closed.
+    """State of a log.
 
-    ``written``: messages in the files. ``dropped``: messages lost, by reason; their sum is that of
-    the log's gap records once it is closed. ``queued``: messages not yet there.
+    ``state``: recording, disk_full, io_error, low_space, writer_failed or closed. ``written``:
+    messages in the files. ``dropped``: messages lost, by reason; their sum is that of the log's gap
+    records once it is closed. ``queued``: messages not yet there. ``marked``: messages whose stamp
+    no log can hold; theirs is the time of logging.
     """
 
     state: str
@@ -58,6 +72,7 @@ class RecorderStats:
     bytes_written: int
     errors: int
     last_error: str
+    marked: int = 0
 
 
 class Recorder:
@@ -86,8 +101,8 @@ class Recorder:
         self._channels: dict[tuple[str, str], Channel] = {}
         self._gaps = Gaps()
         self._dropped: dict[str, int] = {}
+        self._marked = 0
         self._extras: list[Callable[[], None]] = []
-        self._failed = ""
         log_set = LogSet.at(Path(destination), prefix, self._now_ns())
         self._writer = LogWriter(log_set, self._settings, storage or DiskStorage(), self._now_ns)
         self._open(log_set, storage or DiskStorage())
@@ -99,35 +114,67 @@ class Recorder:
         """Snapshot of the counters."""
         writer = self._writer
         with self._lock:
+            dropped = dict(self._dropped)
+            if writer.lost:
+                dropped[WRITER_FAILED] = dropped.get(WRITER_FAILED, 0) + writer.lost
             return RecorderStats(
-                state="failed" if self._failed else writer.state,
+                state=writer.state,
                 path=writer.path,
                 files=writer.files,
                 written=writer.written,
-                dropped=dict(self._dropped),
+                dropped=dropped,
                 queued=len(self._queue) + writer.waiting,
                 bytes_written=writer.bytes_written,
                 errors=writer.errors,
-                last_error=self._failed or writer.last_error,
+                last_error=writer.last_error,
+                marked=self._marked,
             )
+
+    @property
+    def trouble(self) -> str | None:
+        """Why what was written is not all that was to be; None while nothing went wrong.
+
+        After `close` it also tells of a file that was not finished. Messages refused for what they
+        are, and those a slow disk had no time for, are counted in `stats` alone.
+        """
+        stats = self.stats
+        if stats.errors:
+            lost = sum(
+                n for why, n in stats.dropped.items() if why not in (*REFUSALS, "queue_full")
+            )
+            return (
+                f"the log failed {stats.errors} times and misses {lost} messages, as its gap "
+                f"records say; last: {stats.last_error}"
+            )
+        if self._closing and stats.state != "closed":
+            return f"the log {stats.path} was not finished; `tactile log recover` makes it whole"
+        return None
 
     def write(self, topic: Topic, name: str, data: bytes, log_ns: int, publish_ns: int) -> None:
         """Hand over CDR bytes of ``topic``; stamps in wall-clock ns. Drops the oldest when full.
 
-        ValueError above MAX_PAYLOAD bytes or for a name that is none.
+        Whatever is wrong with a message costs that message, which is counted; nothing is raised.
         """
-        if len(data) > MAX_PAYLOAD:
-            raise ValueError(f"{len(data)} bytes for {topic.key(name)}: {MAX_PAYLOAD} allowed")
-        key = (topic.template, name)
         with self._lock:
-            channel = self._channels.get(key)
-            if channel is None:
-                channel = Channel(len(self._channels) + 1, topic, name, topic.channel(name))
-                self._channels[key] = channel
-            item = Item(channel, channel.sequence, log_ns, publish_ns, data)
-            channel.sequence = (channel.sequence + 1) & 0xFFFFFFFF
-            if self._closing or self._failed:
-                self._drop(item, "closed" if self._closing else "failed")
+            good_ns = log_ns if _is_time(log_ns) else self._now_ns()
+            channel = self._channel(topic, name)
+            if not isinstance(channel, Channel):
+                self._refuse(channel, topic.template, good_ns)
+                return
+            sequence, channel.sequence = channel.sequence, (channel.sequence + 1) & 0xFFFFFFFF
+            if not isinstance(data, bytes | bytearray | memoryview):
+                self._refuse("not_bytes", channel.path, good_ns)
+                return
+            data = bytes(data)
+            if len(data) > MAX_PAYLOAD:
+                self._refuse("too_large", channel.path, good_ns)
+                return
+            # The format has a sender that knows no time use that of logging.
+            good_publish_ns = publish_ns if _is_time(publish_ns) else good_ns
+            self._marked += good_ns != log_ns or good_publish_ns != publish_ns
+            item = Item(channel, sequence, good_ns, good_publish_ns, data)
+            if self._closing:
+                self._drop(item, "closed")
                 return
             self._queue.append(item)
             self._queued_bytes += len(data)
@@ -139,6 +186,25 @@ class Recorder:
                 self._queued_bytes -= len(oldest.data)
                 state = self._writer.state
                 self._drop(oldest, "queue_full" if state == "recording" else state)
+
+    def _channel(self, topic: Topic, name: str) -> Channel | str:
+        """The channel of a stream, or why there is none (the lock is held)."""
+        channel = self._channels.get((topic.template, name))
+        if channel is not None:
+            return channel
+        if len(self._channels) >= MAX_CHANNELS:
+            return "too_many_channels"
+        try:
+            path = topic.channel(name)
+        except (ValueError, TypeError):
+            return "bad_name"
+        try:
+            message_class(topic.msgtype)
+        except ValueError:
+            return "unknown_type"
+        channel = Channel(len(self._channels) + 1, topic, name, path)
+        self._channels[topic.template, name] = channel
+        return channel
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
         """Embed a file (calibration, configuration) in this and every later file of the log."""
@@ -166,7 +232,7 @@ class Recorder:
         return not self._thread.is_alive() and self._writer.state == "closed"
 
     def _now_ns(self) -> int:
-        return self._clock.wall_ns(monotonic_now())
+        return min(max(self._clock.wall_ns(monotonic_now()), 0), TIME_END_NS - 1)
 
     def _open(self, log_set: LogSet, storage: Storage) -> None:
         """Open the first file in the caller's thread, so that its errors reach the user."""
@@ -175,6 +241,8 @@ class Recorder:
             "version": version("tactile-reach"),
             "clock_offset_ns": str(self._clock.offset_ns),
         }
+        if self._clock.problem:
+            software["clock_problem"] = self._clock.problem
         self._writer.set_metadata("software", software)
         directory = log_set.directory
         try:
@@ -198,28 +266,39 @@ class Recorder:
 
     def _drop(self, item: Item, reason: str) -> None:
         """Count a lost message (the lock is held)."""
+        self._refuse(reason, item.channel.path, item.log_ns)
+
+    def _refuse(self, reason: str, path: str, log_ns: int) -> None:
+        """Count a message that is not in the log (the lock is held)."""
+        if reason in REFUSALS and reason not in self._dropped:
+            log.error("log: messages of %s are refused: %s; they are counted", path, reason)
         self._dropped[reason] = self._dropped.get(reason, 0) + 1
-        self._gaps.count(reason, item.channel.path, item.log_ns)
+        self._gaps.count(reason, path, log_ns)
 
     # What follows runs in the writer's thread.
 
     def _run(self) -> None:
         period = self._settings.flush_period
         next_flush = time.monotonic() + period - POLL
-        try:
-            while not self._closing:
-                self._wake.wait(POLL)
-                self._take()
-                if time.monotonic() >= next_flush:
-                    self._writer.flush()
-                    next_flush = time.monotonic() + period - POLL
-            self._drain()
-            self._writer.finish()
-        except Exception as error:  # thread boundary: a dead writer must be seen, not guessed
-            log.exception("log writer failed; nothing more is logged")
-            with self._lock:
-                self._failed = f"{type(error).__name__}: {error}"
+        while not self._closing:
+            self._wake.wait(POLL)
+            self._guarded(self._take)
+            if time.monotonic() >= next_flush:
+                self._guarded(self._writer.flush)
+                next_flush = time.monotonic() + period - POLL
+        self._guarded(self._drain)
+        if self._marked:
+            self._writer.set_metadata("stamps", {"marked": str(self._marked)})
+            self._guarded(lambda: self._writer.flush(last=True))
+        self._guarded(self._writer.finish)
         self._count_unwritten()
+
+    def _guarded(self, work: Callable[[], None]) -> None:
+        """Do one step; whatever goes wrong in it costs what is in hand, never the log."""
+        try:
+            work()
+        except Exception as error:  # noqa: BLE001 - thread boundary: the log goes on
+            self._writer.give_up(error)
 
     def _take(self) -> None:
         """Move what is queued into the writer, in batches so that other threads can run."""
@@ -236,7 +315,9 @@ class Recorder:
             if not batch:
                 return
             for item in batch:
-                self._writer.add(item)
+                if not self._writer.add(item):
+                    with self._lock:
+                        self._drop(item, "unwritable")
             time.sleep(0)
 
     def _drain(self) -> None:
@@ -245,7 +326,7 @@ class Recorder:
         while failures < 2:
             self._take()
             self._writer.flush(last=True)
-            if self._writer.blocked:
+            if self._writer.blocked or self._writer.gaps:  # gap records that still wait
                 failures += 1
                 continue
             failures = 0
@@ -256,9 +337,14 @@ class Recorder:
     def _count_unwritten(self) -> None:
         """At the end: what is still in hand is lost."""
         with self._lock:
-            reason = "failed" if self._failed else self._writer.state
+            reason = self._writer.state
             lost = len(self._queue) + self._writer.waiting
             self._queue.clear()
             if lost:
                 self._dropped[reason] = self._dropped.get(reason, 0) + lost
                 log.error("log: %d messages could not be written before the end", lost)
+
+
+def _is_time(value: object) -> bool:
+    """Whether a number of ns can stand in an MCAP record."""
+    return isinstance(value, int) and 0 <= value < TIME_END_NS

@@ -8,10 +8,9 @@ import logging
 import os
 import re
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
-from tactile_bus.instant import NS_PER_S
+from tactile_bus.instant import utc_text
 from tactile_bus.log_reader import check_readable
 from tactile_bus.log_records import LogError
 
@@ -39,7 +38,7 @@ class LogSet:
             stem = destination.name.removesuffix(".mcap")
             pattern = re.compile(re.escape(stem) + r"(_\d{4,})?\.mcap")
             return cls(destination.parent, stem, pattern, True)
-        date = datetime.fromtimestamp(now_ns / NS_PER_S, UTC).strftime("%Y%m%dT%H%M%SZ")
+        date = utc_text(now_ns, "%Y%m%dT%H%M%SZ")
         pattern = re.compile(re.escape(prefix) + r"_\d{8}T\d{6}Z_\d{4,}\.mcap")
         return cls(destination, f"{prefix}_{date}", pattern, False)
 

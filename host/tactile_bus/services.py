@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, TypeVar
 
 import msgspec
@@ -19,6 +20,9 @@ from tactile_bus.messages import MAX_PAYLOAD
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
+
+MAX_ERROR = 4096
+"""Characters of an error: some quote what was asked for."""
 
 RETRY_PERIOD = 0.05
 """s between questions while nobody serves the key: a new session takes a moment to find peers."""
@@ -47,15 +51,18 @@ class Service:
 
     def close(self) -> None:
         """Take the service back."""
-        self._queryable.undeclare()
+        with suppress(zenoh.ZError):  # the session has closed by itself
+            self._queryable.undeclare()
 
     def _serve(self, query: zenoh.Query) -> None:
-        with query:
+        # A session that closes meanwhile leaves nobody to answer.
+        with suppress(zenoh.ZError), query:
             try:
                 reply = self._answer(query)
             except ServiceError as error:
                 self.failed += 1
-                text = msgspec.json.encode({"error": str(error)})
+                plain = str(error).encode("utf-8", "backslashreplace").decode()
+                text = msgspec.json.encode({"error": plain[:MAX_ERROR]})
                 query.reply_err(text, encoding=zenoh.Encoding.APPLICATION_JSON)
             else:
                 self.answered += 1

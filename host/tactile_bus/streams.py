@@ -16,6 +16,8 @@ from tactile_bus.topics import Topic, alive_key
 ATTACHMENT = struct.Struct("<qqB16s")
 """Sequence number, wall-clock ns, length of the id, id of the publisher: rmw_zenoh's layout."""
 
+WALL_LIMIT_NS = (1 << 63) - 1
+
 
 class Publisher:
     """One stream, for one thread; drops when a link is full, never waits for a subscriber."""
@@ -33,10 +35,14 @@ class Publisher:
         self.sequence = 0
 
     def put(self, data: bytes, wall_ns: int) -> None:
-        """Send CDR bytes stamped with their wall-clock time; ValueError above MAX_PAYLOAD."""
+        """Send CDR bytes stamped with their wall-clock time; ValueError above MAX_PAYLOAD.
+
+        A time that the attachment cannot hold (64 bits of ns) becomes the nearest that it can.
+        """
         if len(data) > MAX_PAYLOAD:
             raise ValueError(f"{len(data)} bytes on {self.key}: {MAX_PAYLOAD} allowed")
         self.sequence += 1
+        wall_ns = min(max(wall_ns, -WALL_LIMIT_NS), WALL_LIMIT_NS)
         attachment = ATTACHMENT.pack(self.sequence, wall_ns, 16, self.source)
         self._publisher.put(data, attachment=attachment)
 

@@ -31,6 +31,7 @@ class LiveLines(ABC):
     def __init__(self, console: Console, recorder: Recorder | None) -> None:
         self._recorder = recorder
         self._plain_at = monotonic_now()
+        self._failed = False
         self._live = (
             Live(console=console, auto_refresh=False, transient=True)
             if console.is_terminal
@@ -49,7 +50,18 @@ class LiveLines(ABC):
             self._live.stop()
 
     def show(self) -> None:
-        """Refresh the live lines, or log plain ones when it is time; to be called often."""
+        """Refresh the live lines, or log plain ones when it is time; to be called often.
+
+        What cannot be shown is told once, and ends nothing.
+        """
+        try:
+            self._show()
+        except Exception as error:
+            if not self._failed:
+                self._failed = True
+                log.error("the state cannot be shown", exc_info=error)
+
+    def _show(self) -> None:
         if self._live is not None:
             table = self.table()
             if table is not None:

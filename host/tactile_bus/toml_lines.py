@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from bisect import bisect_left
 
 Path = tuple[str | int, ...]
 
@@ -20,9 +21,10 @@ class _Scanner:
         self.at = 0
         self.lines: dict[Path, int] = {}
         self.arrays: dict[Path, int] = {}  # tables so far in each array of tables
+        self._breaks = [match.start() for match in re.finditer("\n", text)]
 
     def note(self, path: Path, at: int) -> None:
-        self.lines.setdefault(path, self.text.count("\n", 0, at) + 1)
+        self.lines.setdefault(path, bisect_left(self._breaks, at) + 1)
 
     def skip_space(self) -> None:
         match = SPACE.match(self.text, self.at)

@@ -9,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from tactile_bus.arguments import Parser
 from tactile_bus.options import add_log_and_bus, finite_above_zero
 from tactile_bus.session import PORTS
 from tactiled.links.line import KINDS, board_kind
@@ -37,8 +38,9 @@ boards that write in a way of their own are declared with
   lead=N   numbers of a text line before those of the chips
   lines=N  lines of one frame of text
 
-exit status: 0 done; 1 failed while running; 2 bad argument or configuration; 3 refused by the
-environment: port missing, busy or not permitted, no board or the wrong one, log not writable.
+exit status: 0 done; 1 failed while running, or the log did; 2 bad argument or configuration;
+3 refused by the environment: port missing, busy or not permitted, no board or the wrong one, log
+not writable.
 """
 
 
@@ -60,7 +62,7 @@ class _Port(argparse.Action):
 
 def make_parser() -> argparse.ArgumentParser:
     """Parser of the command line."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="tactiled",
         usage="tactiled --port P | --can SPEC | --mcap FILE | --config FILE [option ...]",
         description="Reads taxel boards and publishes and logs calibrated forces and contact "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import signal
 import sys
 import threading
@@ -13,6 +12,7 @@ from types import FrameType
 
 from rich.console import Console
 
+from tactile_bus.ending import leave
 from tactile_bus.instant import monotonic_now, seconds_between
 from tactile_bus.terminal import set_up_logging
 from tactiled.arguments import make_parser
@@ -30,7 +30,17 @@ DONE, FAILED, USAGE, REFUSED = range(4)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run tactiled; returns the exit status: 0 done, 1 failed, 2 usage, 3 refused."""
+    """Run tactiled; the exit status: 0 done, 1 failed, 2 usage, 3 refused.
+
+    Without ``argv`` this is the whole process, which then ends here.
+    """
+    code = _main(argv)
+    if argv is None:
+        leave(code)
+    return code
+
+
+def _main(argv: Sequence[str] | None) -> int:
     options = make_parser().parse_args(argv)
     console = Console(stderr=True)
     set_up_logging(console, verbose=options.verbose)
@@ -70,8 +80,7 @@ def _run(settings: Settings, console: Console, stopping: threading.Event) -> int
     code = _conclude(daemon, trouble)
     if not clean:
         log.warning("a thread did not end in time; leaving without it")
-        logging.shutdown()
-        os._exit(code)
+        leave(code)
     return code
 
 
@@ -86,6 +95,10 @@ def _conclude(daemon: Daemon, trouble: str | None) -> int:
         return REFUSED
     if daemon.recorder is not None:
         log.info("log: %s", daemon.recorder.stats.path)
+        problem = daemon.recorder.trouble
+        if problem is not None:
+            print(f"tactiled: {problem}", file=sys.stderr)
+            return FAILED
     return DONE
 
 

@@ -61,7 +61,13 @@ NAME_TIMEOUT = 0.3
 """s to ask the bus whether a name is in use."""
 
 JOIN_TIMEOUT = 1.0
-"""s for the pipeline's thread to end."""
+"""s for the pipeline's thread to end before the log is closed."""
+
+LEAVE_TIMEOUT = 2.0
+"""s more for it to end, on a machine so busy that it needs them, before it is left behind."""
+
+STOPPING = ServiceError("tactiled is stopping")
+"""What whoever asks for something is told from then on."""
 
 
 class StartError(Exception):
@@ -105,8 +111,13 @@ class Daemon:
         """Bring everything up; `StartError`, and everything down again, when that cannot be."""
         sys.setswitchinterval(SWITCH_INTERVAL)
         return_large_buffers()
+        if self._wall.problem:
+            log.warning("%s", self._wall.problem)
         try:
             self._start()
+        except zenoh.ZError as error:
+            self.stop()
+            raise StartError(f"the bus has closed by itself: {error}") from error
         except (BusError, RecorderError, TransportError, CalibrationError) as error:
             self.stop()
             raise StartError(str(error)) from error
@@ -161,6 +172,7 @@ class Daemon:
 
         journal = None if replay else Journal(outlet, name, transport.name)
         port = Port(name, line, reader, inbox, names, self._open_station, not replay, journal)
+        reader.identified = lambda: port.identified
         if isinstance(line, SerialLine):
             port.add_station(0, name)
             if port.trouble is not None:
@@ -206,23 +218,31 @@ class Daemon:
         return recorder
 
     def stop(self) -> bool:
-        """End in order: boards, pipeline, readers, log (at most 1 s), bus.
+        """End in order: boards, pipeline, readers, services, log (at most 1 s), bus.
 
-        False when a thread is still inside a driver or zenoh: the interpreter must then not be
-        taken down under it, which would abort the process.
+        Whatever produces ends before what it produces into, and the session is the last: from
+        `Outlet.end` on nothing is published, so that no thread meets a closed session. False when
+        a thread is still inside a driver, the disk or zenoh: it must be left behind.
         """
         self._stopping.set()
         self._wake.ring()
         if self._thread.is_alive():
             self._thread.join(JOIN_TIMEOUT)
-        clean = not self._thread.is_alive()
+        clean = True
+        self._abandon_calls()
         for reader in self._readers:
             clean &= reader.stop()
-        if self.recorder is not None and not self.recorder.close():
-            log.error("the log was not closed in time; see `tactile log recover`")
         for service in self._services:
             service.close()
         self._services.clear()
+        if self._outlet is not None:
+            self._outlet.end()
+        if self.recorder is not None and not self.recorder.close():
+            log.error("the log was not closed in time; see `tactile log recover`")
+            clean = False
+        if self._thread.is_alive():  # the log could not wait for it; nothing it says goes out now
+            self._thread.join(LEAVE_TIMEOUT)
+            clean &= not self._thread.is_alive()
         if self._outlet is not None:
             self._outlet.close()
         if self._session is not None:
@@ -253,23 +273,32 @@ class Daemon:
                     self._wake.wait(TICK)
                 now = monotonic_now()
                 for port in self.ports:
-                    port.pump(now)
+                    port.pump(now, self._stopping.is_set)
                 self._serve_calls()
                 if now >= next_second:
-                    next_second = after(next_second, 1.0)
+                    next_second = after(now, 1.0)
                     self._each_second(now)
                 if all(port.ended for port in self.ports):
                     self.done.set()
             for port in self.ports:
-                port.farewell(monotonic_now())
+                self._part(port)
             self._abandon_requests()
         except BaseException as error:  # noqa: BLE001 - thread boundary: the daemon must end loudly
             self._fail(error)
 
+    def _part(self, port: Port) -> None:
+        """Let a port take its leave; one that cannot does not keep the others from it."""
+        try:
+            port.farewell(monotonic_now())
+        except Exception as error:
+            log.error("%s: it could not be told to stop", port.name, exc_info=error)
+
     def _call(self, work: Callable[[], Any]) -> Future[Any]:
         """Have ``work`` done by the pipeline's thread."""
         future: Future[Any] = Future()
-        if len(self._calls) >= CALLS:
+        if self._stopping.is_set():
+            future.set_exception(STOPPING)
+        elif len(self._calls) >= CALLS:
             future.set_exception(ValueError(f"{CALLS} requests are waiting already"))
         else:
             self._calls.append((work, future))
@@ -277,20 +306,32 @@ class Daemon:
         return future
 
     def _serve_calls(self) -> None:
-        while self._calls:
-            work, future = self._calls.popleft()
+        while (call := self._next_call()) is not None:
+            work, future = call
             try:
                 future.set_result(work())
             except (ValueError, ServiceError, CalibrationError) as error:
                 future.set_exception(error)
+            except Exception as error:
+                log.error("a request failed", exc_info=error)
+                future.set_exception(ServiceError(f"{type(error).__name__}: {error}"))
 
     def _abandon_requests(self) -> None:
         """Answer everyone who still waits, so that zenoh can close at once."""
-        error = ServiceError("tactiled is stopping")
-        while self._calls:
-            self._calls.popleft()[1].set_exception(error)
+        self._abandon_calls()
         for station in self.stations:
-            station.abandon_requests(error)
+            station.abandon_requests(STOPPING)
+
+    def _abandon_calls(self) -> None:
+        """Answer those whom the pipeline has not heard yet; from any thread."""
+        while (call := self._next_call()) is not None:
+            call[1].set_exception(STOPPING)
+
+    def _next_call(self) -> tuple[Callable[[], Any], Future[Any]] | None:
+        try:
+            return self._calls.popleft()
+        except IndexError:
+            return None
 
     def _each_second(self, now: Instant) -> None:
         outlet = self._outlet
@@ -298,25 +339,34 @@ class Daemon:
             return
         for port in self.ports:
             for node, station in port.stations.items():
-                station.each_second(now)
-                wall_ns = self._wall.wall_ns(now)
-                station.summary = values = diagnostics.summary(port, node, station, now)
-                message = diagnostics.message(station.name, values, self.recorder, wall_ns)
-                outlet.send(DIAGNOSTICS, station.name, message, wall_ns)
-        self._watch_log(outlet)
+                try:
+                    self._sum_up(outlet, port, node, station, now)
+                except Exception as error:  # noqa: BLE001 - an account of the data, not the data
+                    station.spoilt(error)
+        self._watch_log()
         self._collector.each_second()
 
-    def _watch_log(self, outlet: Outlet) -> None:
+    def _sum_up(
+        self, outlet: Outlet, port: Port, node: int, station: Station, now: Instant
+    ) -> None:
+        station.each_second(now)
+        wall_ns = self._wall.wall_ns(now)
+        values = diagnostics.summary(port, node, station, now)
+        station.summary = values
+        message = diagnostics.message(station.name, values, self.recorder, wall_ns)
+        outlet.send(DIAGNOSTICS, station.name, message, wall_ns)
+
+    def _watch_log(self) -> None:
         if self.recorder is None:
             return
         stats = self.recorder.stats
-        if stats.state == self._log_state:
+        if stats.state == self._log_state or self._stopping.is_set():
             return
         self._log_state = stats.state
         good = stats.state == "recording"
         text = f"log {stats.path}: {stats.state}" + (f" ({stats.last_error})" if not good else "")
         for station in self.stations:
-            outlet.announce(station.name, logging.INFO if good else logging.ERROR, text)
+            station.say_of_log(logging.INFO if good else logging.ERROR, text)
 
     def _fail(self, error: BaseException) -> None:
         if self.failure is None:

@@ -50,6 +50,8 @@ def summary(port: Port, node: int, station: Station, now: Instant) -> dict[str, 
         doubt = station.pipeline.rest_reason
         state = station.pipeline.rest_state.value
         values["rest"] = {"state": state, "reason": "" if doubt is None else doubt.text}
+    if station.clock_problem:
+        values["clock_problem"] = station.clock_problem
     identity = station.identity
     if identity is not None:
         values["serial_number"] = identity.serial_number
@@ -145,6 +147,7 @@ def log_summary(recorder: Recorder) -> dict[str, Any]:
         "queued": stats.queued,
         "errors": stats.errors,
         "last_error": stats.last_error,
+        "marked": stats.marked,
         "drops": dict(stats.dropped),
     }
 

@@ -16,8 +16,20 @@ RAW_PART = 32_768
 """Bytes of serial data in one RawChunk: with its header below the 64 KiB a message may have."""
 
 
+MAX_PATCHES = 512
+"""Patches that one message of features holds, 64 B each; the strongest, should there be more."""
+
+MAX_WITH_SURFACE = 2000
+"""Taxels whose geometry fits into one message whole, 32 B each. The largest board of PROTOCOL.md
+has 2048; its unrolled skin, which is for pictures, is left out."""
+
+
 class MessageMaker:
-    """Messages of one board; what does not change from cycle to cycle is kept."""
+    """Messages of one board; what does not change from cycle to cycle is kept.
+
+    ``patches_cut``: patches left out of messages of features so far. ``whole``: whether the
+    geometry is all there.
+    """
 
     def __init__(self, calibration: BoardCalibration, wall: WallClock) -> None:
         self._wall = wall
@@ -25,6 +37,8 @@ class MessageMaker:
         self._frame = calibration.frame
         taxels = [a.geometry.taxels for a in calibration.arrays]
         self._array_taxels = np.array(taxels, np.uint16)
+        self.patches_cut = 0
+        self.whole = sum(taxels) <= MAX_WITH_SURFACE
 
     def features(self, cycle: Cycle) -> Any:
         """``ContactFeatures``."""
@@ -49,7 +63,7 @@ class MessageMaker:
             tip_contact_time=f.tip_contact_time,
             taxels_in_contact=f.taxels_in_contact,
             taxels_masked=f.taxels_masked,
-            patches=[_patch(p) for p in f.patches],
+            patches=[_patch(p) for p in self._strongest(f.patches)],
             peak_force_bound=f.peak_force_bound,
             normal_force_bound=f.normal_force_bound,
             tip_force_bound=f.tip_force_bound,
@@ -113,12 +127,25 @@ class MessageMaker:
             array_columns=np.array([a.columns for a in arrays], np.uint16),
             position=_flat(np.concatenate([a.position for a in arrays])),
             normal=_flat(np.concatenate([a.rotation[:, :, 2] for a in arrays])),
-            surface=_flat(np.concatenate([a.surface for a in arrays])),
+            surface=_flat(np.concatenate([a.surface for a in arrays]) if self.whole else ()),
             array_posed=np.array([a.posed for a in arrays], np.bool_),
         )
 
+    def _strongest(self, patches: tuple[Patch, ...]) -> tuple[Patch, ...]:
+        """The patches to send, in their order."""
+        self.patches_cut += max(0, len(patches) - MAX_PATCHES)
+        return strongest(patches, MAX_PATCHES)
+
     def _header(self, cycle: Cycle) -> Any:
         return header(self._wall.wall_ns(cycle.captured), self._frame)
+
+
+def strongest(patches: tuple[Patch, ...], count: int) -> tuple[Patch, ...]:
+    """The ``count`` patches of most normal force, in their order."""
+    if len(patches) <= count:
+        return patches
+    ordered = sorted(range(len(patches)), key=lambda i: -patches[i].normal_force)
+    return tuple(patches[i] for i in sorted(ordered[:count]))
 
 
 def split(chunk: Chunk) -> Iterable[Chunk]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import threading
+from contextlib import suppress
 from typing import Any, Protocol
 
 import zenoh
@@ -11,6 +13,7 @@ from tactile_bus.instant import Instant, WallClock, monotonic_now
 from tactile_bus.messages import codec, log_message
 from tactile_bus.recorder import Recorder
 from tactile_bus.streams import Publisher, declare_publisher
+from tactile_bus.throttle import Throttle
 from tactile_bus.topics import LOG, RAW, Topic
 from tactiled.blocks import Chunk
 from tactiled.outgoing import split
@@ -44,7 +47,11 @@ class Sink(Protocol):
 
 
 class Outlet:
-    """Bus and log behind one call. ``recorder`` None: nothing is logged."""
+    """Bus and log behind one call. ``recorder`` None: nothing is logged.
+
+    After `end` nothing is published any more, whichever thread asks for it. ``late`` counts what
+    came after it, ``refused`` what the bus did not take.
+    """
 
     def __init__(
         self,
@@ -55,6 +62,11 @@ class Outlet:
     ) -> None:
         self.wall = wall
         self.recorder = recorder
+        self.late = 0
+        self.refused = 0
+        self._ended = False
+        self._publishing = threading.Lock()
+        self._complaints = Throttle(rate=0.1, burst=1)
         self._session = session
         self._prefix = prefix
         self._codec = codec()
@@ -65,14 +77,13 @@ class Outlet:
         return monotonic_now()
 
     def send(self, topic: Topic, name: str, message: Any, stamp_ns: int) -> None:
-        """Encode and send; ``stamp_ns``: wall-clock time that the message stands for."""
+        """Encode and send; ``stamp_ns``: wall-clock time that the message stands for.
+
+        ValueError or TypeError for a message that cannot be encoded, and for nothing else.
+        """
         data = self._codec.encode(topic, message)
         if topic.published:
-            publisher = self._publishers.get((topic.template, name))
-            if publisher is None:
-                publisher = declare_publisher(self._session, topic, name, self._prefix)
-                self._publishers[topic.template, name] = publisher
-            publisher.put(data, stamp_ns)
+            self._publish(topic, name, data, stamp_ns)
         if self.recorder is not None and topic.logged:
             now_ns = self.wall.wall_ns(monotonic_now())
             self.recorder.write(topic, name, data, now_ns, stamp_ns)
@@ -98,8 +109,33 @@ class Outlet:
         stamp_ns = self.wall.wall_ns(monotonic_now() if at is None else at)
         self.send(LOG, name, log_message(stamp_ns, level, speaker, text), stamp_ns)
 
+    def end(self) -> None:
+        """Publish nothing from now on; what is being published is published first."""
+        with self._publishing:
+            self._ended = True
+
     def close(self) -> None:
         """Take all streams back."""
+        self.end()
         for publisher in self._publishers.values():
-            publisher.close()
+            with suppress(zenoh.ZError):  # the session has closed by itself
+                publisher.close()
         self._publishers.clear()
+
+    def _publish(self, topic: Topic, name: str, data: bytes, stamp_ns: int) -> None:
+        with self._publishing:
+            if self._ended:
+                self.late += 1
+                return
+            try:
+                publisher = self._publishers.get((topic.template, name))
+                if publisher is None:
+                    publisher = declare_publisher(self._session, topic, name, self._prefix)
+                    self._publishers[topic.template, name] = publisher
+                publisher.put(data, stamp_ns)
+            except zenoh.ZError as error:
+                self.refused += 1
+                if self._complaints.allow(self.now()):
+                    log.error(
+                        "the bus refused %d messages; the log has them: %s", self.refused, error
+                    )

@@ -7,10 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from tactile_bus.instant import Instant
+from tactile_bus.instant import Instant, monotonic_now
+from tactile_bus.throttle import Throttle
 from tactiled.blocks import Chunk
 from tactiled.inbox import Inbox, Item, PortLost, PortOpened
-from tactiled.links.events import Diagnosed, Found, Identity, Refusal, Waiting
+from tactiled.links.events import Diagnosed, Event, Found, Identity, Refusal, Waiting
 from tactiled.links.line import Line, LineEvent
 from tactiled.links.link import BoardLink
 from tactiled.replay import journal as kinds
@@ -74,6 +75,11 @@ class Port:
         self.ended = False
         self.trouble: Trouble | None = None
         """What keeps this port out of service, as far as is known."""
+        self.spoilt = 0
+        """Chunks, and turns, that could not be worked off for a reason nobody foresaw."""
+        self.unnoted = 0
+        """Events that the journal could not hold."""
+        self._complaints = Throttle(rate=0.1, burst=3)
         self._names = names
         self._open_station = open_station
         self._live = live
@@ -92,19 +98,29 @@ class Port:
             return Refusal(f"no name is free for {identity}", "see the message above")
         return station.admit(identity)
 
-    def pump(self, now: Instant) -> None:
-        """Work off what the reader handed over, then what time demands, then write."""
+    def pump(self, now: Instant, stopping: Callable[[], bool] = lambda: False) -> None:
+        """Work off what the reader handed over, then what time demands, then write.
+
+        ``stopping``: asked between two chunks; when true the rest is left. Nothing is raised: what
+        cannot be worked off is counted and told.
+        """
         for _ in range(TURN):
-            item = self.inbox.take()
+            item = None if stopping() else self.inbox.take()
             if item is None:
                 break
             if isinstance(item, Chunk) and self.inbox.skipped:
                 self.note(kinds.SKIPPED, now, until=item.received)
-            self.work(item, now)
-        # A recording's time is that of its chunks, which at high speed run ahead of ours.
-        self.tick(now if self._live else self._clock)
-        if self._journal is not None:
-            self._journal.progress(now)
+            try:
+                self.work(item, now)
+            except Exception as error:  # noqa: BLE001 - one chunk must not end the others
+                self._spoilt(error)
+        try:
+            # A recording's time is that of its chunks, which at high speed run ahead of ours.
+            self.tick(now if self._live else self._clock)
+            if self._journal is not None:
+                self._journal.progress(now)
+        except Exception as error:  # noqa: BLE001 - one port must not end the others
+            self._spoilt(error)
 
     def work(self, item: Item, now: Instant) -> None:
         """Work off one chunk, or one piece of news of the port itself."""
@@ -141,7 +157,11 @@ class Port:
     def note(self, kind: str, now: Instant, **values: Any) -> None:
         """Have the journal note what is acted on; see `Journal.note`."""
         if self._journal is not None:
-            self._journal.note(kind, now, **values)
+            try:
+                self._journal.note(kind, now, **values)
+            except (ValueError, TypeError) as error:  # a text that no message can hold
+                self.unnoted += 1
+                log.debug("%s: %s cannot be noted: %s", self.name, kind, error)
 
     @property
     def behind(self) -> bool:
@@ -182,10 +202,30 @@ class Port:
         counts = dict(self.line.rejects)
         counts.update(self.reader.transport.losses)
         counts["inbox_overflow"] = self.inbox.dropped
+        counts["spoilt_chunks"], counts["unnoted_events"] = self.spoilt, self.unnoted
         for link in self.line.links.values():
             for reason, n in link.counters.items():
                 counts[reason] = counts.get(reason, 0) + n
         return {reason: n for reason, n in counts.items() if n}
+
+    @property
+    def identified(self) -> bool:
+        """Whether any board of this port has ever said who it is."""
+        return any(station.identity is not None for station in list(self.stations.values()))
+
+    def _spoilt(self, error: Exception) -> None:
+        self.spoilt += 1
+        if self._complaints.allow(monotonic_now()):
+            log.error("%s: data could not be worked off", self.name, exc_info=error)
+
+    def _hand_over(self, station: Station, event: Event) -> None:
+        if not self._live:
+            station.handle(event)  # a recording is judged by whether it comes out the same
+            return
+        try:
+            station.handle(event)
+        except Exception as error:  # noqa: BLE001 - one event must not end the others
+            station.spoilt(error)
 
     def _handle(self, events: list[LineEvent]) -> None:
         for happened in events:
@@ -193,7 +233,7 @@ class Port:
             if happened.node is not None:
                 station = self.stations.get(happened.node)
                 if station is not None:
-                    station.handle(event)
+                    self._hand_over(station, event)
             elif isinstance(event, Found):
                 for node, name in self._names(event.nodes, event.late).items():
                     self.add_station(node, name)

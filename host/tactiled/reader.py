@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 import os
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 
 from tactiled.blocks import Chunk
 from tactiled.inbox import Inbox, PortEnded, PortLost, PortOpened
 from tactiled.outlet import Outlet
-from tactiled.transports import EndOfLog, PortClosed, Transport, TransportError
+from tactiled.transports import EndOfLog, PortClosed, PortGone, Transport, TransportError
 from tactiled.transports.serial_port import SerialTransport
 
 log = logging.getLogger(__name__)
@@ -30,6 +31,9 @@ LOG_DELAY = 0.003
 
 LOG_BATCH = 32
 """Chunks that may wait so, when they come faster than that."""
+
+RESOLVE_EVERY = 0.5
+"""s between looks at where the path of a port leads, while no board was found on it."""
 
 PACE = 0.002
 """s between looks whether the pipeline has caught up with a recording."""
@@ -62,6 +66,12 @@ class PortReader:
     ) -> None:
         self.transport = transport
         self.reopened = 0
+        self.identified: Callable[[], bool] = lambda: True
+        """Whether a board has said who it is on this port; until then the port's path is resolved
+        anew now and then, for it may be a link that comes to lead elsewhere."""
+        self.unlogged = 0
+        """Chunks that the log did not take."""
+        self._resolve_at = 0.0
         self._inbox = inbox
         self._outlet = outlet
         self.name = name
@@ -97,7 +107,13 @@ class PortReader:
     def _run(self) -> None:
         try:
             while not self._stopping.is_set():
-                self._read_until_lost()
+                try:
+                    self._read_until_lost()
+                except EndOfLog:
+                    raise
+                except Exception as error:
+                    log.error("%s failed", self.transport.name, exc_info=error)
+                    self._inbox.put(PortLost(f"{self.transport.name} failed: {error}"))
                 self._reopen()
         except EndOfLog:
             self._inbox.put(PortEnded())
@@ -116,6 +132,7 @@ class PortReader:
                     waiting.append(chunk)
                 if chunk is None or len(waiting) >= LOG_BATCH:
                     self._log_waiting()
+                self._check_path()
         except EndOfLog:
             raise
         except PortClosed:
@@ -126,9 +143,26 @@ class PortReader:
         finally:
             self._log_waiting()
 
+    def _check_path(self) -> None:
+        """`PortGone` when no board was found yet and the path leads to another device now."""
+        now = time.monotonic()
+        if now < self._resolve_at:
+            return
+        self._resolve_at = now + RESOLVE_EVERY
+        transport = self.transport
+        if not isinstance(transport, SerialTransport) or self.identified():
+            return
+        if transport.leads_elsewhere:
+            transport.forget_device()
+            raise PortGone(f"{transport.name} leads to another device now", "taking that one")
+
     def _log_waiting(self) -> None:
         while self._waiting:
-            self._outlet.raw(self.name, self.transport.name, self._waiting.popleft())
+            try:
+                self._outlet.raw(self.name, self.transport.name, self._waiting.popleft())
+            except (ValueError, TypeError) as error:  # the log goes on without this chunk
+                self.unlogged += 1
+                log.debug("%s: a chunk cannot be logged: %s", self.name, error)
 
     def _reopen(self) -> None:
         wait, said = REOPEN_FIRST, ""

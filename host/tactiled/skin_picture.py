@@ -14,6 +14,7 @@ from tactile_bus.markers import ARROW, SPHERE, SPHERE_LIST, TEXT, Colour, Triple
 from tactile_bus.messages import MSG
 from tactile_bus.topics import CONTACTS
 from tactiled.blocks import Cycle
+from tactiled.outgoing import strongest
 
 TAXELS, CONTACT, FORCE, LABEL = "taxels", "contacts", "forces", "labels"
 """Namespaces of the markers; the number of a contact is that of its patch."""
@@ -25,6 +26,16 @@ METRES_PER_N = 0.01
 """How long an arrow is drawn: the paper's threshold of 10 N is as long as the finger's side."""
 
 TAXEL_M, SHAFT_M, LETTERS_M = 0.003, 0.002, 0.01
+
+LIST_MAX = 1024
+"""Taxels in one marker, 40 B each."""
+
+SMALL, FEW = 512, 32
+"""Taxels, and patches (some 1.1 kB each), that one message may hold together; beyond, the picture
+is made of several."""
+
+MAX_DRAWN = 128
+"""Patches drawn: more than anyone tells apart."""
 
 IDLE: Colour = (0.55, 0.58, 0.62, 1.0)
 SICK: Colour = (0.85, 0.0, 0.6, 1.0)
@@ -49,20 +60,37 @@ class SkinPicture:
         self._due = Instant(captured + period)
         return True
 
-    def draw(self, cycle: Cycle, wall_ns: int) -> Any:
-        """``MarkerArray`` of the taxels by their normal force, and of the contact patches."""
+    def draw(self, cycle: Cycle, wall_ns: int) -> list[Any]:
+        """``MarkerArray`` of the taxels by their normal force, and of the contact patches.
+
+        One message, or several that make up the picture in their order: none of them is longer
+        than a message may be. Of more than `MAX_DRAWN` patches the strongest are drawn.
+        """
         size = (TAXEL_M, TAXEL_M, TAXEL_M)
-        taxels = marker(
-            wall_ns, self._frame, TAXELS, 0, SPHERE_LIST, AT_ORIGIN, size, IDLE,
-            points=self._places, colours=self._colours(cycle),
-        )  # fmt: skip
+        colours = self._colours(cycle)
+        taxels = [
+            marker(
+                wall_ns, self._frame, TAXELS, number, SPHERE_LIST, AT_ORIGIN, size, IDLE,
+                points=self._places[at : at + LIST_MAX], colours=colours[at : at + LIST_MAX],
+            )
+            for number, at in enumerate(range(0, len(self._places), LIST_MAX))
+        ]  # fmt: skip
         felt = [
             (_triple(patch.centroid), _triple(patch.force), patch.normal_force)
-            for patch in cycle.features.patches
+            for patch in strongest(cycle.features.patches, MAX_DRAWN)
         ]
-        return MSG.MarkerArray(
-            [wipe(wall_ns, self._frame), taxels, *patch_markers(wall_ns, self._frame, felt)]
-        )
+        patches = patch_markers(wall_ns, self._frame, felt)
+        first = [wipe(wall_ns, self._frame), taxels[0]]
+        if len(self._places) <= SMALL and len(felt) <= FEW:
+            return [MSG.MarkerArray([*first, *patches])]
+        return [
+            MSG.MarkerArray(part)
+            for part in (
+                first,
+                *([each] for each in taxels[1:]),
+                *(patches[at : at + 3 * FEW] for at in range(0, len(patches), 3 * FEW)),
+            )
+        ]
 
     def _colours(self, cycle: Cycle) -> list[Colour]:
         share = np.clip(-np.nan_to_num(cycle.force[:, 2]) / FULL_N, 0.0, 1.0)[:, None]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter, deque
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -13,7 +14,8 @@ from tactile_bus.calibration import saves
 from tactile_bus.calibration_file import SUFFIX
 from tactile_bus.instant import NS_PER_S, Instant, seconds_between
 from tactile_bus.recorder import Recorder
-from tactile_bus.topics import AMBIENT, CONTACTS, FEATURES, FIELD, FORCES, GEOMETRY
+from tactile_bus.throttle import Throttle
+from tactile_bus.topics import AMBIENT, CONTACTS, FEATURES, FIELD, FORCES, GEOMETRY, LOG, Topic
 from tactiled.blocks import Cycle, Features, Reason, SampleBlock
 from tactiled.chip_watch import ChipWatch
 from tactiled.links.events import (
@@ -52,6 +54,24 @@ STATE_EVERY = 10
 """s between notes of a rest field that follows the drift."""
 
 FIRMWARE_LEVELS = (10, 20, 30, 40)
+
+FIRMWARE_RATE, FIRMWARE_BURST = 10.0, 50
+"""Texts a second that a board's firmware may pass on, and how many at once; the bytes of the rest
+are in the log all the same."""
+
+COMPLAINT_RATE, COMPLAINT_BURST = 0.2, 10
+"""Lines a second, and at once, about messages of one kind that cannot be sent."""
+
+SET_UP_RATE, SET_UP_BURST = 0.5, 10
+"""How often a board may turn out to be another than it was: each time its calibration is logged."""
+
+TEXT_OLDEST_S, TEXT_AHEAD_S = 3600.0, 1.0
+"""A text of a board whose clock says that it is older, or of the future, has no usable stamp."""
+
+UNSENT = "unsent_"
+"""Counters that begin so are of messages that could not be encoded, by the end of their key."""
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +121,9 @@ class Station:
         self._silences = Silences()
         self._unplugged = False
         self._doubt: Reason | None = None
+        self._throttles: dict[str, Throttle] = {}
+        self._firmware = Throttle(FIRMWARE_RATE, FIRMWARE_BURST)
+        self._set_ups = Throttle(SET_UP_RATE, SET_UP_BURST)
         self._answers: dict[int, Future[Event]] = {}
         self._tares: list[Future[dict[str, Any]]] = []
 
@@ -109,12 +132,23 @@ class Station:
         """The log that this board's messages go to."""
         return self._outlet.recorder
 
+    @property
+    def clock_problem(self) -> str:
+        """What is to be said of the stamps of this board's messages; see `WallClock`."""
+        return self._outlet.wall.problem
+
     # Who it is
 
     def admit(self, identity: Identity) -> Refusal | None:
         """Judge a board by whether there is a calibration for it."""
         if identity == self.identity and self.pipeline is not None:
             return None
+        # Asked before anything is worked out: a calibration of 2048 taxels takes its time.
+        if not self._set_ups.allow(self._outlet.now()):
+            return Refusal(
+                f"{identity} describes itself anew again and again",
+                "power-cycle the board, and look for two boards on one line",
+            )
         choice = self._shelf.choose(identity)
         if isinstance(choice, Refusal):
             return choice
@@ -182,8 +216,11 @@ class Station:
             self._state_age = 0
 
     def _warn(self) -> None:
-        """Say once what is to be said of the calibration."""
+        """Say once what is to be said of the calibration, and of a board too large to describe."""
         choice = self.choice
+        if self._maker is not None and not self._maker.whole:
+            text = "so many taxels that their geometry goes without the unrolled skin"
+            self._say(logging.WARNING, text, "geometry")
         if choice is not None and choice.warning and choice.warning != self._warned:
             self._warned = choice.warning
             self._say(logging.WARNING, choice.warning)
@@ -191,8 +228,8 @@ class Station:
     def send_geometry(self) -> None:
         """Publish where the taxels are; nothing before a board has been identified."""
         if self._maker is not None:
-            now_ns = self._outlet.wall.wall_ns(self._outlet.now())
-            self._outlet.send(GEOMETRY, self.name, self._maker.geometry(now_ns), now_ns)
+            maker, now_ns = self._maker, self._outlet.wall.wall_ns(self._outlet.now())
+            self._publish(GEOMETRY, lambda: maker.geometry(now_ns), now_ns)
 
     # What happens
 
@@ -246,10 +283,7 @@ class Station:
                     self.pipeline.reset()
                 self._say(logging.WARNING, f"the board restarted: {reason}", "restart")
             case BoardLog(level, captured, text):
-                known = max((n for n in FIRMWARE_LEVELS if n <= level), default=10)
-                self._outlet.firmware_text(
-                    self.name, known, f"{self.name} firmware", text, captured
-                )
+                self._pass_on(level, captured, text)
             case Reported(status):
                 self.board_status = {
                     "overruns": status.overruns,
@@ -295,7 +329,8 @@ class Station:
         """Fail every request under way."""
         waiting: list[Future[Any]] = [*self._answers.values(), *self._tares]
         for future in waiting:
-            future.set_exception(error)
+            if not future.done():
+                future.set_exception(error)
         self._answers.clear()
         self._tares.clear()
 
@@ -316,6 +351,7 @@ class Station:
         if self.chips is not None:
             for level, text in self.chips.each_second(now):
                 self._say(level, text)
+        self._tell_of_floods(now)
         if self._latencies:
             ordered = sorted(self._latencies)
             last = len(ordered) - 1
@@ -346,7 +382,9 @@ class Station:
         counts = Counter(self.counters)
         if self.pipeline is not None:
             counts.update(asdict(self.pipeline.counters))
-        return {
+        if self._maker is not None:
+            counts["patches_cut"] = self._maker.patches_cut
+        return {reason: n for reason, n in counts.items() if reason.startswith(UNSENT)} | {
             reason: counts[reason]
             for reason in (
                 "lost_cycles",
@@ -355,6 +393,10 @@ class Station:
                 "duplicate_blocks",
                 "unknown_array",
                 "wrong_shape",
+                "spoilt_events",
+                "patches_cut",
+                "texts_held_back",
+                "texts_without_time",
             )
         }
 
@@ -388,25 +430,96 @@ class Station:
                 self._note_state()
 
     def _send(self, cycle: Cycle) -> None:
-        maker, outlet, name = self._maker, self._outlet, self.name
+        maker, outlet = self._maker, self._outlet
         if maker is None:
             return
         stamp_ns = outlet.wall.wall_ns(cycle.captured)
         if self.chips is not None:
             self.chips.observe(cycle.fault, cycle.captured)
         if cycle.features_due:
-            outlet.send(FEATURES, name, maker.features(cycle), stamp_ns)
+            self._publish(FEATURES, lambda: maker.features(cycle), stamp_ns)
         self._latencies.append((outlet.now() - cycle.received) / NS_PER_S)
-        outlet.send(FORCES, name, maker.forces(cycle), stamp_ns)
-        outlet.send(FIELD, name, maker.field(cycle), stamp_ns)
+        self._publish(FORCES, lambda: maker.forces(cycle), stamp_ns)
+        self._publish(FIELD, lambda: maker.field(cycle), stamp_ns)
         if cycle.ambient.method != "off":
-            outlet.send(AMBIENT, name, maker.ambient(cycle), stamp_ns)
-        if self._picture is not None and self._picture.due(cycle.captured):
-            outlet.send(CONTACTS, name, self._picture.draw(cycle, stamp_ns), stamp_ns)
+            self._publish(AMBIENT, lambda: maker.ambient(cycle), stamp_ns)
         self.features, self.last = cycle.features, cycle
         self.sent += 1
+        if self._picture is not None:
+            self._show(self._picture, cycle, stamp_ns)
+
+    def _show(self, picture: SkinPicture, cycle: Cycle, stamp_ns: int) -> None:
+        """Send a picture when one is due: for viewers only, so that it may fail, and be counted."""
+        try:
+            parts = picture.draw(cycle, stamp_ns) if picture.due(cycle.captured) else []
+            for part in parts:
+                self._outlet.send(CONTACTS, self.name, part, stamp_ns)
+        except Exception as error:  # noqa: BLE001 - features go on without it
+            self._note_unsent(CONTACTS, error)
+
+    def _publish(self, topic: Topic, make: Callable[[], Any], stamp_ns: int) -> None:
+        """Make a message and send it; one that cannot be is counted, and the next ones go on."""
+        try:
+            self._outlet.send(topic, self.name, make(), stamp_ns)
+        except Exception as error:  # noqa: BLE001 - one message must not end the others
+            self._note_unsent(topic, error)
+
+    def _note_unsent(self, topic: Topic, error: Exception) -> None:
+        kind = topic.template.rpartition("/")[2]
+        self.counters[UNSENT + kind] += 1
+        if self._throttle(UNSENT + kind).allow(self._outlet.now()):
+            log.error("%s: a message of %s cannot be sent: %s", self.name, kind, error)
+
+    def spoilt(self, error: Exception) -> None:
+        """What became of one event is not known: what the pipeline felt so far is over."""
+        self.counters["spoilt_events"] += 1
+        if self._throttle("spoilt").allow(self._outlet.now()):
+            log.error("%s: an event could not be worked off", self.name, exc_info=error)
+        if self.pipeline is not None:
+            self.pipeline.reset()
+
+    def say_of_log(self, level: int, text: str) -> None:
+        """Tell of the log that this board's messages go to."""
+        self._say(level, text)
+
+    def _pass_on(self, level: int, captured: Instant, text: str) -> None:
+        """Publish and log a text of the firmware, unless there are too many of them."""
+        now = self._outlet.now()
+        if not self._firmware.allow(now):
+            self.counters["texts_held_back"] += 1
+            return
+        age = seconds_between(captured, now)
+        if not -TEXT_AHEAD_S <= age <= TEXT_OLDEST_S:
+            self.counters["texts_without_time"] += 1
+            captured, text = now, f"{text} (when is not known: its clock says {age:.0f} s ago)"
+        known = max((n for n in FIRMWARE_LEVELS if n <= level), default=10)
+        self._speak(known, text, f"{self.name} firmware", captured)
 
     def _say(self, level: int, text: str, kind: str = "") -> None:
         """Announce ``text``; of a ``kind``, only if the last of that is some time ago."""
         if not kind or self._repeats.tell(kind, text, level, self._outlet.now()):
-            self._outlet.announce(self.name, level, text)
+            self._speak(level, text)
+        else:
+            self.counters["texts_held_back"] += 1
+
+    def _tell_of_floods(self, now: Instant) -> None:
+        """Say how many texts of the firmware were held back, once there is room for it."""
+        firmware = self._firmware
+        if firmware.held and firmware.ready(now):
+            held = firmware.take_held()
+            firmware.allow(now)
+            self._speak(logging.WARNING, f"{held} texts held back, too many: firmware")
+
+    def _speak(
+        self, level: int, text: str, firmware: str = "", captured: Instant | None = None
+    ) -> None:
+        try:
+            if firmware:
+                self._outlet.firmware_text(self.name, level, firmware, text, captured)
+            else:
+                self._outlet.announce(self.name, level, text)
+        except Exception as error:  # noqa: BLE001 - one text must not end the features
+            self._note_unsent(LOG, error)
+
+    def _throttle(self, kind: str) -> Throttle:
+        return self._throttles.setdefault(kind, Throttle(COMPLAINT_RATE, COMPLAINT_BURST))

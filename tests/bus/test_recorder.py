@@ -20,7 +20,6 @@ from tactile_bus import topics
 from tactile_bus.instant import WallClock
 from tactile_bus.log_info import info
 from tactile_bus.log_reader import read_messages
-from tactile_bus.messages import MAX_PAYLOAD
 from tactile_bus.recorder import RecorderSettings
 
 BASE_NS = 1_700_000_000_000_000_000
@@ -257,14 +256,6 @@ def test_logging_stops_while_there_is_still_room_and_resumes(
     until(lambda: recorder.stats.written == 2)
     assert recorder.close(10)
     assert [g.reason for g in logs(tmp_path)[-1].gaps] == ["low_space"]
-
-
-def test_wrong_use_is_refused(tmp_path: Path, record: Any) -> None:
-    recorder = record(tmp_path / "a.mcap")
-    with pytest.raises(ValueError, match="65536 allowed"):
-        recorder.write(topics.RAW, "b0", bytes(MAX_PAYLOAD + 1), 0, 0)
-    with pytest.raises(ValueError, match="is no name"):
-        recorder.write(topics.RAW, "b/0", b"", 0, 0)
 
 
 def test_stamps_follow_the_offset_taken_once(tmp_path: Path, record: Any) -> None:

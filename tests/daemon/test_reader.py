@@ -131,15 +131,37 @@ def test_a_port_missing_at_the_start_is_an_error_or_waited_for(rig: Rig) -> None
     assert rig.next() == PortOpened()
 
 
-def test_what_a_reader_dies_of_is_told(rig: Rig) -> None:
+def test_what_a_reader_dies_of_is_told(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     rig.reader.open(wait=False)
+
+    def put(item: Any) -> None:
+        raise RuntimeError("no inbox")
+
+    monkeypatch.setattr(rig.inbox, "put", put)
     rig.transport.reads.put(RuntimeError("driver"))
     rig.reader.start()
     end = time.monotonic() + 60
     while not rig.failures:
         assert time.monotonic() < end
         time.sleep(0.002)
-    assert str(rig.failures[0]) == "driver"
+    assert str(rig.failures[0]) == "no inbox"
+
+
+def test_a_driver_that_fails_is_a_lost_port_and_is_opened_anew(
+    rig: Rig, instant: Callable[[float], Instant]
+) -> None:
+    rig.reader.open(wait=False)
+    rig.transport.reads.put(ZeroDivisionError("a driver's mistake"))
+    rig.transport.reads.put(Chunk(instant(0), b"x"))
+    rig.reader.start()
+    assert isinstance(rig.next(), PortOpened)
+    lost = rig.next()
+    assert isinstance(lost, PortLost)
+    assert lost.reason == "scripted failed: a driver's mistake"
+    assert isinstance(rig.next(), PortOpened)
+    assert rig.next() == Chunk(instant(0), b"x")
+    assert rig.reader.stop()
+    assert rig.failures == []
 
 
 def test_a_recording_waits_for_the_pipeline_and_ends(instant: Callable[[float], Instant]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import sys
 from dataclasses import replace
@@ -313,3 +314,20 @@ def test_settings_of_a_newer_version_are_named(log_tool: Any, virtual: Any, tmp_
     assert "quantum" in outcome.err
     assert "update tactile-reach" in outcome.err
     assert PipelineSettings().method == "consensus"
+
+
+@pytest.mark.parametrize("flag", ["--config", "--calibration"])
+def test_a_log_is_not_reprocessed_by_what_cannot_be_read(
+    pressed: Path, log_tool: Any, tmp_path: Path, flag: str
+) -> None:
+    os.mkfifo(tmp_path / "pipe.toml")
+    (tmp_path / "zero.toml").symlink_to("/dev/zero")
+    (tmp_path / "number.toml").write_text("rate = " + "9" * 200_000)
+    (tmp_path / "deep.toml").write_text("a = " + "[" * 100_000)
+    for name in ("pipe", "zero", "number", "deep"):
+        outcome = log_tool(
+            "reprocess", pressed, flag, tmp_path / f"{name}.toml", "--out", tmp_path / "o.mcap"
+        )
+        assert outcome.code == 2, outcome
+        assert f"{name}.toml" in outcome.err
+        assert len(outcome.err.strip().splitlines()) == 1, outcome

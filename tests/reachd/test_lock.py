@@ -16,7 +16,7 @@ from reachd.lock import ArmLock, LockError, runtime_folder
 def test_the_second_is_refused_by_the_name_of_the_first(tmp_path: Path) -> None:
     first, second = ArmLock("arm", tmp_path), ArmLock("arm", tmp_path)
     first.acquire("left")
-    with pytest.raises(LockError, match=rf"process {os.getpid()}, reach 'left'"):
+    with pytest.raises(LockError, match=rf"process {os.getpid()}, user .+, reach 'left'"):
         second.acquire("right")
     ArmLock("other", tmp_path).acquire("right")
     first.release()
@@ -52,20 +52,89 @@ def test_a_link_that_someone_laid_is_not_followed(tmp_path: Path) -> None:
 def test_a_holder_s_note_that_is_garbage_does_not_hide_the_refusal(tmp_path: Path) -> None:
     first = ArmLock("arm", tmp_path)
     first.acquire("a")
-    first.path.write_bytes(b"\xff{")
-    with pytest.raises(LockError, match="commanded by another reachd: stop"):
+    first.note.write_bytes(b"\xff{")
+    with pytest.raises(LockError, match=rf"another reachd .process {os.getpid()}, user"):
         ArmLock("arm", tmp_path).acquire("b")
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
     with pytest.raises(LockError, match="TACTILE_RUNTIME_DIR"):
-        ArmLock("arm", tmp_path / "nowhere").acquire("a")
+        ArmLock("arm", tmp_path / "file").acquire("a")
 
 
-def test_all_users_share_one_folder_unless_another_is_named(
+def test_every_user_has_a_folder_unless_another_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("TACTILE_RUNTIME_DIR", raising=False)
-    assert runtime_folder() in (Path("/run/lock"), Path("/tmp"))
+    assert runtime_folder().parent in (Path("/run/lock"), Path("/tmp"))
+    assert runtime_folder().name == f"tactile-reach-{os.geteuid()}"
     monkeypatch.setenv("TACTILE_RUNTIME_DIR", str(tmp_path))
     assert ArmLock("arm").path.parent == tmp_path
+
+
+def test_a_file_that_lies_under_the_name_of_a_lock_keeps_its_contents(tmp_path: Path) -> None:
+    lock = ArmLock("arm", tmp_path)
+    lock.path.write_text("precious")
+    lock.note.symlink_to(tmp_path / "victim")
+    (tmp_path / "victim").write_text("precious, too")
+    lock.acquire("a")
+    assert lock.path.read_text() == "precious"
+    assert (tmp_path / "victim").read_text() == "precious, too"
+    lock.release()
+
+
+def test_a_second_name_of_another_file_is_not_taken_for_a_lock(tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    lock = ArmLock("arm", tmp_path)
+    os.link(victim, lock.path)
+    before = victim.stat()
+    with pytest.raises(LockError, match="it has a second name"):
+        lock.acquire("a")
+    assert victim.read_text() == "precious"
+    assert victim.stat().st_mode == before.st_mode
+
+
+@pytest.mark.parametrize("kind", ["fifo", "folder"])
+def test_what_is_not_a_plain_file_is_refused_without_waiting(tmp_path: Path, kind: str) -> None:
+    lock = ArmLock("arm", tmp_path)
+    if kind == "fifo":
+        os.mkfifo(lock.path)
+    else:
+        lock.path.mkdir()
+    with pytest.raises(LockError, match="it is not a plain file"):
+        lock.acquire("a")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs a second user")
+def test_the_lock_of_another_user_is_refused_and_its_holder_named(tmp_path: Path) -> None:
+    lock = ArmLock("arm", tmp_path)
+    script = (
+        "import fcntl, os, sys, time; os.setuid(65534)\n"
+        "f = os.open(sys.argv[1], os.O_RDWR | os.O_CREAT, 0o666); fcntl.flock(f, fcntl.LOCK_EX)\n"
+        'os.write(f, b\'{"pid": 1, "reach": "x\\\\u001b[2J"}\')\n'
+        "print('held', flush=True); time.sleep(60)"
+    )
+    tmp_path.chmod(0o777)
+    for parent in tmp_path.parents[:3]:
+        parent.chmod(0o755)
+    words = [sys.executable, "-c", script, str(lock.path)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"held\n"
+        with pytest.raises(LockError, match=r"belongs to user \w+") as caught:
+            lock.acquire("a")
+        holder.kill()
+    if Path("/proc/locks").exists():
+        assert f"process {holder.pid}, user nobody" in str(caught.value)
+    assert "\x1b" not in str(caught.value)
+
+
+def test_what_a_holder_says_of_itself_reaches_no_terminal_raw(tmp_path: Path) -> None:
+    first = ArmLock("arm", tmp_path)
+    first.acquire("x\x1b[2J" + "y" * 500)
+    with pytest.raises(LockError) as caught:
+        ArmLock("arm", tmp_path).acquire("b")
+    assert "\x1b" not in str(caught.value)
+    assert len(str(caught.value)) < 250

@@ -132,7 +132,7 @@ def test_errors_name_file_line_key_and_remedy(script, old, new, line, message) -
         ("lop_s = 3\n" + PRESS, "lop_s: is not known"),
         ("loop_s = 3\n" + PRESS, "loop_s: given 3; allowed: at least 9"),
         ("loop_s = 0\n" + PRESS, "loop_s: given 0; allowed: a number above 0"),
-        ("[[press]\n", "no valid TOML"),
+        ("[[press]\n", r"toml:1: Expected"),
         ("[[press]]\nposition_mm = [0, 200, 0]\nnormal_n = 1\n", "mm from the nearest taxel"),
         (
             '[[press]]\narray = "tip"\nnormal_n = 1\nramp_s = 0\nhold_s = 0\n',
@@ -146,7 +146,7 @@ def test_scripts_that_make_no_sense(script, text, message) -> None:
 
 
 def test_missing_and_unreadable_files(tmp_path: Path) -> None:
-    with pytest.raises(ScriptError, match=r"nowhere.toml: there is no such file"):
+    with pytest.raises(ScriptError, match=r"nowhere.toml: cannot be read .No such file"):
         load_script(tmp_path / "nowhere.toml")
     with pytest.raises(ScriptError, match="cannot be read"):
         load_script(tmp_path)

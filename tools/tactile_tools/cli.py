@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.metadata import version
 
+from tactile_bus.arguments import Parser
+
 TOOLS = (
     "log",
     "plot",
@@ -30,7 +32,7 @@ TOOLS = (
 
 def build_parser(tools: Sequence[str] = TOOLS) -> argparse.ArgumentParser:
     """Return the parser with the subcommands of ``tools``."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="tactile",
         description="Ask and tare boards, inspect, recover and plot logs, run reaches, demos, "
         "benchmarks and fuzzers.",

@@ -139,8 +139,8 @@ class TrialLog:
         if cycle.ambient.method != "off":
             self._write(AMBIENT, BOARD, maker.ambient(cycle), captured)
         if self._picture.due(captured):
-            picture = self._picture.draw(cycle, self._wall.wall_ns(captured))
-            self._write(CONTACTS, BOARD, picture, captured)
+            for picture in self._picture.draw(cycle, self._wall.wall_ns(captured)):
+                self._write(CONTACTS, BOARD, picture, captured)
 
     def _contacts(self, touch: Touch, contacts: tuple[FingerContact, ...]) -> None:
         """Write what was felt where there are no taxels: the engine's own contacts."""

@@ -107,6 +107,25 @@ class SerialTransport:
         poll.register(waker.read_end, select.POLLIN)
         self._serial, self._waker, self._poll = port, waker, poll
 
+    @property
+    def leads_elsewhere(self) -> bool:
+        """Whether the path as given has come to mean another device than the one that is open.
+
+        Of a link that was laid anew, say; false where the path leads nowhere at present.
+        """
+        port = self._serial
+        if port is None or self._name.startswith(USB_PREFIX):
+            return False
+        try:
+            return os.stat(self._name).st_rdev != os.fstat(port.fileno()).st_rdev
+        except (OSError, serial.SerialException, TypeError):
+            return False
+
+    def forget_device(self) -> None:
+        """Open the path as given next time, whatever USB device was behind it before."""
+        if not self._name.startswith(USB_PREFIX):
+            self.usb_serial = None
+
     def read(self, timeout: float) -> Chunk | None:
         """Bytes that have come, at most `READ_LIMIT`; see `Transport.read`."""
         with self._reading:

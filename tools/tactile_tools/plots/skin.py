@@ -270,7 +270,14 @@ def _round(newton: float) -> float:
 
 
 def _surface(board: BoardSeries, taxels: slice) -> Any:
-    return np.asarray(board.geometry.surface).reshape(-1, 2)[taxels] * 1e3
+    """Places on the unrolled skin, (n, 2) mm."""
+    surface = np.asarray(board.geometry.surface)
+    if surface.size:
+        return surface.reshape(-1, 2)[taxels] * 1e3
+    # The largest boards leave it out of their geometry: the array as it lies, seen from above.
+    places = np.asarray(board.geometry.position).reshape(-1, 3)[taxels]
+    centred = places - places.mean(axis=0)
+    return centred @ np.linalg.svd(centred)[2][:2].T * 1e3
 
 
 def _pitch(surface: Any) -> float:
