@@ -25,6 +25,8 @@ TOOLS = (
     "crash",
     "mutation",
     "bus",
+    "health",
+    "service",
 )
 """Modules of this package that add a subcommand; each defines ``add_parser(subparsers)``."""
 
