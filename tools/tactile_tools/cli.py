@@ -27,6 +27,7 @@ TOOLS = (
     "bus",
     "health",
     "service",
+    "soak",
 )
 """Modules of this package that add a subcommand; each defines ``add_parser(subparsers)``."""
 
