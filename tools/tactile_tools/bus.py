@@ -91,7 +91,7 @@ def _keys(options: argparse.Namespace) -> int:
         if options.remove is not None:
             role = remove_party(folder, options.remove)
             print(
-                f"{options.remove} is not a {role} any more; copy the new roles.toml of each "
+                f"{options.remove} has lost the role {role}; copy the new roles.toml of each "
                 f"party's folder in {folder} to its machine and restart what runs there"
             )
             return 0

@@ -72,7 +72,9 @@ def make_keys(order: Order) -> list[Path]:
     for name, role in order.parties:
         held = next((r for r, names in roles.items() if name in names and r != role), None)
         if held is not None:
-            raise LabError(f"{name} is a {held} already: take another name for a {role}")
+            raise LabError(
+                f"{name} has the role {held} already: take another name for the role {role}"
+            )
         if (order.folder / name).exists() and not order.again:
             raise LabError(
                 f"{order.folder / name} is there already; --again makes new keys for it (the old "
