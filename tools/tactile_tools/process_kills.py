@@ -30,9 +30,10 @@ PROCESSES = ("tactiled", "reachd", "cupboard")
 MOVING_FOR_S = 4.0
 """s of motion within which the kill comes."""
 
-REST_S = 0.35
-"""s after the kill within which the arm must rest: 200 ms for features, 100 for the arm's own
-expiry (faults.md rows 13 and 15), and what an observer on a busy machine may hear late."""
+REST_S = 0.5
+"""s after the kill within which the arm must rest: 200 ms to the zero twist, 100 for the arm's own
+expiry and braking (rows 13 and 15 of the fault table), and what an observer on a busy machine hears
+late."""
 
 WATCH_S = 0.5
 """s after the killed one is back in which nothing may move."""

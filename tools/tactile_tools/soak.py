@@ -47,8 +47,11 @@ GROWTH_MB = 20.0
 allocator moves about is a few."""
 
 GROWTH_DESCRIPTORS = 4.0
+QUIET_S = 10.0
+"""s at the end without a replug and without a reading, for every board to come back in."""
+
 LATE_S = 30.0
-"""s for every board to be back at the end."""
+"""s more that a board may take to be back at the end, on a busy machine."""
 
 
 @dataclass(slots=True)
@@ -151,7 +154,7 @@ def _soak(soak: Soak) -> None:
         folder = Path(name)
         names = [f"b{index}" for index in range(soak.boards)]
         for index, board in enumerate(names):
-            simulator = _simulator(soak, folder / board, index, seconds + LATE_S)
+            simulator = _simulator(soak, folder / board, index, seconds)
             said = folder / f"{board}.txt"
             wait_for(folder / board, stack.enter_context(running(simulator, said)), said)
         (folder / "soak.toml").write_text(
@@ -168,7 +171,8 @@ def _soak(soak: Soak) -> None:
         session = open_session(BusConfig(listen=(), connect=(endpoint,)))
         stack.callback(close_session, session)
         time.sleep(WARM_UP_S)
-        _watch(soak, process, started + seconds)
+        _watch(soak, process, started + seconds - QUIET_S)
+        time.sleep(QUIET_S)
         if process.poll() is not None:
             last = (folder / "tactiled.txt").read_text(errors="replace")[-2000:]
             soak.problems.append(f"tactiled ended with {process.returncode}: {last}")
@@ -182,7 +186,7 @@ def _soak(soak: Soak) -> None:
 
 
 def _simulator(soak: Soak, pty: Path, index: int, seconds: float) -> list[str]:
-    """A board that is away for `AWAY_S` in its turn, until ten seconds before the end."""
+    """A board that is away for `AWAY_S` in its turn, until `QUIET_S` before the end."""
     kind = KINDS[index % 2]
     words = [command("simdevice"), "boards", "--pty", str(pty), "--seed", str(index + 1)]
     words += ["--board", kind]
@@ -190,7 +194,7 @@ def _simulator(soak: Soak, pty: Path, index: int, seconds: float) -> list[str]:
         words += ["--rate", f"{soak.rate_hz:g}"]
     period = soak.replug_period_s * soak.boards
     at = WARM_UP_S / 2 + index * soak.replug_period_s
-    while at < seconds - LATE_S - 10:
+    while at < seconds - QUIET_S:
         words += ["--unplug", f"{at:g}s+{AWAY_S:g}s"]
         at += period
     return words
