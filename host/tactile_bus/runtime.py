@@ -89,6 +89,13 @@ def home() -> Runtime:
     return Runtime(Path(tempfile.gettempdir()) / f"tactile-{os.getuid()}")
 
 
+def _variable(runtime: Runtime) -> str:
+    """Environment variable that moves this folder: the secret stays where the user's home is."""
+    given = os.environ.get(RUNTIME_VARIABLE)
+    here = given is not None and runtime.folder == Path(given).absolute()
+    return RUNTIME_VARIABLE if here else "XDG_RUNTIME_DIR"
+
+
 def prepare(runtime: Runtime) -> None:
     """Make the folder of the sockets, mode 0750, or refuse one that others can get into.
 
@@ -110,17 +117,17 @@ def _prepare_folder(folder: Path, runtime: Runtime) -> None:
         itself, found = folder.lstat(), folder.stat()
     except OSError as error:
         raise RuntimeFolderError(
-            f"{folder}: {error.strerror}; name a folder of your own in {RUNTIME_VARIABLE}"
+            f"{folder}: {error.strerror}; name a folder of your own in {_variable(runtime)}"
         ) from error
     if not stat.S_ISDIR(found.st_mode):
         raise RuntimeFolderError(
-            f"{folder} is not a folder: delete it, or name another in {RUNTIME_VARIABLE}"
+            f"{folder} is not a folder: delete it, or name another in {_variable(runtime)}"
         )
     foreign = {itself.st_uid, found.st_uid} - {os.getuid(), 0}
     if foreign and not runtime.shared:
         raise RuntimeFolderError(
             f"{folder} belongs to another user, who could listen in: name a folder of your "
-            f"own in {RUNTIME_VARIABLE}"
+            f"own in {_variable(runtime)}"
         )
     if found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX:
         raise RuntimeFolderError(
@@ -146,7 +153,7 @@ def token_file(runtime: Runtime) -> tuple[Path, str]:
     except OSError as error:
         raise RuntimeFolderError(
             f"the secret of this rig, {path}, cannot be read ({error.strerror}): ask for the group "
-            f"that owns it, or name a folder of your own in {RUNTIME_VARIABLE}"
+            f"that owns it, or name a folder of your own in {_variable(runtime)}"
         ) from error
     except UnicodeDecodeError as error:
         raise RuntimeFolderError(f"{path} does not hold a secret: delete it") from error

@@ -320,6 +320,23 @@ def test_the_secret_is_made_once_and_kept_from_others(
         runtime.token_file(place)
 
 
+def test_the_folder_of_the_secret_may_not_be_anothers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Somebody may have made it first where all users write; the remedy names what moves it."""
+    monkeypatch.delenv(runtime.SYSTEMD_VARIABLE, raising=False)
+    monkeypatch.setenv(runtime.RUNTIME_VARIABLE, str(tmp_path / "rig"))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "tactile").mkdir(mode=0o700)
+    (tmp_path / "tactile").chmod(0o777)
+    with pytest.raises(BusError, match="may write to"):
+        open_session(BusConfig(role="tactiled"))
+    (tmp_path / "tactile").rmdir()
+    (tmp_path / "tactile").touch()
+    with pytest.raises(BusError, match=r"not a folder.*XDG_RUNTIME_DIR"):
+        open_session(BusConfig(role="tactiled"))
+
+
 def test_a_services_folder_is_its_groups_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, join: Any
 ) -> None:
