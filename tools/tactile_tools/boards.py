@@ -40,7 +40,7 @@ def add_board(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument(
         "board", nargs="?", metavar="BOARD", help=f"name of the board {what}, as tactiled has it"
     )
-    add_bus(parser, None)
+    add_bus(parser, "tool")
 
 
 def run(name: str, work: Callable[[argparse.Namespace], None]) -> Callable[..., int]:
