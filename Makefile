@@ -3,8 +3,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+SOAK_MINUTES ?= 60
+KILLS ?= 1000
 
-.PHONY: setup test test-random lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage stress clean
+.PHONY: setup test test-random lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage stress soak fuzz-pipeline kills clean
 
 setup: $(STAMP)
 
@@ -62,6 +64,18 @@ gate-coverage: setup
 # An hour of reaching while the machine is loaded and its memory churned.
 stress: setup
 	$(BIN)/tactile bench --only stress --json docs/results/stress.json
+
+# An hour of four boards, one of them pulled out and plugged in each second.
+soak: setup
+	$(BIN)/tactile soak --minutes $(SOAK_MINUTES) --json docs/results/soak.json
+
+# A million frames with right CRCs that say anything, through links and pipeline.
+fuzz-pipeline: setup
+	$(BIN)/tactile fuzz --through pipeline --frames 1000000 --json docs/results/fuzz-pipeline.json
+
+# A thousand kills of simulator, tactiled and reachd while they reach; two to three hours.
+kills: setup
+	$(BIN)/tactile crash --processes --kills $(KILLS) --json docs/results/kills.json
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache

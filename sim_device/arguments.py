@@ -141,7 +141,6 @@ def _add_boards(commands: Commands) -> argparse.ArgumentParser:
 
 def _add_cupboard(commands: Commands) -> argparse.ArgumentParser:
     from tactile_bus.options import add_bus
-    from tactile_bus.session import PORTS
 
     cupboard = commands.add_parser(
         "cupboard",
@@ -202,7 +201,7 @@ def _add_cupboard(commands: Commands) -> argparse.ArgumentParser:
     )  # fmt: skip
     add("--arm-noise", default="", metavar="SPEC", help="noise of its sensors, see below")
     add("--arm-fault", default="", metavar="SPEC", help="faults to inject, see below")
-    add_bus(cupboard, PORTS["arm"])
+    add_bus(cupboard, "arm")
     _add_duration(cupboard)
     return cupboard
 

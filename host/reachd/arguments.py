@@ -12,7 +12,6 @@ from reachd.settings import DEFAULT_SET, DEFAULT_STRATEGY, DEFAULT_WAIT
 from reachd.strategies.registry import BUILT_IN
 from tactile_bus.arguments import Parser
 from tactile_bus.options import add_log_and_bus, finite_above_zero
-from tactile_bus.session import PORTS
 
 EPILOG = """\
 examples:
@@ -102,7 +101,7 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="S",
         help=f"how long to wait for features and arm (s; default {DEFAULT_WAIT:g})",
     )
-    add_log_and_bus(parser, PORTS["reachd"])
+    add_log_and_bus(parser, "reachd")
     parser.add_argument("--verbose", action="store_true", help="say more")
     return parser
 

@@ -87,6 +87,7 @@ def _run(
     except StartError as error:
         print(f"reachd: {error}", file=sys.stderr)
         return REFUSED
+    daemon.watchdog.ready("disarmed")
     session = _Session(daemon, stopping)
     try:
         with StatusLine(console, daemon.loop, daemon.recorder) as line:

@@ -38,11 +38,13 @@ from reachd.services import ReachServices
 from reachd.settings import Settings
 from reachd.supervisor import State, Supervisor
 from reachd.touch_input import TouchInput
+from tactile_bus.disk_watch import DiskWatch
 from tactile_bus.instant import Instant, WallClock, monotonic_now, seconds_between
 from tactile_bus.messages import codec
 from tactile_bus.recorder import Recorder, RecorderError
 from tactile_bus.session import BusError, close_session, open_session
 from tactile_bus.streams import list_alive
+from tactile_bus.supervision import Watchdog
 from tactile_bus.topics import ARM_STATE, FEATURES, alive_key, commander_key
 
 log = logging.getLogger(__name__)
@@ -93,6 +95,8 @@ class Daemon:
         self._requests: OperatorRequests | None = None
         self._tokens: list[zenoh.LivelinessToken] = []
         self._log_state = "recording"
+        self.watchdog = Watchdog()
+        self._disk: DiskWatch | None = None
         self._collected = monotonic_now()
         p = settings.parameters
         supervisor = Supervisor(strategy, p, settings.home, auto_reset=settings.auto_reset)
@@ -139,7 +143,9 @@ class Daemon:
         self._session = session = open_session(settings.bus)
         self._claim(session)
         if settings.log is not None:
-            self.recorder = self._open_log(settings.log)
+            self.recorder = recorder = self._open_log(settings.log)
+            self._disk = DiskWatch(lambda: Path(recorder.stats.path).parent)
+            self._disk.start()
             self._listener = Listener(
                 session, self.recorder, self._wall, settings.board, settings.arm
             )
@@ -275,7 +281,10 @@ class Daemon:
         Nothing publishes once the session closes, which it does last. False when a thread is still
         inside somebody's code: it must then be left behind.
         """
+        self.watchdog.stopping("stopping")
         clean = ended = self.loop.stop(STOP_TIMEOUT)
+        if self._disk is not None:
+            self._disk.stop()
         if self._services is not None:
             self._services.close()
         if self._listener is not None:
@@ -309,6 +318,7 @@ class Daemon:
             "lateness_s": self.loop.lateness.summary(),
             "features": {} if touch is None else touch.counters(),
             "arm_state": {} if arm is None else arm.counters(),
+            "alarms": self._alarms(),
             "reports_dropped": 0 if self._reporter is None else self._reporter.dropped,
             "reports_unsent": 0 if self._reporter is None else self._reporter.unsent,
             "clock_problem": self._wall.problem,
@@ -334,6 +344,10 @@ class Daemon:
             values["log"] = dataclasses.asdict(self.recorder.stats)
         return values
 
+    def _alarms(self) -> list[str]:
+        disk = None if self._disk is None else self._disk.alarm(monotonic_now())
+        return [] if disk is None else [disk]
+
     # What the control loop calls
 
     def _sense(self, now: Instant) -> Inputs:
@@ -348,6 +362,7 @@ class Daemon:
             self._arm.command(twist, expiry, now)
 
     def _report(self, cycle: Cycle) -> None:
+        self.watchdog.beat(monotonic_now())  # on the control loop's thread, after its command
         if self._reporter is not None:
             self._reporter.cycle(cycle)
 

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import msgspec
 
+from tactile_bus.keys import TlsConfig
 from tactile_bus.recorder import RecorderSettings
-from tactile_bus.session import BusConfig, Role, TlsConfig
+from tactile_bus.session import PORTS, BusConfig, Role
 from tactile_bus.toml_text import printable
 
 DEFAULT_LOG = "tactile-logs"
@@ -34,12 +35,13 @@ class BusTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     listen: tuple[str, ...] | None = None
     connect: tuple[str, ...] | None = None
+    keys: str | None = None
     tls: TlsConfig | None = None
     insecure: bool = False
 
 
-def add_log_and_bus(parser: argparse.ArgumentParser, port: int) -> None:
-    """Add --log, --no-log, --listen, --connect and --insecure; ``port``: the role's own."""
+def add_log_and_bus(parser: argparse.ArgumentParser, role: Role) -> None:
+    """Add --log, --no-log, --listen, --connect, --keys and --insecure, for a daemon's ``role``."""
     add = parser.add_argument_group("log and bus").add_argument
     add(
         "--log",
@@ -47,32 +49,42 @@ def add_log_and_bus(parser: argparse.ArgumentParser, port: int) -> None:
         help=f"MCAP file to write, or folder for dated files (default folder ./{DEFAULT_LOG})",
     )
     add("--no-log", action="store_true", help="log nothing")
-    _add_bus(add, port)
+    _add_bus(add, role)
 
 
-def add_bus(parser: argparse.ArgumentParser, port: int | None) -> None:
-    """Add --listen, --connect and --insecure; ``port``: the role's own, None for tools."""
-    _add_bus(parser.add_argument_group("bus").add_argument, port)
+def add_bus(parser: argparse.ArgumentParser, role: Role) -> None:
+    """Add --listen, --connect, --keys and --insecure."""
+    _add_bus(parser.add_argument_group("bus").add_argument, role)
 
 
-def _add_bus(add: Callable[..., object], port: int | None) -> None:
-    default = "nowhere" if port is None else f"tcp/127.0.0.1:{port}"
+def _add_bus(add: Callable[..., object], role: Role) -> None:
+    tool = role not in PORTS
+    default = "nowhere" if tool else f"{role}.sock in the runtime folder"
     add(
         "--listen",
         action="append",
         metavar="ENDPOINT",
-        help=f"zenoh endpoint to listen at (default {default}); may be repeated",
+        help="zenoh endpoint to listen at: unixsock-stream//FOLDER/NAME.sock, tcp/127.0.0.1:PORT "
+        f"or tls/HOST:PORT (default {default}); may be repeated",
     )
     add(
         "--connect",
         action="append",
         metavar="ENDPOINT",
-        help="zenoh endpoint of a peer to join; may be repeated",
+        help="zenoh endpoint of a peer to join (default: the others in the runtime folder); may be "
+        "repeated",
+    )
+    add(
+        "--keys",
+        metavar="FOLDER",
+        help="folder of keys, made by `tactile bus keys`: join over TLS, with the rights of its "
+        "certificate",
     )
     add(
         "--insecure",
         action="store_true",
-        help="allow endpoints that leave this machine unprotected",
+        help="ask nobody who joins for a proof, and allow endpoints that leave this machine: "
+        "whoever reaches them may read and command; all of a rig say it, or none",
     )
 
 
@@ -82,6 +94,7 @@ def bus_config(options: argparse.Namespace, table: BusTable, role: Role) -> BusC
         role=role,
         listen=tuple(options.listen) if options.listen else table.listen,
         connect=tuple(options.connect) if options.connect else table.connect,
+        keys=options.keys or table.keys,
         tls=table.tls,
         insecure=options.insecure or table.insecure,
     )

@@ -16,6 +16,8 @@ import msgspec
 import zenoh
 
 from tactile_bus.messages import MAX_PAYLOAD
+from tactile_bus.rights import may_ask
+from tactile_bus.session import config_of
 
 log = logging.getLogger(__name__)
 
@@ -110,6 +112,7 @@ def call(session: zenoh.Session, key: str, payload: object = None, timeout: floa
     request = msgspec.json.encode({} if payload is None else payload)
     if len(request) > MAX_PAYLOAD:
         raise ValueError(f"request of {len(request)} bytes: {MAX_PAYLOAD} allowed")
+    _refuse_without_right(session, key)
     deadline = time.monotonic() + timeout
     while (remaining := deadline - time.monotonic()) > 0:
         replies = session.get(
@@ -129,9 +132,22 @@ def call(session: zenoh.Session, key: str, payload: object = None, timeout: floa
             if reply.err is not None:  # zenoh's own: the peer took the request and did not answer
                 raise NoAnswerError(f"no answer from {key} within {timeout:g} s")
         time.sleep(RETRY_PERIOD)
+    config = config_of(session)
+    who = "" if config is None else config.meets()
     raise NoAnswerError(
-        f"nobody serves {key}: is the daemon running, and this bus connected to it?"
+        f"nobody serves {key}: is the daemon running, and this bus connected to it{who}?"
     )
+
+
+def _refuse_without_right(session: zenoh.Session, key: str) -> None:
+    """`ServiceError` where our own certificate does not entitle to ask: nobody would answer."""
+    config = config_of(session)
+    role = None if config is None or config.tls is None else config.tls.role()
+    if role is not None and not may_ask(role, key):
+        raise ServiceError(
+            f"a certificate of the role {role} may not ask {key}: join with an operator's "
+            "(--keys FOLDER)"
+        )
 
 
 def _decode(key: str, payload: bytes) -> Any:

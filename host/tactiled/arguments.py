@@ -11,7 +11,6 @@ from typing import Any
 
 from tactile_bus.arguments import Parser
 from tactile_bus.options import add_log_and_bus, finite_above_zero
-from tactile_bus.session import PORTS
 from tactiled.links.line import KINDS, board_kind
 from tactiled.sensing.pipeline_settings import METHODS
 from tactiled.settings import DEFAULT_BAUD, array_sizes
@@ -161,7 +160,7 @@ def make_parser() -> argparse.ArgumentParser:
         help="contact features a second (default: every frame; the paper has 15 Hz)",
     )
 
-    add_log_and_bus(parser, PORTS["tactiled"])
+    add_log_and_bus(parser, "tactiled")
 
     group = parser.add_argument_group("running")
     add = group.add_argument

@@ -72,6 +72,7 @@ def _run(settings: Settings, console: Console, stopping: threading.Event) -> int
     except StartError as error:
         print(f"tactiled: {error}", file=sys.stderr)
         return REFUSED
+    daemon.watchdog.ready("running")
     try:
         with StatusLines(console, daemon.ports, daemon.recorder) as status:
             trouble = _watch(daemon, status, stopping)

@@ -20,13 +20,15 @@ from typing import Any
 import zenoh
 
 from tactile_bus.calibration import CalibrationError
-from tactile_bus.instant import Instant, WallClock, after, monotonic_now
+from tactile_bus.instant import Instant, WallClock, after, monotonic_now, seconds_between
 from tactile_bus.recorder import Recorder, RecorderError
 from tactile_bus.services import ServiceError
 from tactile_bus.session import BusError, close_session, open_session
 from tactile_bus.streams import declare_alive
+from tactile_bus.supervision import Watchdog
 from tactile_bus.topics import DIAGNOSTICS, alive_key
 from tactiled import diagnostics
+from tactiled.alarms import Alarms
 from tactiled.inbox import MAX_AGE, Inbox, Wake
 from tactiled.links.events import Identity, Refusal
 from tactiled.links.line import SerialLine
@@ -53,6 +55,10 @@ TICK = 0.01
 
 SWITCH_INTERVAL = 0.0005
 """s after which Python hands the interpreter on: a reader must stamp soon after its data came."""
+
+READER_STUCK = 5.0
+"""s after which a reader that does not come back from its driver is stuck: it reads for a fraction
+of a second at a time. Then the service manager is not told any more that all is well."""
 
 CALLS = 64
 """Requests that may wait for the pipeline's thread."""
@@ -98,6 +104,8 @@ class Daemon:
         self._stopping = threading.Event()
         self._collector = Collector()
         self._log_state = "recording"
+        self.watchdog = Watchdog()
+        self._alarms = Alarms()
         self._thread = threading.Thread(target=self._run, name="pipeline", daemon=True)
         ports = len(settings.ports)
         self._shelf = Shelf(settings.calibrations, strict=len(settings.calibrations) >= ports)
@@ -134,6 +142,7 @@ class Daemon:
             self.ports.append(self._make_port(wanted, transport, outlet))
         if settings.log is not None:
             self.recorder = outlet.recorder = self._open_log(settings.log)
+            self._alarms.watch(self.recorder)
         self._thread.start()
         for reader in self._readers:
             reader.start()
@@ -224,7 +233,9 @@ class Daemon:
         `Outlet.end` on nothing is published, so that no thread meets a closed session. False when
         a thread is still inside a driver, the disk or zenoh: it must be left behind.
         """
+        self.watchdog.stopping("stopping")
         self._stopping.set()
+        self._alarms.stop()
         self._wake.ring()
         if self._thread.is_alive():
             self._thread.join(JOIN_TIMEOUT)
@@ -275,6 +286,8 @@ class Daemon:
                 for port in self.ports:
                     port.pump(now, self._stopping.is_set)
                 self._serve_calls()
+                if all(seconds_between(r.beat, now) < READER_STUCK for r in self._readers):
+                    self.watchdog.beat(now)
                 if now >= next_second:
                     next_second = after(now, 1.0)
                     self._each_second(now)
@@ -352,6 +365,7 @@ class Daemon:
         station.each_second(now)
         wall_ns = self._wall.wall_ns(now)
         values = diagnostics.summary(port, node, station, now)
+        values["alarms"] = self._alarms.each_second(station, now)
         station.summary = values
         message = diagnostics.message(station.name, values, self.recorder, wall_ns)
         outlet.send(DIAGNOSTICS, station.name, message, wall_ns)

@@ -113,12 +113,13 @@ def message(name: str, values: dict[str, Any], recorder: Recorder | None, wall_n
     """``DiagnosticArray`` with the board and, where there is one, the log."""
     state = values["state"]
     level = LEVELS.get(state, WARNING)
-    if level == OK and not values.get("features_valid", True):
+    alarms = values.get("alarms", ())
+    if level == OK and (alarms or not values.get("features_valid", True)):
         level = WARNING
     masked = values.get("masked_chips", {})
     if level == OK and masked:
         level = WARNING
-    text = state if level == OK else "; ".join([state, *values.get("reasons", ())])
+    text = state if level == OK else "; ".join([state, *values.get("reasons", ()), *alarms])
     if masked:
         text += "; masked: " + ", ".join(masked)
     statuses = [

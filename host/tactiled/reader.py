@@ -9,6 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
+from tactile_bus.instant import monotonic_now
 from tactiled.blocks import Chunk
 from tactiled.inbox import Inbox, PortEnded, PortLost, PortOpened
 from tactiled.outlet import Outlet
@@ -72,6 +73,7 @@ class PortReader:
         self.unlogged = 0
         """Chunks that the log did not take."""
         self._resolve_at = 0.0
+        self.beat = monotonic_now()  # when its thread was last seen to go on
         self._inbox = inbox
         self._outlet = outlet
         self.name = name
@@ -124,6 +126,7 @@ class PortReader:
         transport, inbox, waiting = self.transport, self._inbox, self._waiting
         try:
             while True:
+                self.beat = monotonic_now()
                 chunk = transport.read(LOG_DELAY if waiting else READ_TIMEOUT)
                 if chunk is not None:
                     while self._paced and inbox.full and not self._stopping.wait(PACE):
@@ -167,6 +170,7 @@ class PortReader:
     def _reopen(self) -> None:
         wait, said = REOPEN_FIRST, ""
         while not self._stopping.wait(wait):
+            self.beat = monotonic_now()
             try:
                 self.transport.open()
             except TransportError as error:

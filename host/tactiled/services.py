@@ -105,6 +105,7 @@ class BoardServices:
         def sum_up() -> dict[str, Any]:
             values = summary(self._port, self._node, self._station, monotonic_now())
             recorder = self._station.recorder
+            values["alarms"] = self._station.summary.get("alarms", [])
             return values | {"log": None if recorder is None else log_summary(recorder)}
 
         result: dict[str, Any] = self._do(sum_up)

@@ -49,7 +49,8 @@ class Glimpse:
     """What is shown of a board. ``forces``: N, the normal force of the contacts on each side.
 
     ``bound``: N that their sum may err by (95 %), inf where nothing says. ``rate``: Hz.
-    ``latency``: s, median from the last byte to the features; NaN: none measured.
+    ``latency``: s, median from the last byte to the features; NaN: none measured. ``alarms``: what
+    somebody should look at before it becomes a fault.
     """
 
     name: str
@@ -61,6 +62,7 @@ class Glimpse:
     drops: int
     latency: float
     bound: float = math.inf
+    alarms: tuple[str, ...] = ()
 
 
 def glimpse(station: Station, now: Instant) -> Glimpse:
@@ -81,7 +83,7 @@ def glimpse(station: Station, now: Instant) -> Glimpse:
     drops = sum(station.summary.get("drops", {}).values())
     return Glimpse(
         station.name, station.state, forces, valid, reasons, station.rate, drops,
-        station.latency.p50, bound,
+        station.latency.p50, bound, tuple(station.summary.get("alarms", ())),
     )  # fmt: skip
 
 
@@ -116,8 +118,9 @@ def line(seen: Glimpse, width: int = WIDTH, name_width: int = 0) -> Text:
         if len(latency) <= width - text.cell_len:
             text.append(latency)
     room = width - text.cell_len - 2
-    if seen.reasons and room > 8:
-        because = Text("  " + "; ".join(seen.reasons), "yellow")
+    said = (*seen.alarms, *seen.reasons)
+    if said and room > 8:
+        because = Text("  " + "; ".join(said), "yellow")
         because.truncate(room + 2, overflow="ellipsis")
         text.append_text(because)
     text.truncate(width, overflow="ellipsis")

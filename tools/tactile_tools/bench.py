@@ -122,6 +122,7 @@ GROUPS = (
         "standing still after SIGSTOP and SIGKILL of each process",
         ("stop_ms_max_features", "stop_ms_max_arm_state", "stop_ms_max_commands"),
     ),
+    Group("cpu", "cpu", "bench_cpu", "processor time of tactiled with one and four fingers"),
     Group("soak", "soak", "bench_soak", "memory over an hour of simulated frames"),
     Group(
         "stress",

@@ -12,7 +12,7 @@ import zenoh
 
 from tactile_bus.options import BusTable, add_bus, bus_config
 from tactile_bus.services import ServiceError
-from tactile_bus.session import PORTS, BusError, close_session, open_session
+from tactile_bus.session import BusError, close_session, open_session
 from tactile_bus.streams import list_alive
 
 DONE, FAILED, USAGE, REFUSED = range(4)
@@ -40,7 +40,7 @@ def add_board(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument(
         "board", nargs="?", metavar="BOARD", help=f"name of the board {what}, as tactiled has it"
     )
-    add_bus(parser, None)
+    add_bus(parser, "tool")
 
 
 def run(name: str, work: Callable[[argparse.Namespace], None]) -> Callable[..., int]:
@@ -80,7 +80,9 @@ def find(session: zenoh.Session, options: argparse.Namespace) -> list[str]:
         time.sleep(GATHER_S)
         names |= set(list_alive(session, GATHER_S))
     if not names:
-        where = ", ".join(options.connect or (f"tcp/127.0.0.1:{PORTS['tactiled']}",))
+        where = ", ".join(bus_config(options, BusTable(), "tool").connect_endpoints()[:1])
+        if options.connect:
+            where = ", ".join(options.connect)
         raise BoardError(
             f"no tactiled answers at {where}: start it, or name its endpoint with --connect",
             REFUSED,

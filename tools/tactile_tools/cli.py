@@ -26,6 +26,10 @@ TOOLS = (
     "fuzz",
     "crash",
     "mutation",
+    "bus",
+    "health",
+    "service",
+    "soak",
 )
 """Modules of this package that add a subcommand; each defines ``add_parser(subparsers)``."""
 
@@ -35,7 +39,7 @@ def build_parser(tools: Sequence[str] = TOOLS) -> argparse.ArgumentParser:
     parser = Parser(
         prog="tactile",
         description="Ask and tare boards, inspect, recover and plot logs, run reaches, demos, "
-        "benchmarks and fuzzers.",
+        "benchmarks and fuzzers, look after a rig.",
     )
     parser.add_argument(
         "--version", action="version", version=f"tactile-reach {version('tactile-reach')}"

@@ -1,9 +1,13 @@
-"""``tactile crash``: kill processes that log, at random moments, and read what they left behind."""
+"""``tactile crash``: kill processes that log, at random moments, and read what they left behind.
+
+``--processes``: kill simulator, tactiled and reachd instead, while they reach (`process_kills`).
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import shutil
 import signal
@@ -15,6 +19,7 @@ from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -23,6 +28,7 @@ from rich.progress import Progress
 from tactile_bus.instant import NS_PER_S
 from tactile_bus.log_info import LogInfo, info
 from tactile_bus.log_records import LogError
+from tactile_bus.options import finite_above_zero
 from tactile_bus.recovery import recover
 from tactile_tools.crash_writer import TRUTH
 
@@ -85,6 +91,21 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--kills", type=_positive, default=1000, help="kills in all (1000)")
     parser.add_argument("--writers", type=_positive, default=6, help="processes at a time (6)")
     parser.add_argument("--seed", type=int, default=0, help="of the random moments (0)")
+    parser.add_argument(
+        "--processes",
+        action="store_true",
+        help="kill simulator, tactiled and reachd while they reach, and check that the arm rests",
+    )
+    parser.add_argument(
+        "--from-kill", type=_natural, default=0, metavar="N", help="with --processes: go on at N"
+    )
+    parser.add_argument(
+        "--seconds",
+        type=lambda text: finite_above_zero(text, "s"),
+        default=math.inf,
+        metavar="S",
+        help="with --processes: begin no kill after so many seconds",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the result here")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the logs of failed kills")
     parser.set_defaults(func=run)
@@ -97,8 +118,48 @@ def _positive(text: str) -> int:
     return value
 
 
+def _natural(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} given; allowed: a whole number, 0 or more")
+    return int(text)
+
+
+def _run_processes(options: argparse.Namespace) -> int:
+    """Kill the three processes; 0 when the arm rested each time and every log was read."""
+    from tactile_tools.process_kills import run_kills, write_json
+
+    console = Console(stderr=True)
+
+    def save(values: dict[str, Any]) -> None:
+        if options.json is not None:
+            options.json.parent.mkdir(parents=True, exist_ok=True)
+            write_json(options.json, values)
+
+    try:
+        with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+            task = bar.add_task("killing", total=options.kills)
+            totals = run_kills(
+                options.kills,
+                options.seed,
+                first=options.from_kill,
+                seconds=options.seconds,
+                progress=lambda done: bar.advance(task, done),
+                save=save,
+            )
+        save(asdict(totals))
+    except OSError as error:
+        print(f"tactile crash: {error.filename}: {error.strerror}", file=sys.stderr)
+        return 3
+    print(json.dumps(asdict(totals), indent=2))
+    if totals.kills < totals.asked:
+        print(f"go on with --from-kill {totals.next}", file=sys.stderr)
+    return 1 if totals.problems else 0
+
+
 def run(options: argparse.Namespace) -> int:
     """Kill and check; 0 when every file was read and recovered with at most 1 s lost, else 1."""
+    if options.processes:
+        return _run_processes(options)
     started = time.monotonic()
     result = Result(writers=options.writers, seed=options.seed)
     losses: list[float] = []

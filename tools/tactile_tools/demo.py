@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from tactile_tools.plots.series import LogUnreadableError
-from tactile_tools.processes import command, free_port, running, wait_for
+from tactile_tools.processes import command, running, socket_at, wait_for
 
 BOARD = "finger"
 
@@ -124,7 +124,7 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
     goal = _ask([simdevice, "cupboard", *scene, "--print-goal"])
     _ask([simdevice, "calibration", "--seed", str(options.seed), "--out", str(calibration)])
     _make_room(options.out)
-    arm, skin, reach = (f"tcp/127.0.0.1:{free_port()}" for _ in range(3))
+    arm, skin, reach = (socket_at(folder, n) for n in ("arm", "tactiled", "reachd"))
     cupboard = [simdevice, "cupboard", *scene, "--pty", str(board), "--listen", arm]
     sensing = [
         *(tactiled, "--port", str(board), "--name", BOARD, "--calibration", str(calibration)),

@@ -15,7 +15,7 @@ from sim_device.indenter import load_script
 from tactile_bus.geometry import finger
 from tactile_bus.instant import monotonic_now
 from tactile_tools.plots.series import BoardSeries, LogUnreadableError, read_boards
-from tactile_tools.processes import command, free_port, running, wait_for
+from tactile_tools.processes import command, running, socket_at, wait_for
 
 SEED = 1
 ROTATE = "90deg/10s"
@@ -126,7 +126,7 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
                 ),
                 *("--port", str(skin_port), "--name", "skin"),
                 *("--log", str(options.out), "--duration", str(options.duration)),
-                *("--listen", f"tcp/127.0.0.1:{free_port()}"),
+                *("--listen", socket_at(folder, "tactiled")),
             ],
             check=False,
         )

@@ -8,6 +8,7 @@ import pty
 import select
 import signal
 import subprocess
+import tempfile
 import threading
 import time
 import tty
@@ -24,7 +25,7 @@ from tactile_bus.services import ServiceError, call
 from tactile_bus.session import BusConfig, close_session, open_session
 from tactile_bus.streams import BusSample, Tap
 from tactile_bus.topics import ARM_STATE, COMMAND, FEATURES, REACH_STATE, Topic, service_key
-from tactile_tools.processes import command, free_port, wait_for
+from tactile_tools.processes import command, socket_at, wait_for
 
 BOARD, ARM, REACH, WORLD = "finger", "arm", "reach", "world"
 LOCKS = "TACTILE_RUNTIME_DIR"
@@ -115,10 +116,12 @@ class LiveReach:
         if not real_time:
             (folder / "ordinary.toml").write_text("[loop]\npriority = 0\n", encoding="utf-8")
             self._config = ["--config", "ordinary.toml"]
-        self._ends = {n: f"tcp/127.0.0.1:{free_port()}" for n in ("cupboard", "tactiled", "reachd")}
+        self._stack = contextlib.ExitStack()
+        # Not in ``folder``: a socket's path may have a hundred bytes, and that one's is the user's.
+        place = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="tactile-bus-")))
+        self._ends = {n: socket_at(place, n) for n in ("cupboard", "tactiled", "reachd")}
         self._started = 0
         self._running: dict[str, subprocess.Popen[bytes]] = {}
-        self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> LiveReach:
         """Start all three, and wait until features and states come."""

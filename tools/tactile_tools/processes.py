@@ -22,6 +22,14 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+def socket_at(folder: Path, name: str) -> str:
+    """Endpoint of a unix socket in ``folder``, so that a rig of our own leaves others be.
+
+    The folder must be one that others cannot enter, as `tempfile` makes them, with a short path.
+    """
+    return f"unixsock-stream/{folder.absolute() / name}.sock"
+
+
 def command(name: str) -> str:
     """Path of one of our commands, from the environment this one runs in."""
     beside = Path(sys.executable).with_name(name)

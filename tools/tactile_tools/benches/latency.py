@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pty
 import select
@@ -24,7 +25,7 @@ from tactile_bus.instant import Instant, monotonic_now
 from tactile_bus.messages import codec
 from tactile_bus.session import BusConfig, open_session
 from tactile_bus.topics import FEATURES
-from tactile_tools.processes import command, free_port, running
+from tactile_tools.processes import command, running, socket_at
 
 PERIOD_S = 0.010  # 100 Hz, the finger's usual rate
 FLOOR_KEY = "bench/floor"
@@ -55,22 +56,22 @@ def bench_latency(*, quick: bool = False) -> dict[str, float]:
     seconds = 8.0 if quick else 60.0
     with tempfile.TemporaryDirectory(prefix="tactile-latency-") as name:
         folder = Path(name)
-        ports = free_port(), free_port()
+        floor_at = socket_at(folder, "floor")
         with _tty() as (board_end, board_path), _tty() as (floor_end, floor_path):
-            endpoint = f"tcp/127.0.0.1:{ports[0]}"
+            endpoint = socket_at(folder, "tactiled")
             daemon = [
                 *(command("tactiled"), "--port", board_path, "--name", NAME),
                 *("--listen", endpoint, "--log", str(folder / "latency.mcap")),
             ]
             floor = [
                 *(sys.executable, "-c", FLOOR, floor_path),
-                f'["tcp/127.0.0.1:{ports[1]}"]',
+                json.dumps([floor_at]),
             ]
             with (
                 running(daemon, folder / "tactiled.txt"),
                 running(floor, folder / "floor.txt"),
             ):
-                run = _Run(board_end, floor_end, endpoint, f"tcp/127.0.0.1:{ports[1]}")
+                run = _Run(board_end, floor_end, endpoint, floor_at)
                 try:
                     run.drive(seconds)
                 finally:
@@ -118,10 +119,12 @@ class _Run:
         self._wire: list[float] = []
         self._bare: list[float] = []
         self._counting = False
-        self._session = open_session(BusConfig(listen=(), connect=(tactiled, floor)))
+        self._session = open_session(BusConfig(listen=(), connect=(tactiled,)))
+        # The bare program asks for no proof of who reads it, so that this reader brings none.
+        self._bare_session = open_session(BusConfig(listen=(), connect=(floor,), insecure=True))
         self._subscribers = (
             self._session.declare_subscriber(FEATURES.key(NAME), self._on_features),
-            self._session.declare_subscriber(FLOOR_KEY, self._on_floor),
+            self._bare_session.declare_subscriber(FLOOR_KEY, self._on_floor),
         )
 
     def _on_features(self, sample: Any) -> None:
@@ -179,3 +182,4 @@ class _Run:
     def close(self) -> None:
         """Leave the bus; without it the process would hang at exit."""
         self._session.close()
+        self._bare_session.close()

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from tactile_tools.processes import command, free_port, running, wait_for
+from tactile_tools.processes import command, running, socket_at, wait_for
 
 HOUR_OF_CYCLES = 3600 * 100  # the finger's usual rate is 100 Hz
 RATE_HZ = 300  # below what the simulated chips allow (349 Hz); three times faster than life
@@ -31,7 +31,7 @@ def bench_soak(*, quick: bool = False) -> dict[str, float]:
         daemon = [
             *(command("tactiled"), "--port", str(port), "--name", "soak"),
             *("--rate", str(RATE_HZ), "--log", str(folder / "soak.mcap")),
-            *("--listen", f"tcp/127.0.0.1:{free_port()}"),
+            *("--listen", socket_at(folder, "tactiled")),
         ]
         with running([*simulator, "--rate", str(RATE_HZ)], folder / "simulator.txt") as board:
             wait_for(port, board, folder / "simulator.txt")

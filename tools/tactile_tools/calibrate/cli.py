@@ -104,7 +104,7 @@ def _add_record(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         parser.add_argument(
             f"--{name}", type=_seconds, default=default, metavar="S", help=f"s {what} ({default:g})"
         )
-    add_bus(parser, None)
+    add_bus(parser, "tool")
     parser.set_defaults(func=actions.record_command)
 
 

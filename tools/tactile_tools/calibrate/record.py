@@ -16,7 +16,7 @@ from tactile_bus.session import BusConfig, BusError, close_session, open_session
 from tactile_tools.calibrate.actions import REFUSED, ActionError
 from tactile_tools.calibrate.live import LiveBoard, refuse_existing
 from tactile_tools.calibrate.wizard import Timing, Wizard, WizardError
-from tactile_tools.processes import command, free_port, running
+from tactile_tools.processes import command, running, socket_at
 
 
 def record(options: argparse.Namespace) -> None:
@@ -78,12 +78,12 @@ def _bus(options: argparse.Namespace) -> Iterator[tuple[BusConfig, Callable[[], 
     if options.port is None:
         yield bus_config(options, BusTable(), "tool"), lambda: False
         return
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    words = [command("tactiled"), "--port", options.port, "--name", options.name, "--no-log"]
-    words += ["--board", options.board, "--listen", endpoint]
-    if options.calibration is not None:
-        words += ["--calibration", str(options.calibration)]
     with tempfile.TemporaryDirectory(prefix="tactile-record-") as folder:
+        endpoint = socket_at(Path(folder), "tactiled")
+        words = [command("tactiled"), "--port", options.port, "--name", options.name, "--no-log"]
+        words += ["--board", options.board, "--listen", endpoint]
+        if options.calibration is not None:
+            words += ["--calibration", str(options.calibration)]
         said = Path(folder) / "tactiled"
         with running(words, said) as process:
             try:

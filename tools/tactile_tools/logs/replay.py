@@ -51,7 +51,7 @@ def fill(parser: argparse.ArgumentParser) -> None:
         help="times real time, or inf for as fast as can be (default 1)",
     )
     parser.add_argument("--loop", action="store_true", help="begin again at the end")
-    add_bus(parser, None)
+    add_bus(parser, "tool")
     parser.set_defaults(func=run)
 
 

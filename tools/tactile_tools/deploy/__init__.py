@@ -1,0 +1,1 @@
+"""Files of an installation: systemd units, udev rules, users, first configurations."""
