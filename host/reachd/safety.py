@@ -458,7 +458,10 @@ class SafetyGate:
             return
         if self._late_since is None:
             self._late_since = captured
-        text = f"commands take {late * 1e3:.0f} ms to come into force, {s.echo_age * 1e3:g} at most"
+        text = (
+            f"commands come into force at the arm {late * 1e3:.0f} ms late, or not at all: "
+            f"{s.echo_age * 1e3:g} ms are allowed"
+        )
         lost = seconds_between(self._late_since, captured) >= ECHO_LOST
         if lost and self._on(Check.ECHO_LOST):
             faults.append(Intervention(Check.ECHO_LOST, "latched", text))

@@ -92,6 +92,30 @@ def test_only_valid_features_count(spoil: dict, rig: Callable, passes: Callable)
     assert moved == 18
 
 
+@pytest.mark.parametrize(("every", "moves"), [(1, True), (2, True), (3, False), (18, False)])
+def test_touch_that_is_valid_now_and_then_stops(
+    every: int, moves: bool, rig: Callable, codes: Callable
+) -> None:
+    """Half of the last 200 ms is enough, a third is not."""
+    r, off = rig(), rig(Check.FEATURES_SPARSE)
+    for one, expected in ((r, moves), (off, True)):
+        for k in range(200):
+            decision = one.step(touch=replace(one.fresh_touch(-one.period), valid=k % every == 0))
+        assert ("features_sparse" not in codes(decision)) == expected
+        assert decision.held is None
+    for _ in range(30):
+        r.step()
+    assert r.step().twist != ZERO, "it goes on by itself"
+
+
+def test_time_that_goes_back_tells_nothing_of_touch(rig: Callable) -> None:
+    r = rig(Check.CLOCK_BACKWARDS)
+    for _ in range(30):
+        r.step(touch=replace(r.fresh_touch(), valid=False))
+    r.now = after(r.now, -5.0)
+    assert "features_sparse" not in {i.code.value for i in r.step().interventions}
+
+
 def test_features_out_of_order_do_not_make_older(rig: Callable, passes: Callable) -> None:
     r = rig()
     r.step()
