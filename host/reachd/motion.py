@@ -320,13 +320,16 @@ class MotionWatch:
         pace = length / seconds
         dead = abs(moves) < DEAD * pace * TRACK_NS / NS_PER_S
         if 0.0 <= went < (1.0 - DISAGREES) * length:
-            # Held back: by whatever presses on the finger, for it may be wedged any way.
-            force = sum(math.hypot(a.fx, a.fy) for a in lately) / len(lately)
-            torque = sum(abs(a.mz) for a in lately) / len(lately)
-            explained = force >= s.free_air_force or torque >= s.free_air_torque
+            # Held back: by whatever presses on the finger, for it may be wedged any way; or it was
+            # for a part of the window, and has come free.
+            explained = any(
+                sum(math.hypot(a.fx, a.fy) for a in some) >= s.free_air_force * len(some)
+                or sum(abs(a.mz) for a in some) >= s.free_air_torque * len(some)
+                for some in (states, lately)
+            )
         else:
             explained = aside or self._gives_way(index)
-        lies = reported >= REPORTED * pace or (_moving(last) and self._stays(index))
+        lies = reported >= REPORTED * pace or (_moving(lately) and self._stays(index))
         if explained and not (dead and lies):
             return None
         if dead:
@@ -342,9 +345,13 @@ class MotionWatch:
         )
 
 
-def _moving(arm: ArmState) -> bool:
-    """Whether its twist says that it moves: jammed arms creep slower."""
-    return max(math.hypot(arm.twist.vx, arm.twist.vy), abs(arm.twist.omega)) > CREEP
+def _moving(states: list[ArmState]) -> bool:
+    """Whether their mean twist says that the arm moves: jammed arms creep slower."""
+    n = len(states)
+    vx = math.fsum(a.twist.vx for a in states) / n
+    vy = math.fsum(a.twist.vy for a in states) / n
+    omega = math.fsum(a.twist.omega for a in states) / n
+    return max(math.hypot(vx, vy), abs(omega)) > CREEP
 
 
 def _off(moved: tuple[float, float, float], way: Path) -> tuple[float, float]:

@@ -215,3 +215,9 @@ def test_a_force_that_rises_is_foreseen(rig: Callable) -> None:
     touching(old, 0.0, Side.TIP, AHEAD)
     old.step(AHEAD, passed=300_000_000)
     assert touching(old, 4.0, Side.TIP, AHEAD).twist.vx == 0.04, "too long ago for a rate"
+
+
+def test_without_any_touch_the_wrist_alone_is_judged(rig: Callable) -> None:
+    r = rig(*OFF, Check.FEATURES_STALE, Check.FEATURES_LOST, Check.FEATURES_SPARSE, armed=False)
+    assert r.request(touch=None) == set()
+    assert r.step(AHEAD, touch=None).twist == AHEAD
