@@ -116,7 +116,7 @@ class SafetySettings:
     free_air_force: float = number("N", "force at arming that shows a bias or a wrong tool")
     free_air_torque: float = number("N·m", "torque at arming that shows a bias or a wrong tool")
     overload: float = number("", "part of force or torque at which it latches", 1.0)
-    overload_passes: float = number("", "passes of force or torque that latch it", 1.0)
+    overload_passes: float = number("", "passes of force or torque that latch it", 1.0, above=False)
     overload_within: float = number("s", "time within which so many passes count")
     skin_force: float = number("N", "sum of normal forces on the skin at which motion ends")
     touch_light: float = number("N", "force on the skin from which the finger touches something")

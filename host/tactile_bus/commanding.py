@@ -206,7 +206,7 @@ class CommandDesk:
     """The arm's side: grants its command to one at a time, and tells whose words are obeyed.
 
     Every command is judged as it comes, in any thread, so that no flood of others can hide the
-    commander's; `newest` then hands out the last that holds. ``key`` makes a secret of 32 bytes.
+    commander's; `newest` then hands out the last that holds.
     """
 
     def __init__(self) -> None:
