@@ -124,6 +124,20 @@ def test_a_dead_pose_latches_within_half_a_second_even_if_it_is_noisy(
     assert decision.held is Check.ARM_FROZEN
 
 
+def test_a_jammed_arm_may_tremble(rig: Callable) -> None:
+    """Its load explains that it stays; a twist far below what was told does not contradict it."""
+    for wanted, load, twist in (
+        (Twist(0.0, 0.0, 0.1), {"mz": -2.0}, Twist(0.0, 0.0, 0.004)),
+        (AHEAD, {"fx": -6.0}, Twist(0.002, 0.0, 0.0)),
+    ):
+        plant = Plant(rig(*OFF, Check.WRENCH), lambda _: ZERO, twist=twist, **load)
+        plant.noise = 3e-5
+        assert plant.run(100, wanted)[0] is None
+        lying = Plant(rig(*OFF, Check.WRENCH), lambda _: ZERO, twist=wanted, **load)
+        lying.noise = 3e-5
+        assert lying.run(100, wanted)[1].held is Check.ARM_FROZEN
+
+
 def test_half_the_way_that_nothing_holds_back_latches(rig: Callable) -> None:
     plant = Plant(rig(*OFF), lambda t: Twist(0.4 * t.vx, 0.4 * t.vy, t.omega))
     when, decision = plant.run(60)
