@@ -74,6 +74,7 @@ LATER_FIELDS: Mapping[str, frozenset[str]] = {
     "tactile_msgs/msg/ContactFeatures": frozenset(
         {"reason_codes", "peak_force_bound", "normal_force_bound", "tip_force_bound"}
     ),
+    "tactile_msgs/msg/SkinGeometry": frozenset({"array_posed"}),
     "tactile_msgs/msg/TaxelForces": frozenset({"normal_bound"}),
 }
 """Fields that a type has got since its first version. Logs from before lack them, and are read:

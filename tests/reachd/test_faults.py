@@ -62,7 +62,8 @@ def test_a_step_of_the_system_clock_changes_nothing(
     assert set(lab.codes("intervention")) <= {"not_armed", "features_lost", "features_stale",
                                               "arm_stale", "arm_lost", "arm_limits", "loop_late",
                                               "acceleration", "slow_down", "commander",
-                                              "echo_late", "echo_lost", "features_sparse"}  # fmt: skip
+                                              "echo_late", "echo_lost",
+                                              "features_sparse"}  # fmt: skip
     with (lab.folder / "trial.mcap").open("rb") as file:
         stamps = [
             (message.log_time, message.publish_time)
