@@ -13,12 +13,19 @@ from typing import Any, Final
 import msgspec
 import zenoh
 
-from sim_device.arm_commands import CommandInput
 from sim_device.cupboard import Cupboard, NotNow
 from sim_device.world.base import PHYSICS_STEP, World, WorldError
 from sim_device.world.scene_markers import FRAME, scene_markers
 from sim_device.world.scenes import Scene, SceneError
-from tactile_bus.arm_types import ArmLimits, ArmState
+from tactile_bus.arm_services import serve_desk
+from tactile_bus.arm_types import ArmLimits, ArmState, Echo
+from tactile_bus.commanding import (
+    CommandDesk,
+    LimitsRequest,
+    NotGrantedError,
+    Signed,
+    limits_fields,
+)
 from tactile_bus.instant import (
     Instant,
     WallClock,
@@ -30,7 +37,7 @@ from tactile_bus.markers import frame_transform
 from tactile_bus.messages import MSG, codec, header
 from tactile_bus.services import Service, ServiceError, declare_service
 from tactile_bus.session import BusConfig, BusError, close_session, open_session
-from tactile_bus.streams import Latest, Publisher, Tap, declare_publisher, latest
+from tactile_bus.streams import BusSample, Publisher, Tap, declare_publisher
 from tactile_bus.topics import ARM_STATE, COMMAND, TF, WORLD, alive_key, service_key
 
 log = logging.getLogger(__name__)
@@ -61,9 +68,11 @@ class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A request that says nothing."""
 
 
-def state_message(state: ArmState, sequence: int, wall_ns: int) -> Any:
-    """``ArmState.msg`` of a state captured at ``wall_ns``."""
-    twist = state.twist
+def state_message(state: ArmState, sequence: int, wall_ns: int, commander: str = "") -> Any:
+    """``ArmState.msg`` of a state captured at ``wall_ns``, while ``commander`` is obeyed."""
+    twist, echo = state.twist, state.echo
+    if echo is None or echo.commander != commander:
+        echo = Echo(commander, 0, Instant(0))  # the command in force is an earlier commander's
     return MSG.ArmState(
         header=header(wall_ns, FRAME),
         captured_ns=state.captured,
@@ -78,6 +87,9 @@ def state_message(state: ArmState, sequence: int, wall_ns: int) -> Any:
         omega_max=state.omega_max,
         f_max=state.f_max,
         m_max=state.m_max,
+        commander=echo.commander,
+        command_sequence=echo.sequence,
+        command_ns=echo.decided,
     )
 
 
@@ -100,8 +112,7 @@ class _Ends:
     states: Publisher
     markers: Publisher
     frames: Publisher
-    commands: Latest
-    watch: Tap
+    commands: Tap
     services: list[Service]
     token: zenoh.LivelinessToken
 
@@ -126,7 +137,7 @@ class ArmServer:
         self.name = name
         self.world_name = world_name
         self.sent = 0
-        self.commands = CommandInput()
+        self.desk = CommandDesk()
         self._bus = bus
         self._load = load
         self._make_world = make_world
@@ -149,19 +160,19 @@ class ArmServer:
         """Commands not obeyed, by reason, and what came late."""
         arm = self.cupboard.counters
         kept = {k: v for k, v in arm.items() if k not in ("accepted", "clamped", "expired")}
-        return {**self.commands.refused, "oversized": self._oversized, **kept}
+        return {**self.desk.refused, "oversized": self._oversized, **kept}
 
     def note(self) -> str:
         """How the arm is and how far from the goal, for a status line."""
         text = f"{self.cupboard.arm.mode}  {self.cupboard.distance * 100:.1f} cm to goal"
-        refused = sum(self.commands.refused.values()) + self._oversized
+        refused = sum(self.desk.refused.values()) + self._oversized
         late = self.cupboard.counters["late_steps"] * round(PHYSICS_STEP * 1000)
         text += f"  refused {refused}" if refused else ""
         return text + (f"  late {late} ms" if late else "")
 
     @property
     def _oversized(self) -> int:
-        return 0 if self._ends is None else self._ends.watch.refused
+        return 0 if self._ends is None else self._ends.commands.refused
 
     def fileno(self) -> int:
         """There is nothing to wait on: commands are fetched every tick."""
@@ -191,17 +202,20 @@ class ArmServer:
             ends = self._ends = self._begin(self._session, now)
         with self._lock:
             states = self.cupboard.advance(now)
-            sample = ends.commands.newest()
-            twist = None if sample is None else self.commands.take(sample, now)
-            # It came since the last look, nobody knows when: taken as having come right then.
-            waited = seconds_between(self._polled, now)
-            if twist is not None and self.cupboard.command(twist, now, waited):
-                self._obeyed = self._polled
+            order = self.desk.newest(now)
+            if order is not None:
+                # It came since the last look, nobody knows when: taken as having come right then.
+                waited = seconds_between(self._polled, now)
+                left = seconds_between(now, order.expires)
+                echo = Echo(order.commander, order.sequence, order.decided)
+                if self.cupboard.command(order.twist, now, waited, left, echo):
+                    self._obeyed = self._polled
             self._polled = now
+            commander = self.desk.commander
         for state in states:
             self.sent += 1
             wall_ns = self._wall.wall_ns(state.captured)
-            message = state_message(state, self.sent % SEQUENCES, wall_ns)
+            message = state_message(state, self.sent % SEQUENCES, wall_ns, commander)
             ends.states.put(self._codec.encode(ARM_STATE, message), wall_ns)
             if state.captured >= self._next_frame:
                 self._next_frame = after(state.captured, FRAME_PERIOD)
@@ -223,15 +237,18 @@ class ArmServer:
             states=declare_publisher(session, ARM_STATE, self.name),
             markers=declare_publisher(session, WORLD, self.world_name),
             frames=declare_publisher(session, TF, "tf"),
-            commands=latest(session, command_key),
-            # The newest sample may hide another sender's, so that all are looked at beside it.
-            watch=Tap(session, command_key, lambda s: self.commands.watch(s, monotonic_now())),
+            # Each is judged as it comes: the newest of all could be a stranger's.
+            commands=Tap(session, command_key, self._hear),
             services=[
                 declare_service(session, key, handler, request)
                 for key, handler, request in self._handlers()
-            ],
+            ]
+            + serve_desk(session, self.name, self.desk),
             token=session.liveliness().declare_token(alive_key(self.name, "arm")),
         )
+
+    def _hear(self, sample: BusSample) -> None:
+        self.desk.hear(sample.data, monotonic_now())
 
     def _refuse_namesake(self, session: zenoh.Session) -> None:
         key = alive_key(self.name, "arm")
@@ -246,18 +263,26 @@ class ArmServer:
     def _handlers(self) -> Sequence[tuple[str, Callable[[Any], object], Any]]:
         arm, world = self.name, self.world_name
         return (
-            (service_key(arm, "limits", "arm"), self._set_limits, ArmLimits),
-            (service_key(arm, "clear", "arm"), self._clear, Nothing),
+            (service_key(arm, "limits", "arm"), self._set_limits, LimitsRequest),
+            (service_key(arm, "clear", "arm"), self._clear, Signed),
             (service_key(arm, "status", "arm"), self._arm_status, Nothing),
             (service_key(world, "reset", "world"), self._reset, ResetRequest),
             (service_key(world, "status", "world"), self._world_status, Nothing),
         )
 
-    def _set_limits(self, limits: ArmLimits) -> ArmLimits:
-        with self._lock:
-            return self.cupboard.request_limits(limits)
+    def _authorise(self, service: str, request: Signed, **fields: object) -> None:
+        try:
+            self.desk.authorise(service, request, monotonic_now(), **fields)
+        except NotGrantedError as error:
+            raise ServiceError(str(error)) from error
 
-    def _clear(self, _: Nothing) -> dict[str, str]:
+    def _set_limits(self, request: LimitsRequest) -> ArmLimits:
+        self._authorise("limits", request, **limits_fields(request.limits))
+        with self._lock:
+            return self.cupboard.request_limits(request.limits)
+
+    def _clear(self, request: Signed) -> dict[str, str]:
+        self._authorise("clear", request)
         try:
             with self._lock:
                 return {"mode": self.cupboard.clear()}
@@ -271,7 +296,7 @@ class ArmServer:
                 "mode": arm.mode,
                 "limits": arm.limits,
                 "states": self.sent,
-                "commander": self.commands.commander,
+                "commander": self.desk.commander or None,
                 "last_command_ns": self._obeyed,
                 "counters": self.cupboard.counters | self.losses,
             }

@@ -20,14 +20,14 @@ from sim_device.faults import Window
 from sim_device.world.arm import STEP_NS, ArmFault, ArmSettings, SimulatedArm
 from sim_device.world.base import World
 from sim_device.world.touch import on_skin
-from tactile_bus.arm_types import ArmLimits, ArmState, Twist
+from tactile_bus.arm_types import ArmLimits, ArmState, Echo, Twist
 from tactile_bus.geometry import TIP_X
 from tactile_bus.instant import NS_PER_S, Instant, seconds_between
 
 COMMAND_EXPIRY: Final = 0.045
-"""s a command holds from its receipt. With its braking, the period of states and the way over
-the bus, whoever watches the arm sees it at rest within 100 ms of the last command; with 50 ms
-the longest of twenty times was 101."""
+"""s a command holds from its receipt at most, however much of its own expiry is left. With its
+braking, the period of states and the way over the bus, whoever watches the arm sees it at rest
+within 100 ms of the last command; with 50 ms the longest of twenty times was 101."""
 
 MAX_CATCH_UP: Final = 0.25
 """s that are made up for at most: 3 ms of work, and three times what a command may hold."""
@@ -127,16 +127,24 @@ class Cupboard:
             self._suspended += excess
         return states + self._moved_on(Instant(now - self._suspended))
 
-    def command(self, twist: Twist, now: Instant, waited: float) -> bool:
-        """Obey ``twist``, which came at most ``waited`` s before ``now``; False when refused.
+    def command(
+        self,
+        twist: Twist,
+        now: Instant,
+        waited: float,
+        left: float = COMMAND_EXPIRY,
+        echo: Echo | None = None,
+    ) -> bool:
+        """Obey ``twist`` for ``left`` s more; False when refused.
 
-        It expires as if it had come that early. Call it after `advance` to ``now``.
+        It came at most ``waited`` s before ``now``, and holds no longer than if it had come that
+        early. Call it after `advance` to ``now``.
         """
-        expiry = COMMAND_EXPIRY - waited
+        expiry = min(left, COMMAND_EXPIRY - waited)
         if expiry <= 0:
             self._late["late_commands"] += 1
             return False
-        return self.arm.command(twist, Instant(now - self._suspended), expiry)
+        return self.arm.command(twist, Instant(now - self._suspended), expiry, echo)
 
     def request_limits(self, limits: ArmLimits) -> ArmLimits:
         """Ask the arm for ``limits``; returns those in force."""

@@ -90,7 +90,9 @@ def _run(
     daemon.watchdog.ready("disarmed")
     session = _Session(daemon, stopping)
     try:
-        with StatusLine(console, daemon.loop, daemon.recorder) as line:
+        with StatusLine(
+            console, daemon.loop, daemon.recorder, settings.parameters.safety.cautions
+        ) as line:
             code = session.run(line)
     except StartError as error:
         print(f"reachd: {error}", file=sys.stderr)
@@ -155,6 +157,7 @@ class _Session:
 
     def _look(self, line: StatusLine) -> None:
         self._note_outcome()
+        self._daemon.check_arm()
         line.show()
         self._daemon.watch()
         beat = self._daemon.loop.lateness.cycles

@@ -20,11 +20,15 @@ MAX_FINISHED = 16
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """Newest inputs, None where none ever came; whether a second publisher was seen on one."""
+    """Newest inputs, None where none ever came; whether a second publisher was seen on one.
+
+    ``rivalled``: somebody else was seen to send commands to the arm.
+    """
 
     touch: Touch | None
     arm: ArmState | None
     duplicate: bool = False
+    rivalled: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +91,7 @@ class Controller:
             now,
             lateness=lateness,
             duplicate=inputs.duplicate,
+            rivalled=inputs.rivalled,
             failure=command.failure,
         )
         self._troubles = tuple(

@@ -32,12 +32,13 @@ from reachd.outcome import Outcome
 from reachd.publish import Reporter
 from reachd.report import as_json
 from reachd.safety import SafetyGate
-from reachd.safety_settings import SafetySettings
+from reachd.safety_settings import Check, SafetySettings
 from reachd.seam import Goal, Strategy
 from reachd.services import ReachServices
 from reachd.settings import Settings
 from reachd.supervisor import State, Supervisor
 from reachd.touch_input import TouchInput
+from tactile_bus.arm_types import Echo
 from tactile_bus.disk_watch import DiskWatch
 from tactile_bus.instant import Instant, WallClock, monotonic_now, seconds_between
 from tactile_bus.messages import codec
@@ -45,7 +46,7 @@ from tactile_bus.recorder import Recorder, RecorderError
 from tactile_bus.session import BusError, close_session, open_session
 from tactile_bus.streams import list_alive
 from tactile_bus.supervision import Watchdog
-from tactile_bus.topics import ARM_STATE, FEATURES, alive_key, commander_key
+from tactile_bus.topics import ARM_STATE, FEATURES, alive_key, commander_key, service_key
 
 log = logging.getLogger(__name__)
 
@@ -97,6 +98,7 @@ class Daemon:
         self._log_state = "recording"
         self.watchdog = Watchdog()
         self._disk: DiskWatch | None = None
+        self._commanded = False  # the arm was ours once
         self._collected = monotonic_now()
         p = settings.parameters
         supervisor = Supervisor(strategy, p, settings.home, auto_reset=settings.auto_reset)
@@ -115,7 +117,12 @@ class Daemon:
     def about(self) -> dict[str, Any]:
         """What a reach was made with."""
         s = self.settings
-        return {"strategy": s.strategy, "set": s.parameters.name, "seed": s.seed}
+        return {
+            "strategy": s.strategy,
+            "set": s.parameters.name,
+            "seed": s.seed,
+            "note": s.parameters.note,
+        }
 
     def start(self) -> None:
         """Bring everything up, disarmed; `StartError`, and all down again, when that cannot be."""
@@ -153,7 +160,12 @@ class Daemon:
             session, settings.board, safety.features_age, remote=settings.remote_board
         )
         self._arm = BusArm(
-            session, settings.arm, self._wall, safety.arm_age, remote=settings.remote_arm
+            session,
+            settings.arm,
+            self._wall,
+            safety.arm_age,
+            reach=settings.name,
+            remote=settings.remote_arm,
         )
         self._arm.open()
         self._reporter = Reporter(
@@ -168,6 +180,12 @@ class Daemon:
         self._requests = OperatorRequests(
             self.loop, self._arm, settings.parameters, self._reporter, self._log_trouble
         )
+        for caution in safety.cautions:
+            log.warning("safety: %s", caution)
+            self._reporter.event("safety", "caution", caution)
+        if settings.parameters.note:
+            log.info("set %s: %s", settings.parameters.name, settings.parameters.note)
+            self._reporter.event("safety", "note", settings.parameters.note)
         # What lives now is taken out of the collector's sight, which must not stop the loop.
         gc.collect()
         gc.freeze()
@@ -200,12 +218,21 @@ class Daemon:
         safety = self.settings.parameters.safety
         deadline = time.monotonic() + self.settings.wait
         while not (stopping.is_set() or self.done.is_set()):
+            self.check_arm()
             cycle = self.loop.last
             if cycle is not None and _fit(cycle, safety):
                 return
             if time.monotonic() >= deadline:
                 raise StartError(self._missing())
             stopping.wait(0.02)
+
+    def check_arm(self) -> None:
+        """`StartError` when the arm was never ours and is another's."""
+        if self._arm is not None and self._arm.denied is not None and not self._commanded:
+            raise StartError(self._arm.denied)
+        cycle = self.loop.last
+        arm = None if cycle is None else cycle.inputs.arm
+        self._commanded |= arm is not None and arm.echo is not None and arm.echo.own
 
     def reach(self, goal: Goal) -> None:
         """Arm and begin a reach; `StartError` when either is refused."""
@@ -319,6 +346,8 @@ class Daemon:
             "features": {} if touch is None else touch.counters(),
             "arm_state": {} if arm is None else arm.counters(),
             "alarms": self._alarms(),
+            "cautions": self.settings.parameters.safety.cautions,
+            "note": self.settings.parameters.note,
             "reports_dropped": 0 if self._reporter is None else self._reporter.dropped,
             "reports_unsent": 0 if self._reporter is None else self._reporter.unsent,
             "clock_problem": self._wall.problem,
@@ -355,16 +384,16 @@ class Daemon:
         if touch is None or arm is None:
             return Inputs(None, None)
         newest, state = touch.newest(now), arm.state(now)
-        return Inputs(newest, state, touch.duplicated(now) or arm.duplicated(now))
+        duplicate = touch.duplicated(now) or arm.duplicated(now)
+        return Inputs(newest, state, duplicate, arm.rivalled(now))
 
-    def _act(self, twist: Any, expiry: float, now: Instant) -> None:
-        if self._arm is not None:
-            self._arm.command(twist, expiry, now)
+    def _act(self, twist: Any, expiry: float, now: Instant) -> bytes:
+        return b"" if self._arm is None else self._arm.command(twist, expiry, now)
 
-    def _report(self, cycle: Cycle) -> None:
+    def _report(self, cycle: Cycle, sent: bytes) -> None:
         self.watchdog.beat(monotonic_now())  # on the control loop's thread, after its command
         if self._reporter is not None:
-            self._reporter.cycle(cycle)
+            self._reporter.cycle(cycle, sent)
 
     def fail(self, error: BaseException) -> None:
         """A thread, the caller's or the one it speaks for, has failed."""
@@ -418,6 +447,11 @@ class Daemon:
                 f"the state of arm {s.arm!r} is {cycle.arm_age:.3f} s old: has its driver stopped? "
                 'If it runs on another machine, set [inputs] arm_clock = "remote"'
             )
+        elif cycle.inputs.arm.echo is not None and not cycle.inputs.arm.echo.own:
+            problems.append(
+                f"arm {s.arm!r} has not granted its command within {s.wait:g} s: does its driver "
+                f"serve {service_key(s.arm, 'claim', 'arm')}?"
+            )
         return "; ".join(problems) or "features and arm come too seldom to start"
 
 
@@ -428,9 +462,16 @@ def _fit(cycle: Cycle, safety: SafetySettings) -> bool:
         touch is not None
         and touch.valid
         and cycle.inputs.arm is not None
+        and all(i.code is not Check.FEATURES_SPARSE for i in cycle.decision.interventions)
+        and (cycle.inputs.arm.echo is None or _obeys(cycle.inputs.arm.echo))
         and -safety.future <= cycle.touch_age < safety.features_age
         and -safety.future <= cycle.arm_age < safety.arm_age
     )
+
+
+def _obeys(echo: Echo) -> bool:
+    """Whether the arm has obeyed one of our commands."""
+    return echo.own and echo.sequence > 0
 
 
 def _texts(values: dict[str, float]) -> dict[str, str]:

@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 
 from reachd.safety_settings import SafetySettings
-from reachd.seam import ArmState, Twist
+from reachd.seam import ArmState, Touch, Twist
+from tactile_bus.geometry import Side
 from tactile_bus.records import record
 
 ROUNDING = 1e-12
@@ -19,7 +20,8 @@ NO_OVERSHOOT = math.e
 time constant is at least e times the delay."""
 
 PARALLEL = 1e-6
-"""Sine of the angle below which two borders have no corner worth the name."""
+"""Sine of the angle below which two borders have no corner worth the name, and a velocity is that
+before, slowed down."""
 
 
 @record
@@ -58,17 +60,50 @@ def within_speed(twist: Twist, speed: float, turn: float) -> Twist:
 def within_acceleration(twist: Twist, last: Twist, dv: float, dw: float) -> Twist:
     """``twist``, at most ``dv`` (m/s) and ``dw`` (rad/s) away from the ``last`` command.
 
-    A stop is never delayed: the zero twist passes as it is.
+    Braking is never delayed: a velocity along the last one and no faster passes as it is, and so
+    does a turning; one the other way is at once brought to zero.
     """
-    if twist.vx == 0.0 and twist.vy == 0.0 and twist.omega == 0.0:
+    vx, vy = _velocity_step(twist, last, dv)
+    omega = _turning_step(twist.omega, last.omega, dw)
+    if vx == twist.vx and vy == twist.vy and omega == twist.omega:
         return twist
-    ax, ay, aw = twist.vx - last.vx, twist.vy - last.vy, twist.omega - last.omega
+    return Twist(vx, vy, omega)
+
+
+def _velocity_step(twist: Twist, last: Twist, dv: float) -> tuple[float, float]:
+    ax, ay = twist.vx - last.vx, twist.vy - last.vy
     step = math.hypot(ax, ay)
-    if step <= dv and abs(aw) <= dw:
-        return twist
-    part = dv / step if step > dv else 1.0
-    turn = math.copysign(dw, aw) if abs(aw) > dw else aw
-    return Twist(last.vx + ax * part, last.vy + ay * part, last.omega + turn)
+    if step <= dv:
+        return twist.vx, twist.vy
+    before = math.hypot(last.vx, last.vy)
+    across = abs(twist.vx * last.vy - twist.vy * last.vx)
+    if across <= PARALLEL * before * math.hypot(twist.vx, twist.vy):
+        along = twist.vx * last.vx + twist.vy * last.vy
+        if along >= 0.0 and math.hypot(twist.vx, twist.vy) <= before:
+            return twist.vx, twist.vy
+        if along < 0.0 and before > dv:
+            return 0.0, 0.0
+    return last.vx + ax * dv / step, last.vy + ay * dv / step
+
+
+def _turning_step(omega: float, last: float, dw: float) -> float:
+    step = omega - last
+    if abs(step) <= dw:
+        return omega
+    if omega * last >= 0.0 and abs(omega) <= abs(last):
+        return omega
+    if omega * last < 0.0 and abs(last) > dw:
+        return 0.0
+    return last + math.copysign(dw, step)
+
+
+def braked(last: Twist, rules: list[Constraint], speed: float, turn: float) -> Twist:
+    """The last command, slowed down along its way until it keeps ``rules`` and both speeds."""
+    twist = within_speed(last, speed, turn)
+    for rule in rules:
+        if rule.broken_by(twist):
+            twist = scaled(twist, rule.bound / rule.along(twist))
+    return twist
 
 
 def workspace_constraints(
@@ -114,6 +149,58 @@ def load(arm: ArmState, settings: SafetySettings) -> float:
 def approach_left(part: float, soft: float) -> float:
     """Part of an approach that is left at the load ``part``: all to ``soft``, none from 1 on."""
     return min(1.0, max(0.0, (1.0 - part) / (1.0 - soft)))
+
+
+def felt(touch: Touch) -> float:
+    """N that the skin may feel at most: touch with its own uncertainty.
+
+    A bound that is not known is taken to be as large as the force: nominal forces of boards that
+    nobody calibrated are right to a factor of two.
+    """
+    return max(
+        _at_most(touch.total_force, touch.normal_force_bound),
+        _at_most(touch.peak_force, touch.peak_force_bound),
+    )
+
+
+def _at_most(force: float, bound: float) -> float:
+    force = max(force, 0.0)
+    return force + (bound if 0.0 <= bound < math.inf else force)
+
+
+NORMALS = {Side.TIP: (1.0, 0.0), Side.LEFT: (0.0, 1.0), Side.RIGHT: (0.0, -1.0)}
+"""Outward normal of each part of the skin, in ``ee``."""
+
+
+def touch_constraints(touch: Touch, arm: ArmState, speed: float) -> list[Constraint]:
+    """What keeps the place of the peak contact from pressing on faster than ``speed`` (m/s)."""
+    normal = NORMALS.get(touch.peak_side)
+    if normal is None:
+        return []
+    c, s = math.cos(arm.heading), math.sin(arm.heading)
+    nx, ny = c * normal[0] - s * normal[1], s * normal[0] + c * normal[1]
+    rx, ry = c * touch.peak_x - s * touch.peak_y, s * touch.peak_x + c * touch.peak_y
+    return [Constraint(nx, ny, rx * ny - ry * nx, speed)]
+
+
+def force_constraints(arm: ArmState, speed: float) -> list[Constraint]:
+    """What keeps the pivot from moving against the force on it faster than ``speed`` (m/s)."""
+    force = math.hypot(arm.fx, arm.fy)
+    return [Constraint(-arm.fx / force, -arm.fy / force, 0.0, speed)] if force > 0.0 else []
+
+
+def squeeze_constraints(twist: Twist, arm: ArmState, left: float) -> list[Constraint]:
+    """What leaves only the part ``left`` of every motion but that straight back out.
+
+    The skin tells how hard it is squeezed, and not which motion would loosen it.
+    """
+    c, s = math.cos(arm.heading), math.sin(arm.heading)
+    found = []
+    for nx, ny in ((c, s), (-s, c), (s, -c)):
+        found.append(Constraint(nx, ny, 0.0, left * max(0.0, nx * twist.vx + ny * twist.vy)))
+    for nw in (1.0, -1.0):
+        found.append(Constraint(0.0, 0.0, nw, left * max(0.0, nw * twist.omega)))
+    return found
 
 
 def wrench_constraints(twist: Twist, arm: ArmState, left: float) -> list[Constraint]:

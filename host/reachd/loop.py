@@ -97,9 +97,9 @@ class Lateness:
 class ControlLoop:
     """Runs a controller at its period until `stop`. ``failure``: what it died of.
 
-    ``sense`` fetches the newest inputs, ``act`` sends a twist with its expiry in s, ``report`` is
-    told of every cycle; none of them may block. ``priority``: real-time priority to take where
-    ``real_time`` says that the system grants it.
+    ``sense`` fetches the newest inputs, ``act`` sends a twist with its expiry in s and returns what
+    was sent, ``report`` is told of every cycle and of that; none of them may block. ``priority``:
+    real-time priority to take where ``real_time`` says that the system grants it.
     """
 
     def __init__(
@@ -108,8 +108,8 @@ class ControlLoop:
         period: float,
         expiry: float,
         sense: Callable[[Instant], Inputs],
-        act: Callable[[Twist, float, Instant], None],
-        report: Callable[[Cycle], None],
+        act: Callable[[Twist, float, Instant], bytes],
+        report: Callable[[Cycle, bytes], None],
         failed: Callable[[BaseException], None],
         priority: int = 0,
     ) -> None:
@@ -181,11 +181,11 @@ class ControlLoop:
         # Read again: an input captured since then must not seem to come from the future.
         now = monotonic_now()
         cycle = self.controller.cycle(inputs, now, lateness)
-        self._act(cycle.decision.twist, cycle.decision.expiry, now)
+        sent = self._act(cycle.decision.twist, cycle.decision.expiry, now)
         self.last = cycle
         self.beat = now
         self.lateness.add(lateness)
-        self._report(cycle)
+        self._report(cycle, sent)
         while self._calls:
             work, future = self._calls.popleft()
             try:

@@ -37,7 +37,10 @@ class RefusedError(Exception):
 
 
 class OperatorRequests:
-    """Arm, reach, stop and reset; from any thread but the control loop's. Raise `RefusedError`."""
+    """Arm, reach, stop, reset and clear; from any thread but the control loop's.
+
+    All raise `RefusedError`.
+    """
 
     def __init__(
         self,
@@ -99,6 +102,15 @@ class OperatorRequests:
         """Go home after a reach."""
         self._granted(lambda now: self._loop.controller.supervisor.request_reset(now))
         self._reporter.event("operator", "reset", "")
+
+    def clear(self) -> str:
+        """Have the arm clear a fault or stop; it stays disarmed here. Returns the arm's mode."""
+        try:
+            mode = self._arm.request_clear()
+        except ArmError as error:
+            raise RefusedError(str(error)) from error
+        self._reporter.event("operator", "clear", f"the arm is {mode!r}")
+        return mode
 
     def _set_limits(self, limits: ArmLimits) -> None:
         if self._confirmed(limits):

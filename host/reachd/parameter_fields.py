@@ -79,6 +79,7 @@ class Parameters:
     )
 
     safety: SafetySettings
+    note: str = ""
 
     def __post_init__(self) -> None:
         """Refuse values out of range and values that contradict one another."""

@@ -16,11 +16,11 @@ from typing import Any
 
 import zenoh
 
-from reachd.arms.bus_arm import FRAME, command_message
 from reachd.cycle import Cycle
 from reachd.outcome import Outcome
 from reachd.seam import Twist
 from reachd.supervisor import State
+from tactile_bus.commanding import FRAME
 from tactile_bus.instant import Instant, WallClock, monotonic_now
 from tactile_bus.messages import MSG, codec, header
 from tactile_bus.recorder import Recorder
@@ -84,14 +84,19 @@ class Reporter:
             topic.template: declare_publisher(session, topic, name)
             for topic in (REACH_STATE, REACH_EVENT)
         }
-        self._queue: queue.SimpleQueue[tuple[int, Cycle] | Event | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[tuple[int, Cycle, bytes] | Event | None] = (
+            queue.SimpleQueue()
+        )
         self._thread = threading.Thread(target=self._run, name="reporter", daemon=True)
         self._thread.start()
 
-    def cycle(self, cycle: Cycle) -> None:
-        """Report a cycle; called by the control loop alone. Never blocks."""
+    def cycle(self, cycle: Cycle, sent: bytes) -> None:
+        """Report a cycle and the command that was sent in it, empty for none.
+
+        Called by the control loop alone. Never blocks.
+        """
         self._sequence = (self._sequence + 1) & 0xFFFFFFFF
-        self._put((self._sequence, cycle))
+        self._put((self._sequence, cycle, sent))
 
     def event(self, kind: str, code: str, text: str, at: Instant | None = None) -> None:
         """Report something that happened; from any thread. Never blocks."""
@@ -113,7 +118,7 @@ class Reporter:
                 publisher.close()
         return True
 
-    def _put(self, item: tuple[int, Cycle] | Event) -> None:
+    def _put(self, item: tuple[int, Cycle, bytes] | Event) -> None:
         if self._queue.qsize() >= MAX_WAITING:
             try:
                 self._queue.get_nowait()
@@ -142,12 +147,11 @@ class Reporter:
         if self._complaints.allow(monotonic_now()):
             log.error("a report could not be sent, %d so far", self.unsent, exc_info=error)
 
-    def _send_cycle(self, sequence: int, cycle: Cycle) -> None:
+    def _send_cycle(self, sequence: int, cycle: Cycle, sent: bytes) -> None:
         now, status = cycle.now, cycle.status
         wall_ns = self._wall.wall_ns(now)
-        if self._recorder is not None:
-            command = command_message(cycle.decision.twist, wall_ns)
-            self._record(COMMAND, self._arm, self._codec.encode(COMMAND, command), wall_ns)
+        if sent:
+            self._record(COMMAND, self._arm, sent, wall_ns)
         if status.state is not self._state:
             self._state = status.state
             self._send_event(Event(now, "state", status.state, status.text))

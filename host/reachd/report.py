@@ -74,6 +74,8 @@ def show(console: Console, outcome: Outcome, goal: Goal, about: dict[str, Any]) 
     table.add_row(
         "peak force", f"{outcome.peak_force:.1f} N at a taxel, {outcome.peak_load:.1f} N at the arm"
     )
+    if about.get("note"):
+        table.add_row("", about["note"])
     table.add_row("excavations", excavations(outcome))
     table.add_row("interventions", interventions(outcome))
     console.print(table, highlight=False, markup=False)

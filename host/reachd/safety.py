@@ -7,23 +7,31 @@ request of the operator, with every condition healthy. Nothing here is a certifi
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import Literal
 
 from reachd.finite import finite, usable
 from reachd.limits import (
+    Constraint,
     approach_left,
+    braked,
     constrained,
     fastest_point,
+    felt,
+    force_constraints,
     load,
+    squeeze_constraints,
+    touch_constraints,
     within_acceleration,
     within_speed,
     workspace_constraints,
     wrench_constraints,
 )
+from reachd.motion import MotionWatch
 from reachd.safety_settings import MOVING_MODES, PAUSED_MODE, Check, SafetySettings
 from reachd.seam import ZERO, ArmState, Goal, Touch, Twist
-from reachd.stillness import Stillness
+from tactile_bus.arm_types import Echo
 from tactile_bus.instant import Instant, seconds_between
 from tactile_bus.records import record
 
@@ -33,6 +41,21 @@ ON_THE_WAY = 0.003
 """s from a cycle's deadline to the arm: what the loop is late and what the bus takes. An input is
 too old by so much and a period before its age is reached, so that zero is there in time."""
 FEATURES_ON_THE_WAY = 0.008  # on a busy machine 3 ms were not enough in one of forty kills
+
+ECHO_LOST = 0.05
+"""s for which commands must come late until it latches: one hiccup only stops."""
+
+SPARSE_OVER = 0.2
+"""s over which touch must have been valid for at least half of the time."""
+
+HARD_STATES = 2
+"""States in a row that must be overloaded for it to latch."""
+
+HARD_AT_ONCE = 2.0
+"""Times that load at which one state is enough."""
+
+SKIN_LATCH = 2.0
+"""Times the limit on what the skin feels at which it latches."""
 
 CONFIRMED_WITHIN = 1e-3
 """Part by which a limit read back may differ from the one sent: arms round theirs. A lower one is
@@ -74,6 +97,8 @@ class SafetyGate:
         self._slows = Check.SLOW_DOWN not in self._off
         self._bounds_workspace = Check.WORKSPACE not in self._off
         self._bounds_wrench = Check.WRENCH not in self._off
+        self._bounds_skin = Check.SKIN_FORCE not in self._off
+        self._bounds_touch = Check.TOUCH_RISING not in self._off
         self._confirmed: tuple[float, ...] = ()  # limits last read back and found as asked
         self._hold: Intervention | None = Intervention(
             Check.NOT_ARMED, "stopped", "the gate is not armed: arm it by an operator's request"
@@ -85,7 +110,16 @@ class SafetyGate:
         self._last = ZERO
         self._stepped: Instant | None = None
         self._felt: Instant | None = None  # when the last valid features were captured
-        self._still = Stillness()
+        self._motion = MotionWatch(settings)
+        self._own_since: Instant | None = None  # the arm says that it is ours
+        self._late_since: Instant | None = None  # commands come late
+        self._passes: deque[Instant] = deque()  # of the limit of force or torque
+        self._hard = 0  # states in a row that were overloaded
+        self._beyond = False  # it, and not below the soft one since
+        self._seen: deque[tuple[Instant, bool]] = deque()  # whether touch was valid, until then
+        self._touched: Touch | None = None  # the newest that was usable
+        self._rising = 0.0  # N/s at which the force on the skin grew when it was captured
+        self._loaded_at: Instant | None = None  # capture of the newest state
 
     @property
     def armed(self) -> bool:
@@ -124,6 +158,7 @@ class SafetyGate:
         if not fresh or not -self._settings.future <= age <= self._settings.request_age:
             text = f"the request to arm is {age:.3f} s old, or older than what it is to clear"
             refusals.append(Intervention(Check.REQUEST_STALE, "refused", text))
+        self._motion.restart()  # what it did before is what the operator has looked after
         faults, stops, _ = self._inputs(touch, arm, now, duplicate)
         # An arm that stopped by itself is revived by the zero commands that follow.
         refusals += [
@@ -137,7 +172,7 @@ class SafetyGate:
             self._hold = None
             self._proven = True
             self._last = ZERO
-            self._still = Stillness()
+            self._passes.clear()
         return tuple(refusals)
 
     def step(
@@ -150,6 +185,7 @@ class SafetyGate:
         *,
         lateness: float = 0.0,
         duplicate: bool = False,
+        rivalled: bool = False,
         failure: str | None = None,
     ) -> Decision:
         """The twist that may be sent.
@@ -157,10 +193,31 @@ class SafetyGate:
         ``wanted``: what the strategy wants, None with ``failure`` when it failed. ``touch``,
         ``arm``: the newest, None when there never was one. ``goal``: where to slow down.
         ``lateness``: s by which the loop missed its deadline. ``duplicate``: a second publisher
-        was seen on an input.
+        was seen on an input. ``rivalled``: somebody else was seen to send commands.
         """
+        decision = self._decide(
+            wanted, touch, arm, goal, now, lateness, duplicate, rivalled, failure
+        )
+        self._motion.told(decision.twist, now)
+        return decision
+
+    def _decide(
+        self,
+        wanted: Twist | None,
+        touch: Touch | None,
+        arm: ArmState | None,
+        goal: Goal | None,
+        now: Instant,
+        lateness: float,
+        duplicate: bool,
+        rivalled: bool,
+        failure: str | None,
+    ) -> Decision:
         passed = 0.0 if self._stepped is None else seconds_between(self._stepped, now)
         faults, stops, notes = self._inputs(touch, arm, now, duplicate)
+        if rivalled and self._on(Check.RIVAL_COMMANDS):
+            text = "somebody else sends commands to the arm, which does not obey them"
+            notes.append(Intervention(Check.RIVAL_COMMANDS, "ignored", text))
         faults += self._command(wanted, failure)
         stops += self._timing(passed, lateness)
         self._stepped = now
@@ -246,6 +303,9 @@ class SafetyGate:
             else:
                 oldest = min(touch.captured, touch.received)
                 self._felt = oldest if self._felt is None else max(self._felt, oldest)
+                self._touch(touch)
+        self._squeezed(faults)
+        self._sparse(touch, now, stops)
         age = math.inf if self._felt is None else seconds_between(self._felt, now)
         if age <= s.features_age - s.period - FEATURES_ON_THE_WAY:
             return
@@ -254,6 +314,45 @@ class SafetyGate:
             faults.append(Intervention(Check.FEATURES_LOST, "latched", text))
         if self._on(Check.FEATURES_STALE):
             stops.append(Intervention(Check.FEATURES_STALE, "stopped", text))
+
+    def _touch(self, touch: Touch) -> None:
+        """Keep the newest usable touch, and how fast its force grew."""
+        last = self._touched
+        if last is not None and touch.captured <= last.captured:
+            return
+        self._rising = 0.0
+        if last is not None:
+            passed = seconds_between(last.captured, touch.captured)
+            if passed <= SPARSE_OVER:
+                self._rising = max(0.0, touch.total_force - last.total_force) / passed
+        self._touched = touch
+
+    def _squeezed(self, faults: list[Intervention]) -> None:
+        """More force on the skin than twice what it may feel; known until it is felt anew."""
+        if self._touched is None or not self._on(Check.SKIN_OVERLOAD):
+            return
+        force, limit = felt(self._touched), self._settings.skin_force
+        if force >= SKIN_LATCH * limit:
+            text = f"the skin feels up to {force:.1f} N, its limit is {limit:g} N"
+            faults.append(Intervention(Check.SKIN_OVERLOAD, "latched", text))
+
+    def _sparse(self, touch: Touch | None, now: Instant, stops: list[Intervention]) -> None:
+        """Touch that is valid now and then, but not for half of the time."""
+        seen = self._seen
+        if seen and now <= seen[-1][0]:
+            if now < seen[-1][0]:
+                seen.clear()
+            return
+        seen.append((now, touch is not None and usable(touch)))
+        while seconds_between(seen[0][0], now) > SPARSE_OVER:
+            seen.popleft()
+        without, before = 0.0, seen[0][0]
+        for at, good in seen:
+            without += 0.0 if good else seconds_between(before, at)
+            before = at
+        if without > SPARSE_OVER / 2 and self._on(Check.FEATURES_SPARSE):
+            text = f"the features were not valid for {without:.2f} of the last {SPARSE_OVER:g} s"
+            stops.append(Intervention(Check.FEATURES_SPARSE, "stopped", text))
 
     def _arm_state(
         self,
@@ -281,9 +380,15 @@ class SafetyGate:
         if not finite(arm.x, arm.y, arm.heading, arm.fx, arm.fy, arm.mz):
             text = "the arm's state holds a number that is not finite"
             stops.append(Intervention(Check.ARM_NOT_FINITE, "stopped", text))
-        elif self._still.frozen(arm, self._last, now, s) and self._on(Check.ARM_FROZEN):
-            text = "the arm's state does not change although the arm is told to move"
-            faults.append(Intervention(Check.ARM_FROZEN, "latched", text))
+        else:
+            faults.extend(
+                Intervention(check, "latched", text)
+                for check, text in self._motion.judge(arm)
+                if self._on(check)
+            )
+            self._overload(arm, now, faults)
+        if arm.echo is not None:
+            self._echo(arm.echo, arm.captured, faults, stops)
         if arm.mode == PAUSED_MODE:
             if self._on(Check.ARM_STOPPED):
                 text = "the arm stopped by itself because commands had ceased"
@@ -296,6 +401,72 @@ class SafetyGate:
             wrong = self._unconfirmed(arm)
             faults.extend(wrong)
             self._confirmed = () if wrong else limits
+
+    def _overload(self, arm: ArmState, now: Instant, faults: list[Intervention]) -> None:
+        """A load far beyond its limit, or beyond it again and again.
+
+        An impact is over with the next state: it counts only from twice that load on.
+        """
+        s = self._settings
+        part = load(arm, s)
+        if arm.captured != self._loaded_at:
+            self._loaded_at = arm.captured
+            self._hard = self._hard + 1 if part >= s.overload else 0
+        hard = self._hard >= HARD_STATES or part >= HARD_AT_ONCE * s.overload
+        if hard and self._on(Check.OVERLOAD):
+            text = f"the load is {part:.0%} of its limit"
+            faults.append(Intervention(Check.OVERLOAD, "latched", text))
+        if part < s.soft_fraction:
+            self._beyond = False
+        elif part >= 1.0 and not self._beyond:
+            self._beyond = True
+            self._passes.append(now)
+        while self._passes and seconds_between(self._passes[0], now) > s.overload_within:
+            self._passes.popleft()
+        if len(self._passes) >= s.overload_passes and self._on(Check.OVERLOAD_REPEATED):
+            text = (
+                f"the load passed its limit {len(self._passes)} times within "
+                f"{s.overload_within:g} s"
+            )
+            faults.append(Intervention(Check.OVERLOAD_REPEATED, "latched", text))
+            self._passes.clear()
+
+    def _echo(
+        self,
+        echo: Echo,
+        captured: Instant,
+        faults: list[Intervention],
+        stops: list[Intervention],
+    ) -> None:
+        """Whose commands the arm obeys, and how late they come into force there."""
+        s = self._settings
+        if not echo.own:
+            self._own_since = self._late_since = None
+            who = f"{echo.commander!r}'s" if echo.commander else "nobody's"
+            text = f"the arm obeys {who} commands, not ours: see who else runs, then arm again"
+            faults.append(Intervention(Check.COMMANDER, "latched", text))
+            return
+        if self._own_since is None:
+            self._own_since = captured
+        due = self._motion.first_after(echo.decided)
+        if due is not None and echo.sequence == 0:
+            due = max(due, self._own_since)  # none was obeyed yet
+        # The one after that in force has been under way for so long; the loop sends one a period.
+        late = -math.inf if due is None else seconds_between(due, captured) + s.period
+        if late <= s.echo_age:
+            self._late_since = None
+            return
+        if self._late_since is None:
+            self._late_since = captured
+        text = (
+            f"commands come into force at the arm {late * 1e3:.0f} ms late, or not at all: "
+            f"{s.echo_age * 1e3:g} ms are allowed"
+        )
+        lost = seconds_between(self._late_since, captured) >= ECHO_LOST
+        if lost and self._on(Check.ECHO_LOST):
+            faults.append(Intervention(Check.ECHO_LOST, "latched", text))
+        if self._on(Check.ECHO_LATE):
+            stops.append(Intervention(Check.ECHO_LATE, "stopped", text))
 
     def _unconfirmed(self, arm: ArmState) -> list[Intervention]:
         """Limits that the arm does not confirm as asked, with both values."""
@@ -339,22 +510,28 @@ class SafetyGate:
         """Apply every limit of motion to a healthy command; says in ``notes`` which ones acted."""
         s = self._settings
         twist = self._speed(wanted, notes)
-        if self._bounds_acceleration:
-            dt = min(max(passed, 0.0), s.period + s.lateness)
-            before = twist
-            twist = within_acceleration(
-                twist, self._last, s.acceleration * dt, s.turn_acceleration * dt
-            )
-            _note(notes, Check.ACCELERATION, before, twist, "the command changes too fast")
+        fastest, fastest_turn = math.inf, math.inf
         if goal is not None and self._slows:
             tip_x = arm.x + s.tip_length * math.cos(arm.heading)
             tip_y = arm.y + s.tip_length * math.sin(arm.heading)
             if math.hypot(goal.x - tip_x, goal.y - tip_y) < s.slow_radius:
                 before = twist
-                left = s.slow_fraction
-                twist = within_speed(twist, left * s.speed, left * s.turn_rate)
+                fastest, fastest_turn = s.slow_fraction * s.speed, s.slow_fraction * s.turn_rate
+                twist = within_speed(twist, fastest, fastest_turn)
                 _note(notes, Check.SLOW_DOWN, before, twist, "the goal is near")
-        return self._held_back(twist, arm, notes)
+        twist, rules = self._held_back(twist, arm, notes)
+        if self._bounds_acceleration:
+            dt = min(max(passed, 0.0), s.period + s.lateness)
+            before, last = twist, self._last
+            twist = within_acceleration(twist, last, s.acceleration * dt, s.turn_acceleration * dt)
+            if twist is not before and (
+                within_speed(twist, fastest, fastest_turn) is not twist
+                or any(rule.broken_by(twist) for rule in rules)
+            ):
+                # The way from the last command to the new one leaves what is allowed: brake first.
+                twist = braked(last, rules, fastest, fastest_turn)
+            _note(notes, Check.ACCELERATION, before, twist, "the command changes too fast")
+        return twist
 
     def _speed(self, wanted: Twist, notes: list[Intervention]) -> Twist:
         """Greatest speed and turn rate; the path stays."""
@@ -369,22 +546,56 @@ class SafetyGate:
             _note(notes, Check.TURN_RATE, before, twist, "the command turns too fast")
         return twist
 
-    def _held_back(self, twist: Twist, arm: ArmState, notes: list[Intervention]) -> Twist:
-        """Workspace and wrench together, for either alone could undo the other."""
+    def _held_back(
+        self, twist: Twist, arm: ArmState, notes: list[Intervention]
+    ) -> tuple[Twist, list[Constraint]]:
+        """Workspace, wrench and touch together, for each alone could undo the others.
+
+        The twist that is left, and the rules that it keeps.
+        """
         s = self._settings
-        kept, rules = twist, []
+        rules: list[Constraint] = []
         if self._bounds_workspace:
-            rules = workspace_constraints(arm, s, fastest_point(twist, s))
+            # The way from the last command may be faster than where it leads.
+            fastest = max(fastest_point(twist, s), fastest_point(self._last, s))
+            rules = workspace_constraints(arm, s, fastest)
             kept = constrained(twist, rules)
             _note(notes, Check.WORKSPACE, twist, kept, "the edge of the workspace is near")
         part = load(arm, s)
-        if part <= s.soft_fraction or not self._bounds_wrench:
-            return kept
-        left = approach_left(part, s.soft_fraction)
-        held = wrench_constraints(twist, arm, left)
-        text = f"the load is {part:.0%} of its limit: {left:.0%} of the approach is left"
-        _note(notes, Check.WRENCH, twist, constrained(twist, held), text)
-        return constrained(twist, rules + held)
+        if part > s.soft_fraction and self._bounds_wrench:
+            left = approach_left(part, s.soft_fraction)
+            held = wrench_constraints(twist, arm, left)
+            text = f"the load is {part:.0%} of its limit: {left:.0%} of the approach is left"
+            _note(notes, Check.WRENCH, twist, constrained(twist, held), text)
+            rules = rules + held
+        rules = rules + self._of_touch(twist, arm, notes)
+        return constrained(twist, rules) if rules else twist, rules
+
+    def _of_touch(self, twist: Twist, arm: ArmState, notes: list[Intervention]) -> list[Constraint]:
+        """What is felt, and what that will be in a moment at the rate at which it grows."""
+        s, touch = self._settings, self._touched
+        if touch is None:
+            return []
+        rules: list[Constraint] = []
+        force = felt(touch)
+        part = force / s.skin_force
+        if part > s.soft_fraction and self._bounds_skin:
+            left = approach_left(part, s.soft_fraction)
+            rules = squeeze_constraints(twist, arm, left)
+            text = f"the skin feels {part:.0%} of its limit: {left:.0%} of the motion is left"
+            _note(notes, Check.SKIN_FORCE, twist, constrained(twist, rules), text)
+        if self._bounds_touch:
+            ahead = touch.total_force + self._rising * s.touch_lead
+            left = min(1.0, max(0.0, (s.touch_hard - ahead) / (s.touch_hard - s.touch_soft)))
+            speed = left * s.speed
+            if touch.total_force > s.touch_light:
+                speed = min(speed, s.touch_speed)
+            if speed < s.speed:
+                slow = touch_constraints(touch, arm, speed) + force_constraints(arm, speed)
+                text = f"the finger touches, up to {ahead:.1f} N soon: {speed:.3f} m/s against it"
+                _note(notes, Check.TOUCH_RISING, twist, constrained(twist, slow), text)
+                rules = rules + slow
+        return rules
 
 
 def _note(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from types import MappingProxyType
 
 from reachd.fields import SettingError, check_fields, number
 from reachd.workspace import Region
@@ -37,6 +39,19 @@ class Check(StrEnum):
     WORKSPACE = "workspace"
     WRENCH = "wrench"
     FREE_AIR = "free_air"
+    COMMANDER = "commander"
+    RIVAL_COMMANDS = "rival_commands"
+    ECHO_LATE = "echo_late"
+    ECHO_LOST = "echo_lost"
+    ARM_SPEED = "arm_speed"
+    ARM_TRACKING = "arm_tracking"
+    ARM_PATH = "arm_path"
+    OVERLOAD = "overload"
+    OVERLOAD_REPEATED = "overload_repeated"
+    FEATURES_SPARSE = "features_sparse"
+    TOUCH_RISING = "touch_rising"
+    SKIN_FORCE = "skin_force"
+    SKIN_OVERLOAD = "skin_overload"
     REQUEST_STALE = "request_stale"
 
 
@@ -47,9 +62,33 @@ ALWAYS_ON = frozenset(
         Check.STRATEGY_FAILED,
         Check.ARM_NOT_FINITE,
         Check.REQUEST_STALE,
+        Check.COMMANDER,
     }
 )
 """Checks without which the gate has nothing to judge by, or would arm itself."""
+
+HARD_CAPS: Mapping[str, float] = MappingProxyType(
+    {
+        "speed": 0.25,
+        "turn_rate": 1.0,
+        "acceleration": 10.0,
+        "force": 30.0,
+        "torque": 6.0,
+        "overload": 2.0,
+        "skin_force": 60.0,
+        "features_age": 0.3,
+        "arm_age": 0.1,
+        "echo_age": 0.1,
+        "frozen_after": 0.5,
+        "arm_v_max": 0.25,
+        "arm_omega_max": 1.0,
+        "arm_f_max": 30.0,
+        "arm_m_max": 6.0,
+    }
+)
+"""Limits beyond which somebody may be hurt or a cupboard broken before the gate acts: allowed, but
+never without a word. 0.25 m/s is what ISO 10218-1 calls reduced speed; the others are twice what
+the hardware set has, in round figures."""
 
 MOVING_MODES = frozenset({"ready", "moving"})
 """Arm modes in which motion may be commanded."""
@@ -76,10 +115,20 @@ class SafetySettings:
     )
     free_air_force: float = number("N", "force at arming that shows a bias or a wrong tool")
     free_air_torque: float = number("N·m", "torque at arming that shows a bias or a wrong tool")
+    overload: float = number("", "part of force or torque at which it latches", 1.0)
+    overload_passes: float = number("", "passes of force or torque that latch it", 1.0, above=False)
+    overload_within: float = number("s", "time within which so many passes count")
+    skin_force: float = number("N", "sum of normal forces on the skin at which motion ends")
+    touch_light: float = number("N", "force on the skin from which the finger touches something")
+    touch_speed: float = number("m/s", "greatest speed against what it touches")
+    touch_soft: float = number("N", "force foreseen from which motion against it is slowed")
+    touch_hard: float = number("N", "force foreseen at which such motion ends")
+    touch_lead: float = number("s", "how far ahead a rising force is foreseen", above=False)
     features_age: float = number("s", "age of the last valid features at which motion ends")
     features_latch: float = number("s", "age of the last valid features at which the gate latches")
     arm_age: float = number("s", "age of the arm's state at which motion ends")
     arm_latch: float = number("s", "age of the arm's state at which the gate latches")
+    echo_age: float = number("s", "age at which a command must be in force at the arm")
     frozen_after: float = number("s", "motion commanded but none reported, at which it latches")
     future: float = number("s", "how far ahead of now an input may be stamped", 0, 1, above=False)
     lateness: float = number("s", "lateness of the control loop at which motion ends")
@@ -106,9 +155,22 @@ class SafetySettings:
                 raise SettingError(f"{late} must be at least {soon} ({getattr(self, soon):g} s)")
             if getattr(self, soon) <= self.period:
                 raise SettingError(f"{soon} must exceed the loop's period ({self.period:g} s)")
+        if self.touch_hard <= self.touch_soft:
+            raise SettingError(f"touch_hard must exceed touch_soft ({self.touch_soft:g} N)")
         kept = sorted(self.disabled & ALWAYS_ON)
         if kept:
             raise SettingError(f"the check {kept[0]!s} cannot be switched off")
+
+    @property
+    def cautions(self) -> tuple[str, ...]:
+        """What an operator must know of these settings: checks that are off, limits too wide."""
+        off = [f"the check {check} is off" for check in sorted(self.disabled)]
+        wide = [
+            f"{name} is {getattr(self, name):g}, beyond the cap of {cap:g}"
+            for name, cap in HARD_CAPS.items()
+            if getattr(self, name) > cap
+        ]
+        return (*off, *wide)
 
     @property
     def arm_limits(self) -> ArmLimits:

@@ -7,6 +7,7 @@ y forward, angles from y: x_here = y_paper, y_here = −x_paper.)
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -23,7 +24,8 @@ class Touch:
     """The contact features a strategy may use; see ``ContactFeatures.msg``.
 
     Forces in N, ``peak_x``/``peak_y`` in m in ``ee``. ``total_force``: sum of normal forces over
-    the skin. ``tip_force``: sum of normal forces at the tip.
+    the skin. ``tip_force``: sum of normal forces at the tip. Bounds: N by which the true force may
+    differ, in 95 % of cycles, from ``peak_force`` and from ``total_force``; NaN for unknown.
     """
 
     captured: Instant
@@ -35,6 +37,8 @@ class Touch:
     peak_y: float
     total_force: float
     tip_force: float
+    peak_force_bound: float = math.nan
+    normal_force_bound: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,7 @@
-"""What can be asked of reachd over the bus: goal, stop, reset, arm, status. Errors are replies."""
+"""What can be asked of reachd over the bus: goal, stop, reset, arm, clear, status.
+
+Errors are replies.
+"""
 
 from __future__ import annotations
 
@@ -60,6 +63,7 @@ class ReachServices:
             "stop": (self._stop, StopRequest),
             "reset": (self._reset, Nothing),
             "arm": (self._arm, ArmRequest),
+            "clear": (self._clear, Nothing),
             "status": (lambda _: status(), Nothing),
         }
         self._services: list[Service] = [
@@ -92,6 +96,9 @@ class ReachServices:
     def _arm(self, request: ArmRequest) -> dict[str, Any]:
         self._granted(lambda: self._requests.arm(free_air=request.free_air))
         return self._status()
+
+    def _clear(self, _: Nothing) -> dict[str, Any]:
+        return {"mode": self._granted(self._requests.clear)}
 
     def _granted(self, work: Callable[[], Any]) -> Any:
         try:

@@ -13,9 +13,11 @@ from enum import Enum, auto
 from typing import Any, Generic, TypeVar
 
 from reachd.seam import ArmState, Touch, Twist
+from tactile_bus.arm_types import Echo
 from tactile_bus.geometry import Side
 from tactile_bus.instant import Instant, seconds_between
 from tactile_bus.messages import DecodeError, codec
+from tactile_bus.remote_clock import RemoteClock
 from tactile_bus.streams import BusSample
 from tactile_bus.topics import Topic
 
@@ -23,9 +25,6 @@ T = TypeVar("T")
 
 DUPLICATE_FOR = 1.0
 """s after the last sample of a second publisher until it is taken to be gone."""
-
-DRIFT = 2e-4
-"""s/s by which the clocks of two machines may drift apart: twice what bad quartzes do."""
 
 
 class Verdict(Enum):
@@ -61,10 +60,14 @@ class SourcePin:
         """Whether a sample received at ``now`` may be used."""
         if sample.source is None or sample.sequence is None:
             return self._note_foreign(now) if self._live(now) else Verdict.ANONYMOUS
-        if sample.source != self._source:
-            if self._live(now):
-                return self._note_foreign(now)
+        if not self._live(now):
+            # Whoever it is: a number forged under the first one's name must not lock him out.
+            repeated = sample.source == self._source and sample.data == self._data
+            if repeated and sample.sequence == self._sequence:
+                return Verdict.REPEATED
             self._source = sample.source
+        elif sample.source != self._source:
+            return self._note_foreign(now)
         elif sample.sequence == self._sequence and sample.data == self._data:
             return Verdict.REPEATED
         elif sample.sequence <= self._sequence:
@@ -82,26 +85,6 @@ class SourcePin:
     def _note_foreign(self, now: Instant) -> Verdict:
         self._foreign = now
         return Verdict.DUPLICATE
-
-
-class RemoteClock:
-    """Maps another machine's monotonic stamps to this one's: the least delay seen counts as none.
-
-    What comes later than the quickest did is that much older, so a queue that fills up on the way
-    shows as age. The quickest is forgotten no faster than clocks drift.
-    """
-
-    def __init__(self) -> None:
-        self._offset: float | None = None
-        self._at = Instant(0)
-
-    def here(self, stamp: int, received: Instant) -> Instant:
-        """Instant of this host for ``stamp``; never later than ``received``."""
-        offset = received - stamp
-        if self._offset is not None:
-            offset = min(offset, round(self._offset + DRIFT * (received - self._at)))
-        self._offset, self._at = offset, received
-        return Instant(stamp + offset)
 
 
 class Input(Generic[T]):
@@ -168,12 +151,23 @@ def make_touch(message: Any, captured: Instant, received: Instant) -> Touch:
         peak_y=float(message.peak_position.y),
         total_force=float(message.normal_force),
         tip_force=float(message.tip_force),
+        peak_force_bound=float(message.peak_force_bound),
+        normal_force_bound=float(message.normal_force_bound),
     )
 
 
-def make_arm_state(message: Any, captured: Instant, received: Instant) -> ArmState:
-    """``ArmState.msg`` as strategies and gate see it."""
+def make_arm_state(
+    message: Any, captured: Instant, received: Instant, commander: str = ""
+) -> ArmState:
+    """``ArmState.msg`` as strategies and gate see it; ``commander``: as whom we command the arm."""
     linear, angular = message.twist.linear, message.twist.angular
+    says = str(message.commander)
+    echo = Echo(
+        commander=says,
+        sequence=int(message.command_sequence),
+        decided=Instant(int(message.command_ns)),
+        own=bool(commander) and says == commander,
+    )
     return ArmState(
         captured=captured,
         received=received,
@@ -189,4 +183,5 @@ def make_arm_state(message: Any, captured: Instant, received: Instant) -> ArmSta
         omega_max=float(message.omega_max),
         f_max=float(message.f_max),
         m_max=float(message.m_max),
+        echo=echo,
     )

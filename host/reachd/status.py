@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from rich.console import Console
 from rich.table import Table
@@ -17,16 +18,23 @@ from tactile_bus.terminal import LiveLines
 class StatusLine(LiveLines):
     """Shows what ``loop`` does."""
 
-    def __init__(self, console: Console, loop: ControlLoop, recorder: Recorder | None) -> None:
+    def __init__(
+        self,
+        console: Console,
+        loop: ControlLoop,
+        recorder: Recorder | None,
+        cautions: Sequence[str] = (),
+    ) -> None:
         super().__init__(console, recorder)
         self._loop = loop
+        self._cautions = len(cautions)
 
     def table(self) -> Table | None:
         """One row; None before the first control cycle."""
         cycle = self._loop.last
         if cycle is None:
             return None
-        cells = describe(cycle)
+        cells = describe(cycle, self._cautions)
         table = Table.grid(padding=(0, 2))
         style = "green" if cycle.decision.held is None else "red"
         table.add_row(
@@ -40,11 +48,14 @@ class StatusLine(LiveLines):
         cycle = self._loop.last
         if cycle is None:
             return []
-        return [", ".join(f"{k} {v}" for k, v in describe(cycle).items() if v)]
+        return [", ".join(f"{k} {v}" for k, v in describe(cycle, self._cautions).items() if v)]
 
 
-def describe(cycle: Cycle) -> dict[str, str]:
-    """State of a reach in a few short texts; empty where there is nothing to say."""
+def describe(cycle: Cycle, cautions: int = 0) -> dict[str, str]:
+    """State of a reach in a few short texts; empty where there is nothing to say.
+
+    ``cautions``: how many checks are off and limits too wide.
+    """
     status, touch, arm = cycle.status, cycle.inputs.touch, cycle.inputs.arm
     return {
         "state": f"{status.state} ({status.activity}) {status.elapsed:.1f} s",
@@ -54,6 +65,7 @@ def describe(cycle: Cycle) -> dict[str, str]:
         if arm is None
         else f"{arm.mode} {math.hypot(arm.fx, arm.fy):.1f} N {_age(cycle.arm_age)}",
         "late": f"{cycle.lateness * 1e3:.1f} ms",
+        "CAUTIONS": str(cautions) if cautions else "",
         "gate": ", ".join(str(i.code) for i in cycle.decision.interventions),
     }
 

@@ -29,12 +29,28 @@ ZERO = Twist(0.0, 0.0, 0.0)
 
 
 @record
+class Echo:
+    """What an arm says of whom it obeys, and of the command in force or the last that was.
+
+    ``commander``: as granted, empty for nobody. ``decided``: instant of the decision, by the
+    commander's clock; 0, as is ``sequence``, before the first. ``own``: for whoever reads the
+    state, whether that commander is himself.
+    """
+
+    commander: str
+    sequence: int
+    decided: Instant
+    own: bool = True
+
+
+@record
 class ArmState:
     """What the arm reports of itself at its own rate.
 
     Pose of the wrist pivot (m, rad) and its twist; wrench that the environment exerts on the
     end-effector about the pivot (N, N, N·m), all in ``cupboard``. ``mode`` is "ready", "moving",
     "stopped", "fault" or "estop". The limits are those the arm confirms: m/s, rad/s, N, N·m.
+    ``echo`` is None where commands reach the arm without a way between: in lockstep.
     """
 
     captured: Instant
@@ -51,6 +67,7 @@ class ArmState:
     omega_max: float
     f_max: float
     m_max: float
+    echo: Echo | None = None
 
 
 @dataclass(frozen=True, slots=True)

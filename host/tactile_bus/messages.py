@@ -33,6 +33,7 @@ SHORT_NAMES = {
     name.rsplit("/", 1)[1]: name
     for name in (
         "tactile_msgs/msg/AmbientField",
+        "tactile_msgs/msg/ArmCommand",
         "tactile_msgs/msg/ArmState",
         "tactile_msgs/msg/ContactFeatures",
         "tactile_msgs/msg/ContactPatch",
@@ -67,6 +68,17 @@ SHORT_NAMES = {
     )
 }
 """Types that ``MSG.<name>`` finds by their last part."""
+
+LATER_FIELDS: Mapping[str, frozenset[str]] = {
+    "tactile_msgs/msg/ArmState": frozenset({"commander", "command_sequence", "command_ns"}),
+    "tactile_msgs/msg/ContactFeatures": frozenset(
+        {"reason_codes", "peak_force_bound", "normal_force_bound", "tip_force_bound"}
+    ),
+    "tactile_msgs/msg/SkinGeometry": frozenset({"array_posed"}),
+    "tactile_msgs/msg/TaxelForces": frozenset({"normal_bound"}),
+}
+"""Fields that a type has got since its first version. Logs from before lack them, and are read:
+whoever goes by one has to do without it there."""
 
 NUMBER_TYPES = {
     "bool": np.bool_,

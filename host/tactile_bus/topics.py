@@ -50,7 +50,7 @@ DIAGNOSTICS = Topic("tactile/{name}/diagnostics", "diagnostic_msgs/msg/Diagnosti
 LOG = Topic("tactile/{name}/log", "rcl_interfaces/msg/Log", 0)
 
 ARM_STATE = Topic("arm/{name}/state", f"{_OWN}/ArmState", 100, stale_after=0.05)
-COMMAND = Topic("arm/{name}/cmd_vel", "geometry_msgs/msg/TwistStamped", 100, stale_after=0.1)
+COMMAND = Topic("arm/{name}/cmd_vel", f"{_OWN}/ArmCommand", 100, stale_after=0.1)
 REACH_STATE = Topic("reach/{name}/state", f"{_OWN}/ReachState", 100)
 REACH_EVENT = Topic("reach/{name}/event", f"{_OWN}/ReachEvent", 0)
 TF = Topic("tf", "tf2_msgs/msg/TFMessage", 25)
@@ -101,8 +101,8 @@ def find_topic(key: str) -> tuple[Topic, str] | None:
 def service_key(name: str, service: str, kind: str = "tactile") -> str:
     """Key of a queryable of a daemon.
 
-    ``kind`` tactile: status, tare, set_rate, recalibrate; arm: limits, clear; reach: goal, stop,
-    reset, arm, status.
+    ``kind`` tactile: status, tare, set_rate, recalibrate; arm: claim, release, limits, clear,
+    status; reach: goal, stop, reset, arm, clear, status.
     """
     return Topic(kind + "/{name}/srv/" + service, "", 0).key(name)
 

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from sim_device.world.base import PHYSICS_STEP, FingerState, World
-from tactile_bus.arm_types import ZERO, ArmLimits, ArmState, Twist
+from tactile_bus.arm_types import ZERO, ArmLimits, ArmState, Echo, Twist
 from tactile_bus.instant import NS_PER_S, Instant, after
 from tactile_bus.records import record
 
@@ -32,6 +32,9 @@ MAX_PENDING: Final = 64
 MAX_UNREAD: Final = 400
 """States not yet fetched: one second at the highest rate; older ones are of no use to anyone."""
 
+FAST: Final = 5.0
+"""How many times too fast an arm moves that has the fault of this name."""
+
 FACTORY_LIMITS: Final = ArmLimits(v_max=0.5, omega_max=1.0, f_max=100.0, m_max=20.0)
 """What an arm allows that nobody has set up: ten times too much for a cupboard (v_max and ω_max
 are the defaults of Flexiv's RDK; force and moment are ours)."""
@@ -42,8 +45,9 @@ class ArmFault(StrEnum):
 
     ``SILENT``: no state is sent. ``FROZEN``: states with fresh stamps and old values. ``STALE``:
     the same state over and over, stamps and all. ``BIASED``: a constant wrench is added.
-    ``REFUSES_LIMITS``: keeps and confirms its own limits. ``FAULT``: the drives have failed and
-    brake. ``ESTOP``: the button is pressed.
+    ``REFUSES_LIMITS``: keeps and confirms its own limits. ``BACKWARDS``, ``SIDEWAYS``: mounted the
+    wrong way round, it moves so. ``FAST``: moves `FAST` times as fast as it is told. ``FAULT``: the
+    drives have failed and brake. ``ESTOP``: the button is pressed.
     """
 
     SILENT = "silent"
@@ -51,6 +55,9 @@ class ArmFault(StrEnum):
     STALE = "stale"
     BIASED = "biased"
     REFUSES_LIMITS = "refuses_limits"
+    BACKWARDS = "backwards"
+    SIDEWAYS = "sideways"
+    FAST = "fast"
     FAULT = "fault"
     ESTOP = "estop"
 
@@ -102,11 +109,12 @@ class ArmSettings:
 
 @record
 class _Command:
-    """A twist, the instant it takes effect and the instant it dies."""
+    """A twist, the instant it takes effect and the instant it dies; ``echo`` names it."""
 
     twist: Twist
     effective: Instant
     expires: Instant
+    echo: Echo | None
 
 
 class SimulatedArm:
@@ -128,6 +136,7 @@ class SimulatedArm:
         self._next_state = Instant(start + self._period)
         self._pending: deque[_Command] = deque()
         self._active: _Command | None = None
+        self._echo: Echo | None = None
         self._unread: deque[ArmState] = deque()
         self._faults: frozenset[ArmFault] = frozenset()
         self._latched: str | None = None
@@ -197,8 +206,16 @@ class SimulatedArm:
             self._world.limit_wrench(self._limits.f_max, self._limits.m_max)
         return self._limits
 
-    def command(self, twist: Twist, now: Instant, expiry: float = DEFAULT_EXPIRY) -> bool:
+    def command(
+        self,
+        twist: Twist,
+        now: Instant,
+        expiry: float = DEFAULT_EXPIRY,
+        echo: Echo | None = None,
+    ) -> bool:
         """Move at ``twist`` until ``expiry`` s from ``now``, or the next command.
+
+        ``echo``: what states say of it once it is in force.
 
         False where it is refused and counted, and the arm stops: not finite, an expiry that is not
         finite or not above 0, or an arm that is not enabled. Longer expiries are cut to
@@ -215,7 +232,8 @@ class SimulatedArm:
         if len(self._pending) == MAX_PENDING:
             self._pending.popleft()
             self.counters["overflow"] += 1
-        self._pending.append(_Command(self._within_limits(twist), effective, after(now, expiry)))
+        held = self._within_limits(twist)
+        self._pending.append(_Command(held, effective, after(now, expiry), echo))
         self.counters["accepted"] += 1
         return True
 
@@ -229,6 +247,8 @@ class SimulatedArm:
                 break
             end = self._next_change(at, end)
             target = self._active.twist if self._active is not None else ZERO
+            if self._faults:
+                target = self._misunderstood(target)
             self._world.step((end - at) / NS_PER_S, target)
             self._clock = end
             if end == self._next_state:
@@ -279,10 +299,21 @@ class SimulatedArm:
         self.counters["clamped"] += 1
         return Twist(twist.vx * scale, twist.vy * scale, omega)
 
+    def _misunderstood(self, twist: Twist) -> Twist:
+        """What an arm that is mounted or scaled wrongly makes of ``twist``."""
+        if ArmFault.BACKWARDS in self._faults:
+            twist = Twist(-twist.vx, -twist.vy, -twist.omega)
+        if ArmFault.SIDEWAYS in self._faults:
+            twist = Twist(-twist.vy, twist.vx, twist.omega)
+        if ArmFault.FAST in self._faults:
+            twist = Twist(FAST * twist.vx, FAST * twist.vy, FAST * twist.omega)
+        return twist
+
     def _take_commands(self, at: Instant) -> None:
         """Let commands take effect, and die, that are due at ``at``."""
         while self._pending and self._pending[0].effective <= at:
             self._active = self._pending.popleft()
+            self._echo = self._active.echo
             self._stopped_itself = False
         if self._active is not None and self._active.expires < at + STEP_NS:
             # A step is whole: stopping before the one in which it dies never holds it too long.
@@ -347,4 +378,5 @@ class SimulatedArm:
             omega_max=limits.omega_max,
             f_max=limits.f_max,
             m_max=limits.m_max,
+            echo=self._echo,
         )

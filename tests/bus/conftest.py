@@ -79,10 +79,13 @@ def example_messages() -> dict[topics.Topic, Any]:
         topics.LOG: log_message(WALL_NS, 30, "b0", "grüße"),
         topics.ARM_STATE: MSG.ArmState(
             header(WALL_NS, "cupboard"), 1, 2, 0.1, -0.2, 0.3, twist, wrench,
-            "moving", 0.05, 0.35, 10.0, 1.5,
+            "moving", 0.05, 0.35, 10.0, 1.5, "reach-1", 7, 1,
         ),
         topics.REFERENCE: MSG.WrenchStamped(head, wrench),
-        topics.COMMAND: MSG.TwistStamped(header(WALL_NS, "cupboard"), twist),
+        topics.COMMAND: MSG.ArmCommand(
+            header(WALL_NS, "cupboard"), twist, 1, 2, 0.0625, "reach-1",
+            np.arange(16, dtype=np.uint8),
+        ),
         topics.REACH_STATE: MSG.ReachState(
             header(WALL_NS, "cupboard"), 1, 2, "reaching", "burrow", "hybrid_event",
             MSG.Point(0.358, 0.03, 0.0), 0.0075, 0.2, 3.5, twist, twist, True, "",

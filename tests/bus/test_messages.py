@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from tactile_bus import topics
 from tactile_bus.messages import (
+    LATER_FIELDS,
     MAX_PAYLOAD,
     MSG,
     SHORT_NAMES,
@@ -151,3 +152,10 @@ def test_channels_lead_back_to_their_topics() -> None:
     assert topics.find_topic("/rosout") is None
     with pytest.raises(ValueError, match="is no name"):
         topics.FEATURES.channel("a/b")
+
+
+def test_fields_that_came_later_are_those_at_the_end_of_their_types() -> None:
+    """Logs from before lack them and are read: so a field is only ever added at the end."""
+    for name, later in LATER_FIELDS.items():
+        fields = [field for field, _ in codec().fields(name)]
+        assert set(fields[-len(later) :]) == later, name

@@ -13,14 +13,16 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 import zenoh
 
 from sim_device.world.scenes import Pose, Scene, SceneObject, Shape
 from tactile_bus.arm_types import ZERO, Twist
+from tactile_bus.commanding import ClaimRequest, Grant, Signer, clock_domain
 from tactile_bus.instant import NS_PER_S, WallClock, monotonic_now
-from tactile_bus.messages import MSG, codec, header
-from tactile_bus.services import call
+from tactile_bus.messages import codec
+from tactile_bus.services import ServiceError, call
 from tactile_bus.session import BusConfig, close_session, open_session
 from tactile_bus.streams import BusSample, Publisher, Tap, declare_publisher
 from tactile_bus.topics import ARM_STATE, COMMAND, service_key
@@ -51,33 +53,56 @@ def free_port() -> int:
         return port
 
 
-def command_bytes(twist: Twist, frame: str = "cupboard", z: float = 0.0) -> bytes:
-    message = MSG.TwistStamped(
-        header(1, frame),
-        MSG.Twist(MSG.Vector3(twist.vx, twist.vy, z), MSG.Vector3(0.0, 0.0, twist.omega)),
-    )
-    return codec().encode(COMMAND, message)
+EXPIRY = 0.06
 
 
 class Commander:
-    """Sends ``twist`` 100 times a second until it is stopped; then nothing, not even a zero."""
+    """Sends ``twist`` 100 times a second until it is stopped; then nothing, not even a zero.
 
-    def __init__(self, session: zenoh.Session, twist: Twist) -> None:
+    It claims the arm, ServiceError where that is not granted; or sends under a grant of its own
+    making, where ``grant`` is given.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, twist: Twist, grant: Grant | None = None, name: str = "test"
+    ) -> None:
         self._publisher = declare_publisher(session, COMMAND, "arm")
-        self._data = command_bytes(twist)
+        self.grant = claim(session, name) if grant is None else grant
+        self.signer = Signer(self.grant)
+        self._twist = twist
+        self._delay = 0.0
+        self._queue: list[tuple[float, bytes]] = []
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
+    def delay(self, seconds: float) -> None:
+        """From now on commands take so long on the way; what is under way still comes."""
+        self._delay = seconds
+
     def stop(self) -> None:
+        """Decide nothing more; what is under way is sent to its end."""
         self._stop.set()
         self._thread.join()
         self._publisher.close()
 
     def _run(self) -> None:
         wall = WallClock.take()
-        while not self._stop.wait(0.01):
-            self._publisher.put(self._data, wall.wall_ns(monotonic_now()))
+        while not self._stop.wait(0.01) or self._queue:
+            now = monotonic_now()
+            if not self._stop.is_set():
+                data = self.signer.command(self._twist, now, EXPIRY, wall.wall_ns(now))
+                self._queue.append((time.monotonic() + self._delay, data))
+            else:
+                time.sleep(0.01)
+            while self._queue and self._queue[0][0] <= time.monotonic():
+                self._publisher.put(self._queue.pop(0)[1], wall.wall_ns(now))
+
+
+def claim(session: zenoh.Session, name: str = "test", clock: str | None = None) -> Grant:
+    """Become the commander of the arm; ServiceError where somebody else is."""
+    request = ClaimRequest(name, clock_domain() if clock is None else clock)
+    return msgspec.convert(call(session, service_key("arm", "claim", "arm"), request, 20), Grant)
 
 
 class Cupboard:
@@ -109,8 +134,11 @@ class Cupboard:
     def publisher(self) -> Publisher:
         return declare_publisher(self.session, COMMAND, "arm")
 
-    def commander(self, twist: Twist) -> Commander:
-        return Commander(self.session, twist)
+    def commander(self, twist: Twist, **how: Any) -> Commander:
+        return Commander(self.session, twist, **how)
+
+    def claim(self, name: str = "test") -> Signer:
+        return Signer(claim(self.session, name))
 
     def rest(self) -> None:
         """Wait until no command is under way: a late one sets an arm off that had stopped."""
@@ -126,9 +154,17 @@ class Cupboard:
     def settled(self) -> None:
         """Arm at rest, another commander welcome, everything back where it was."""
         self.rest()
-        time.sleep(0.4)
+        until(lambda: not self.owned())
         self.call("reset", kind="world")
         self.call("limits", LIMITS)
+
+    def owned(self) -> bool:
+        """Whether somebody still commands the arm, who must fall silent first."""
+        try:
+            self.call("limits", LIMITS)
+        except ServiceError:
+            return True
+        return False
 
     def end(self) -> tuple[int, str]:
         self.process.send_signal(signal.SIGINT)
@@ -186,11 +222,6 @@ def start(tmp_path: Path, scene_file: Path) -> Iterator[Callable[..., Cupboard]]
     yield run
     for running in started:
         running.close()
-
-
-@pytest.fixture(scope="session")
-def encode_command() -> Callable[..., bytes]:
-    return command_bytes
 
 
 __all__ = ["ZERO", "Commander", "Cupboard"]

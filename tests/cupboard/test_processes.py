@@ -17,11 +17,11 @@ import pytest
 
 from sim_device.catalogue import factory_calibration
 from tactile_bus.arm_types import Twist
-from tactile_bus.instant import NS_PER_S, monotonic_now
-from tactile_bus.messages import codec
+from tactile_bus.instant import NS_PER_S, Instant, monotonic_now
+from tactile_bus.messages import MSG, codec
 from tactile_bus.services import ServiceError
-from tactile_bus.streams import latest
-from tactile_bus.topics import WORLD, alive_key
+from tactile_bus.streams import Tap, latest
+from tactile_bus.topics import COMMAND, WORLD, alive_key
 from tactiled.blocks import Cycle
 from tactiled.links.events import Sampled
 from tactiled.links.line import SerialLine
@@ -33,13 +33,19 @@ STILL = 1e-4  # m/s
 
 COMMANDER = textwrap.dedent("""
     import sys, time
+    import msgspec
+    from tactile_bus.arm_types import Twist
+    from tactile_bus.commanding import ClaimRequest, Grant, Signer, clock_domain
+    from tactile_bus.services import call
     from tactile_bus.session import BusConfig, open_session
     from tactile_bus.streams import Publisher
     session = open_session(BusConfig(listen=(), connect=(f"tcp/127.0.0.1:{sys.argv[1]}",)))
-    publisher = Publisher(session, "arm/arm/cmd_vel", "geometry_msgs/msg/TwistStamped")
-    data = bytes.fromhex(sys.argv[2])
+    request = ClaimRequest("other", clock_domain())
+    signer = Signer(msgspec.convert(call(session, "arm/arm/srv/claim", request, 20), Grant))
+    publisher = Publisher(session, "arm/arm/cmd_vel", "tactile_msgs/msg/ArmCommand")
     print("ready", flush=True)
     while True:
+        data = signer.command(Twist(0.05, 0.0, 0.0), time.monotonic_ns(), 0.06, time.time_ns())
         publisher.put(data, time.time_ns())
         time.sleep(0.01)
 """)
@@ -104,9 +110,9 @@ def test_a_command_moves_the_arm_and_its_end_stops_it(cupboard: Any, wait_until:
 
 
 @pytest.fixture
-def other(cupboard: Any, encode_command: Any) -> Iterator[subprocess.Popen[str]]:
+def other(cupboard: Any) -> Iterator[subprocess.Popen[str]]:
     process = subprocess.Popen(
-        [sys.executable, "-c", COMMANDER, str(cupboard.port), encode_command(AHEAD).hex()],
+        [sys.executable, "-c", COMMANDER, str(cupboard.port)],
         stdout=subprocess.PIPE,
         text=True,
     )
@@ -135,41 +141,114 @@ def test_a_second_commander_is_refused_until_the_first_is_gone(
     cupboard: Any, wait_until: Wait
 ) -> None:
     begin = cupboard.states[-1].x
-    foreign = cupboard.call("status")["counters"]["foreign"]
     first = cupboard.commander(AHEAD)
     wait_until(lambda: cupboard.states[-1].mode == "moving")
-    second = cupboard.commander(BACK)
+    assert cupboard.states[-1].commander == first.grant.commander
+    with pytest.raises(ServiceError, match="another reachd \\(reach 'test'\\)"):
+        cupboard.commander(BACK, name="second")
     wait_until(lambda: cupboard.states[-1].x > begin + 0.015)
-    assert cupboard.call("status")["counters"]["foreign"] > foreign
     assert min(s.twist.linear.x for s in cupboard.states[-100:]) > -STILL
     first.stop()
+    second = None
+    while second is None:
+        try:
+            second = cupboard.commander(BACK, name="second")
+        except ServiceError:
+            time.sleep(0.05)
     wait_until(lambda: cupboard.states[-1].twist.linear.x < -0.01)
+    state = cupboard.states[-1]
+    assert state.commander == second.grant.commander
+    assert state.command_sequence > 0
     second.stop()
 
 
+def test_strangers_move_nothing_and_lock_nobody_out(cupboard: Any, wait_until: Wait) -> None:
+    """Row 45: whoever reads all that the commander sends, and sends a hundred times as much."""
+    heard: list[bytes] = []
+    tap = Tap(cupboard.session, COMMAND.key("arm"), lambda s: heard.append(s.data))
+    owner = cupboard.commander(AHEAD)
+    wait_until(lambda: cupboard.states[-1].mode == "moving")
+    wait_until(lambda: heard)
+    publisher = cupboard.publisher()
+    back = MSG.Twist(MSG.Vector3(-0.3, 0.0, 0.0), MSG.Vector3(0.0, 0.0, 0.0))
+    begin, count = cupboard.states[-1].x, len(cupboard.states)
+    while cupboard.states[-1].x < begin + 0.02:
+        message = codec().decode(COMMAND, heard[-1])
+        message.twist = back
+        for sequence in (message.sequence + 1, 2**60):
+            message.sequence = sequence
+            publisher.put(codec().encode(COMMAND, message), 1)
+        message.commander = "evil-00000000"
+        publisher.put(codec().encode(COMMAND, message), 1)
+        publisher.put(heard[max(0, len(heard) - 50)], 1)  # as it came
+        time.sleep(0.001)
+    moved = cupboard.states[count:]
+    assert min(s.twist.linear.x for s in moved) > 0.02, "it never stopped nor turned"
+    assert {s.commander for s in moved} == {owner.grant.commander}
+    for service, request in (
+        ("limits", FACTORY),
+        ("limits", FACTORY | {"commander": owner.grant.commander}),
+        ("clear", {}),
+        ("claim", {"name": "evil", "clock": ""}),
+        ("release", {}),
+    ):
+        with pytest.raises(ServiceError, match=r"arm's commander|commanded by another"):
+            cupboard.call(service, request)
+    assert cupboard.states[-1].v_max == 0.05
+    counters = cupboard.call("status")["counters"]
+    assert all(counters[reason] > 0 for reason in ("forged", "foreign", "repeated"))
+    owner.stop()
+    tap.close()
+    publisher.close()
+
+
+FACTORY = {"v_max": 0.5, "omega_max": 1.0, "f_max": 100.0, "m_max": 20.0}
+
+
 def test_damaged_oversized_and_nameless_commands_move_nothing(
-    cupboard: Any, encode_command: Any, wait_until: Wait
+    cupboard: Any, wait_until: Wait
 ) -> None:
     before = cupboard.call("status")["counters"]
-    good = encode_command(AHEAD)
+    signer, publisher = cupboard.claim(), cupboard.publisher()
+    nameless = cupboard.session.declare_publisher("arm/arm/cmd_vel")
+
+    def command(twist: Twist = AHEAD, ago: int = 0) -> bytes:
+        return bytes(signer.command(twist, Instant(monotonic_now() - ago), 0.06, 1))
 
     def refused(reason: str) -> int:
         return int(cupboard.call("status")["counters"][reason])
 
-    publisher = cupboard.publisher()
-    nameless = cupboard.session.declare_publisher("arm/arm/cmd_vel")
     for reason, send in (
-        ("malformed", lambda: publisher.put(good[:40], 1)),
-        ("anonymous", lambda: nameless.put(good)),
-        ("oversized", lambda: nameless.put(good + bytes(66_000 - len(good)))),
-        ("not_finite", lambda: publisher.put(encode_command(Twist(math.nan, 0.0, 0.0)), 1)),
+        ("malformed", lambda: publisher.put(command()[:40], 1)),
+        ("forged", lambda: nameless.put(command()[:-16] + bytes(16))),
+        ("oversized", lambda: nameless.put(command() + bytes(66_000))),
+        ("late", lambda: publisher.put(command(ago=NS_PER_S), 1)),
+        ("not_finite", lambda: publisher.put(command(Twist(math.nan, 0.0, 0.0)), 1)),
     ):
-        # Again and again: the arm looks at the newest command alone.
+        # Again and again: on a busy machine one may come too late.
         wait_until(lambda send=send, reason=reason: send() or refused(reason) > before[reason])
     after = cupboard.call("status")["counters"]
     assert after["accepted"] == before["accepted"]
     assert {s.mode for s in cupboard.states[-20:]} <= {"ready", "stopped"}
     nameless.undeclare()
+
+
+@pytest.mark.parametrize("delay", [0.25])
+def test_commands_expire_by_their_decision_however_they_are_delayed(
+    delay: float, cupboard: Any, wait_until: Wait
+) -> None:
+    """Row 37: a queue on the way holds what was decided before the stop."""
+    begin = cupboard.states[-1].x
+    commander = cupboard.commander(AHEAD)
+    wait_until(lambda: cupboard.states[-1].x > begin + 0.005)
+    commander.delay(delay)
+    time.sleep(0.5)
+    commander.stop()
+    stopped = monotonic_now()
+    time.sleep(delay + 0.3)
+    moving = [s.captured_ns for s in cupboard.states if abs(s.twist.linear.x) > STILL]
+    assert max(moving) - stopped < 0.1 * NS_PER_S
+    assert cupboard.call("status")["counters"]["late"] > 10
 
 
 def test_limits_are_confirmed_and_kept(cupboard: Any, wait_until: Wait) -> None:
@@ -257,9 +336,11 @@ def test_an_emergency_stop_cannot_be_cleared_while_pressed_and_ctrl_c_ends_in_or
     assert factory["v_max"] == 0.5
     commander = cupboard.commander(AHEAD)
     wait_until(lambda: cupboard.call("status")["counters"]["not_enabled"] > 30)
-    with pytest.raises(ServiceError, match="'estop' is still there"):
+    with pytest.raises(ServiceError, match="for the arm's commander"):
         cupboard.call("clear")
     commander.stop()
+    with pytest.raises(ServiceError, match="'estop' is still there"):
+        cupboard.call("clear", commander.signer.sign("clear"))
     assert {s.mode for s in cupboard.states} == {"estop"}
     assert cupboard.states[-1].x == pytest.approx(-0.2, abs=1e-6)
     code, errors = cupboard.end()

@@ -20,7 +20,7 @@ Recorded = Callable[..., tuple[int, Path]]
 TYPES = {
     "/world/world/objects": "visualization_msgs/msg/MarkerArray",
     "/arm/arm/state": "tactile_msgs/msg/ArmState",
-    "/arm/arm/cmd_vel": "geometry_msgs/msg/TwistStamped",
+    "/arm/arm/cmd_vel": "tactile_msgs/msg/ArmCommand",
     "/tactile/finger/features": "tactile_msgs/msg/ContactFeatures",
     "/reach/reach/state": "tactile_msgs/msg/ReachState",
     "/reach/reach/event": "tactile_msgs/msg/ReachEvent",

@@ -87,7 +87,15 @@ def recorded() -> Callable[..., Path]:
             number = i + round(start * 100)
             recorder.write(topics.FEATURES, "finger", features(at, number), at + 1_000_000, at)
             twist = MSG.Twist(MSG.Vector3(number * 1e-3, 0.0, 0.0), MSG.Vector3(0.0, 0.0, 0.1))
-            command = MSG.TwistStamped(header(at, "cupboard"), twist)
+            command = MSG.ArmCommand(
+                header(at, "cupboard"),
+                twist,
+                at,
+                number + 1,
+                0.06,
+                "reach-1",
+                np.zeros(16, np.uint8),
+            )
             data = codec().encode(topics.COMMAND, command)
             recorder.write(topics.COMMAND, "arm", data, at + 2_000_000, at)
             if i % 50 == 0:

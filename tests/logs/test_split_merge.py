@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from tactile_bus import topics
+from tactile_bus.arm_types import Twist
+from tactile_bus.commanding import command_message
 from tactile_bus.log_info import info
 from tactile_bus.log_reader import read_messages
 from tactile_bus.recorder import RecorderSettings
@@ -76,7 +78,7 @@ def test_values_that_hold_begin_every_part(
         at = 10**18 + i * 10**7
         command = codec().encode(
             topics.COMMAND,
-            MSG.TwistStamped(header(at, ""), MSG.Twist(*[MSG.Vector3(0.0, 0.0, 0.0)] * 2)),
+            command_message(Twist(0.0, 0.0, 0.0), at, 0.06, at),
         )
         recorder.write(topics.COMMAND, "arm", command, at, at)
     assert recorder.close(10)

@@ -78,27 +78,6 @@ def frozen(gate: SafetyGate, wanted: Twist, make: tuple[Callable, Callable], **p
     return decision.held is Check.ARM_FROZEN
 
 
-@pytest.mark.parametrize("name", ["x", "y", "heading"])
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_ten_micrometres_are_not_motion_yet(
-    name: str,
-    sign: float,
-    settings: SafetySettings,
-    make_gate: Callable,
-    make_touch: Callable,
-    make_arm: Callable,
-) -> None:
-    free = replace(
-        settings, disabled=frozenset({Check.ACCELERATION, Check.WORKSPACE}), frozen_after=0.565
-    )
-    made = (make_touch, make_arm)
-    step = Twist(0.04, 0.0, 0.0)
-    # 58 cycles after the first stay: just long enough if the tiny move began no new count.
-    assert frozen(make_gate(free), step, made, **{name: sign * 1e-5})
-    beyond = {name: sign * math.nextafter(1e-5, 1)}
-    assert not frozen(make_gate(free), step, made, **beyond)
-
-
 @pytest.mark.parametrize(("speed", "watched"), [(0.002, True), (math.nextafter(0.002, 0), False)])
 def test_from_two_millimetres_a_second_on_it_is_watched(
     speed: float,

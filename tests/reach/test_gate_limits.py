@@ -110,10 +110,19 @@ def test_acceleration_is_bounded_each_cycle(send: Callable[..., Decision], codes
         (Twist(0.3, 0.4, 0.1), Twist(0.0, 0.0, 0.0), Twist(0.06, 0.08, 0.1)),
         (Twist(0.05, 0.0, 0.5), Twist(0.0, 0.0, 0.0), Twist(0.05, 0.0, 0.2)),
         (Twist(0.05, 0.0, -0.5), Twist(0.0, 0.0, 0.0), Twist(0.05, 0.0, -0.2)),
-        (Twist(-0.5, 0.0, 0.1), Twist(0.5, 0.0, 0.0), Twist(0.4, 0.0, 0.1)),
-        (Twist(0.0, 0.0, 0.01), Twist(0.5, 0.0, 0.9), Twist(0.4, 0.0, 0.7)),
-        (Twist(0.0, 0.01, 0.0), Twist(0.0, 0.0, 0.9), Twist(0.0, 0.01, 0.7)),
-        (Twist(0.01, 0.0, 0.0), Twist(0.0, 0.0, 0.9), Twist(0.01, 0.0, 0.7)),
+        # Braking is as sudden as it is wanted; the other way begins with standing still.
+        (Twist(-0.5, 0.0, 0.1), Twist(0.5, 0.0, 0.0), Twist(0.0, 0.0, 0.1)),
+        (Twist(-0.5, 0.0, 0.1), Twist(0.1, 0.0, 0.0), Twist(0.0, 0.0, 0.1)),
+        (Twist(-0.5, 0.0, 0.1), Twist(0.06, 0.0, 0.0), Twist(-0.04, 0.0, 0.1)),
+        (Twist(0.0, 0.0, 0.01), Twist(0.5, 0.0, 0.9), Twist(0.0, 0.0, 0.01)),
+        (Twist(0.2, 0.2, 0.0), Twist(0.4, 0.4, 0.9), Twist(0.2, 0.2, 0.0)),
+        (Twist(0.0, 0.01, 0.0), Twist(0.0, 0.0, -0.9), Twist(0.0, 0.01, 0.0)),
+        (Twist(0.0, 0.0, -0.5), Twist(0.0, 0.0, 0.9), Twist(0.0, 0.0, 0.0)),
+        (Twist(0.0, 0.0, -0.5), Twist(0.0, 0.0, 0.1), Twist(0.0, 0.0, -0.1)),
+        (Twist(0.0, 0.0, 0.9), Twist(0.0, 0.0, 0.5), Twist(0.0, 0.0, 0.7)),
+        # A turn of the way is no braking, and nor is going on faster.
+        (Twist(0.0, 0.3, 0.0), Twist(0.3, 0.0, 0.0), Twist(0.3 - 0.1 / 2**0.5, 0.1 / 2**0.5, 0.0)),
+        (Twist(0.6, 0.0, 0.0), Twist(0.3, 0.0, 0.0), Twist(0.4, 0.0, 0.0)),
     ],
 )
 def test_within_acceleration(wanted: Twist, last: Twist, expected: Twist) -> None:
@@ -121,6 +130,26 @@ def test_within_acceleration(wanted: Twist, last: Twist, expected: Twist) -> Non
     assert (found.vx, found.vy, found.omega) == pytest.approx(
         (expected.vx, expected.vy, expected.omega)
     )
+
+
+def test_acceleration_is_bounded_last_and_never_against_another_limit(
+    make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
+) -> None:
+    """A load from one state to the next: it brakes on its way, then slides off from standing."""
+    gate = make_gate(settings)
+    for k in range(1, 12):
+        now = Instant(T0 + k * 10_000_000)
+        last = gate.step(Twist(0.04, 0.0, 0.0), make_touch(now), make_arm(now, **INSIDE), None, now)
+    assert last.twist == Twist(0.04, 0.0, 0.0)
+    slid = []
+    for k in range(12, 20):
+        now = Instant(T0 + k * 10_000_000)
+        arm = make_arm(now, fx=-15.0, **INSIDE)
+        decision = gate.step(Twist(0.04, 0.03, 0.0), make_touch(now), arm, None, now)
+        slid.append((decision.twist.vx, decision.twist.vy))
+    assert slid[0] == pytest.approx((0.0, 0.0), abs=1e-12)
+    assert slid[1] == pytest.approx((0.0, 0.005), abs=1e-9)
+    assert slid[-1] == pytest.approx((0.0, 0.03), abs=1e-9)
 
 
 def test_a_stop_is_not_delayed(

@@ -32,7 +32,7 @@ TABLES = {
         "goal_radius": 0.0075,
         "safety.force": 15.0,
         "safety.torque": 4.5,
-        "safety.arm_f_max": 15.0,
+        "safety.arm_f_max": 15.0 / math.sqrt(2.0),  # on both axes at once 15
         "safety.arm_m_max": 4.5,
     },
     # The authors' simulator, lengths / 10.

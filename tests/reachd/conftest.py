@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import queue
 import signal
 import socket
 import subprocess
@@ -19,19 +20,25 @@ from typing import Any
 import pytest
 import zenoh
 
-from tactile_bus.arm_types import ARM_LIMITS, ArmLimits
+from reachd.parameters import SETS
+from tactile_bus.arm_services import serve_desk
+from tactile_bus.arm_types import ArmLimits
+from tactile_bus.commanding import (
+    CommandDesk,
+    LimitsRequest,
+    NotGrantedError,
+    Order,
+    limits_fields,
+)
 from tactile_bus.instant import WallClock, monotonic_now
 from tactile_bus.messages import MSG, codec, header
-from tactile_bus.services import call, declare_service
+from tactile_bus.services import ServiceError, call, declare_service
 from tactile_bus.session import BusConfig, close_session, open_session
 from tactile_bus.streams import declare_publisher
 from tactile_bus.topics import ARM_STATE, COMMAND, REACH_EVENT, REACH_STATE, service_key
 
 SLOW = 60.0
 """s that anything may take on a busy machine before a test gives it up."""
-
-EXPIRY = 0.06
-"""s for which the arm follows a command."""
 
 
 def until(done: Callable[[], object], seconds: float = SLOW) -> None:
@@ -55,6 +62,7 @@ class Heard:
     vx: float
     vy: float
     omega: float
+    order: Order
 
     @property
     def still(self) -> bool:
@@ -62,7 +70,7 @@ class Heard:
 
 
 class FakeArm:
-    """Obeys twists without inertia, each for `EXPIRY` s; its tip starts at the shelf's edge."""
+    """Obeys twists without inertia, each until it expires; its tip starts at the shelf's edge."""
 
     def __init__(self, endpoint: str, name: str = "arm") -> None:
         self.name = name
@@ -70,6 +78,7 @@ class FakeArm:
         self.force = (0.0, 0.0, 0.0)
         self.mode = "ready"
         self.paused = False
+        self.does = lambda speed: speed  # what it makes of the speed that it is told
         self.frozen: Any = None  # a state whose values are repeated under fresh stamps
         self.deaf_to_limits = False
         self.limits = ArmLimits(0.5, 1.0, 100.0, 20.0)
@@ -79,9 +88,11 @@ class FakeArm:
         self._wall = WallClock.take()
         self._stopping = threading.Event()
         self._key = COMMAND.key(name)
+        self.desk = CommandDesk()
         self._subscriber = self.session.declare_subscriber(self._key, self._hear)
         key = service_key(name, "limits", "arm")
-        self._service = declare_service(self.session, key, self._limit, ArmLimits)
+        self._services = serve_desk(self.session, name, self.desk)
+        self._services.append(declare_service(self.session, key, self._limit, LimitsRequest))
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -92,9 +103,10 @@ class FakeArm:
     @property
     def speed(self) -> tuple[float, float, float]:
         last = self.heard[-1] if self.heard else None
-        if last is None or time.monotonic() - last.at > EXPIRY or self.mode in ("estop", "fault"):
+        if last is None or monotonic_now() >= last.order.expires or self.mode in ("estop", "fault"):
             return (0.0, 0.0, 0.0)
-        return (last.vx, last.vy, last.omega)
+        vx, vy, omega = self.does((last.vx, last.vy, last.omega))
+        return (vx, vy, omega)
 
     def close(self) -> None:
         self._stopping.set()
@@ -102,14 +114,24 @@ class FakeArm:
         close_session(self.session)
 
     def _hear(self, sample: zenoh.Sample) -> None:
-        twist = codec().decode(COMMAND, sample.payload.to_bytes()).twist
-        heard = Heard(time.monotonic(), twist.linear.x, twist.linear.y, twist.angular.z)
+        now = monotonic_now()
+        if self.desk.hear(sample.payload.to_bytes(), now) is not None:
+            return
+        order = self.desk.newest(now)
+        if order is None:  # it expired while this thread waited for the machine
+            return
+        twist = order.twist
+        heard = Heard(time.monotonic(), twist.vx, twist.vy, twist.omega, order)
         assert all(math.isfinite(v) for v in (heard.vx, heard.vy, heard.omega))
         self.heard.append(heard)
 
-    def _limit(self, limits: ArmLimits) -> ArmLimits:
+    def _limit(self, request: LimitsRequest) -> ArmLimits:
+        try:
+            self.desk.authorise("limits", request, monotonic_now(), **limits_fields(request.limits))
+        except NotGrantedError as error:
+            raise ServiceError(str(error)) from error
         if not self.deaf_to_limits:
-            self.limits = limits
+            self.limits = request.limits
         return self.limits
 
     def _run(self) -> None:
@@ -136,7 +158,9 @@ class FakeArm:
         now, limits = monotonic_now(), self.limits
         if self.frozen is not None:
             stamp = header(self._wall.wall_ns(now), "cupboard")
-            return replace(self.frozen, header=stamp, captured_ns=now, sequence=sequence)
+            return replace(
+                self.frozen, header=stamp, captured_ns=now, sequence=sequence, **self._echo()
+            )
         vx, vy, omega = self.speed
         fx, fy, mz = self.force
         return MSG.ArmState(
@@ -153,13 +177,27 @@ class FakeArm:
             omega_max=limits.omega_max,
             f_max=limits.f_max,
             m_max=limits.m_max,
+            **self._echo(),
         )
+
+    def _echo(self) -> dict[str, Any]:
+        last, commander = (self.heard[-1].order if self.heard else None), self.desk.commander
+        mine = last is not None and last.commander == commander
+        return {
+            "commander": commander,
+            "command_sequence": last.sequence if mine else 0,
+            "command_ns": last.decided if mine else 0,
+        }
 
 
 class Wire:
-    """A TCP connection to ``target`` that can be cut so that neither end is told."""
+    """A TCP connection to ``target`` that can be cut so that neither end is told.
+
+    ``delay``: s that what goes towards ``target`` takes; the other way is as quick as ever.
+    """
 
     def __init__(self, target: str) -> None:
+        self.delay = 0.0
         self._target = int(target.rpartition(":")[2])
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
@@ -192,14 +230,33 @@ class Wire:
                     near.close()
                     continue
                 self._ends += [near, far]
-                for pair in ((near, far), (far, near)):
-                    threading.Thread(target=self._pump, args=pair, daemon=True).start()
+                waiting: queue.SimpleQueue[tuple[float, bytes]] = queue.SimpleQueue()
+                for work, args in (
+                    (self._hold, (near, waiting)),
+                    (self._let_go, (waiting, far)),
+                    (self._pump, (far, near)),
+                ):
+                    threading.Thread(target=work, args=args, daemon=True).start()
 
     def _far(self) -> socket.socket | None:
         try:
             return socket.create_connection(("127.0.0.1", self._target), timeout=SLOW)
         except OSError:
             return None  # nobody listens yet; whoever connects tries again
+
+    def _hold(self, source: socket.socket, waiting: queue.SimpleQueue[tuple[float, bytes]]) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(65536):
+                waiting.put((time.monotonic() + self.delay, data))
+        waiting.put((0.0, b""))
+
+    def _let_go(self, waiting: queue.SimpleQueue[tuple[float, bytes]], sink: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while (item := waiting.get())[1]:
+                time.sleep(max(0.0, item[0] - time.monotonic()))
+                self._whole.wait()
+                sink.sendall(item[1])
+            sink.shutdown(socket.SHUT_RDWR)
 
     def _pump(self, source: socket.socket, sink: socket.socket) -> None:
         with contextlib.suppress(OSError):
@@ -333,4 +390,4 @@ def wait_until() -> Callable[..., None]:
 
 @pytest.fixture
 def hardware_limits() -> ArmLimits:
-    return replace(ARM_LIMITS["hardware"])
+    return replace(SETS["hardware"].safety.arm_limits)

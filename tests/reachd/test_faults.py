@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import signal
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 from mcap.reader import make_reader
+
+from tactile_bus.messages import codec
+from tactile_bus.services import ServiceError
+from tactile_bus.topics import REACH_EVENT
 
 NEAR = ("--strategy", "straight", "--target", "0.04,0.0", "--seed", "1")
 FAR = ("--strategy", "straight", "--target", "0.36,0.0", "--seed", "1")
@@ -56,7 +61,9 @@ def test_a_step_of_the_system_clock_changes_nothing(
     # A busy machine makes inputs old and cycles late; by a clock they would be so by an hour.
     assert set(lab.codes("intervention")) <= {"not_armed", "features_lost", "features_stale",
                                               "arm_stale", "arm_lost", "arm_limits", "loop_late",
-                                              "acceleration", "slow_down"}  # fmt: skip
+                                              "acceleration", "slow_down", "commander",
+                                              "echo_late", "echo_lost",
+                                              "features_sparse"}  # fmt: skip
     with (lab.folder / "trial.mcap").open("rb") as file:
         stamps = [
             (message.log_time, message.publish_time)
@@ -151,3 +158,105 @@ def test_a_second_reachd_elsewhere_on_the_bus_is_refused(lab: Any, wait_until: U
     assert "commanded by another reachd (reach 'reach') on this bus" in second.said
     assert first.process.poll() is None
     assert all(h.still for h in arm.heard)
+
+
+def test_a_second_reachd_that_sees_only_the_arm_is_refused(lab: Any, wait_until: Until) -> None:
+    """Row 35 by the arm itself: no lock is shared, and no link but that to the arm."""
+    arm, _ = lab.arm, lab.board()
+    lab.reachd("--serve", "--strategy", "straight", "--no-log")
+    wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
+    wait_until(lambda: arm.desk.commander)
+    locks = lab.folder / "elsewhere"
+    locks.mkdir()
+    for how in (("--serve",), NEAR):
+        second = lab.reachd(
+            *how, "--no-log", "--name", "other",
+            listen="tcp/127.0.0.1:0", TACTILE_RUNTIME_DIR=str(locks),
+        )  # fmt: skip
+        assert second.wait() == 3, second.said
+        assert "commanded by another reachd (reach 'reach')" in second.said
+    assert arm.desk.commander.startswith("reach-")
+    lab.ask("arm")
+    assert lab.ask("status")["armed"] is True
+
+
+def test_the_arm_is_ours_again_after_its_driver_started_anew(lab: Any, wait_until: Until) -> None:
+    """Row 45: latched meanwhile; whoever stopped commanding for long has to ask anew, too."""
+    arm, _ = lab.arm, lab.board()
+    program = lab.reachd("--serve", "--strategy", "straight", "--no-log")
+    wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
+    wait_until(lambda: _arms(lab))
+    lab.ask("goal", {"x": 0.36, "y": 0.0})
+    wait_until(lambda: arm.moving)
+    first = arm.desk.commander
+    arm.desk.forget()
+    wait_until(lambda: lab.ask("status")["held"] == "commander")
+    assert "obeys nobody's commands" in lab.ask("status")["outcome"]["text"]
+    wait_until(lambda: arm.desk.commander not in ("", first))
+    wait_until(lambda: _arms(lab))
+    program.signal(signal.SIGTERM)
+    assert program.wait() == 0
+    assert arm.desk.commander == "", "given back"
+
+
+def _arms(lab: Any) -> bool:
+    try:
+        return bool(lab.ask("arm")["armed"])
+    except ServiceError:
+        return False
+
+
+@pytest.mark.parametrize("delay", [0.25, 0.07])
+def test_commands_that_are_delayed_on_the_way_latch(
+    delay: float, lab: Any, wait_until: Until
+) -> None:
+    """Row 37: states come undelayed; the arm drops what is too old, and reachd sees it."""
+    arm, _ = lab.arm, lab.board()
+    wire = lab.wire(lab.arm_at)
+    program = lab.reachd(*FAR, "--no-log", via=wire.endpoint)
+    lab.reaching(program)
+    wait_until(lambda: arm.travelled > 0.005)
+    wire.delay = delay
+    assert program.wait() == 1, program.said
+    assert "NOT REACHED (held)" in program.said
+    assert "come into force" in program.said
+    wait_until(lambda: not arm.moving)
+    assert arm.travelled < 0.06
+
+
+@pytest.mark.parametrize("how", ["backwards", "sideways", "fast"])
+def test_an_arm_that_moves_otherwise_than_it_is_told_latches(how: str, lab: Any) -> None:
+    """Row 38."""
+    arm, _ = lab.arm, lab.board()
+    arm.does = {
+        "backwards": lambda v: (-v[0], -v[1], -v[2]),
+        "sideways": lambda v: (-v[1], v[0], v[2]),
+        "fast": lambda v: (5 * v[0], 5 * v[1], 5 * v[2]),
+    }[how]
+    program = lab.reachd(*FAR, "--no-log")
+    assert program.wait() == 1, program.said
+    held = set(lab.codes("intervention"))
+    assert held & {"arm_tracking", "arm_speed"}
+    assert not math.isclose(arm.travelled, 0.0)
+    assert arm.travelled < 0.03, "what it goes in 150 ms, and what a busy machine adds"
+
+
+def test_what_an_operator_must_know_is_said(lab: Any, wait_until: Until) -> None:
+    """Checks that are off and limits beyond the caps: at the start, in the status, in the log."""
+    _, _ = lab.arm, lab.board()
+    config = lab.folder / "reach.toml"
+    config.write_text('[parameters.safety]\ndisabled = ["skin_overload"]\nforce = 45.0\n')
+    program = lab.reachd("--serve", "--log", "trial.mcap", "--config", str(config))
+    wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
+    cautions = lab.ask("status")["cautions"]
+    assert cautions == ["the check skin_overload is off", "force is 45, beyond the cap of 30"]
+    program.signal(signal.SIGTERM)
+    assert program.wait() == 0
+    for caution in cautions:
+        assert f"WARNING safety: {caution}" in program.said
+    with (lab.folder / "trial.mcap").open("rb") as file:
+        said = [
+            codec().decode(REACH_EVENT, m.data).text
+            for _, c, m in make_reader(file).iter_messages(topics=["/reach/reach/event"])
+        ]
+    assert set(cautions) <= set(said)

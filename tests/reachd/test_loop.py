@@ -41,11 +41,12 @@ class Rig:
         self.failures: list[BaseException] = []
         self.loop = ControlLoop(
             controller(), 0.01, 0.06, sense or (lambda _: Inputs(None, None)), self._act,
-            self.cycles.append, self.failures.append,
+            lambda cycle, _: self.cycles.append(cycle), self.failures.append,
         )  # fmt: skip
 
-    def _act(self, twist: Twist, expiry: float, now: Instant) -> None:
+    def _act(self, twist: Twist, expiry: float, now: Instant) -> bytes:
         self.sent.append(twist)
+        return b""
 
 
 def until(done: Callable[[], object]) -> None:

@@ -264,7 +264,7 @@ def test_an_arm_that_is_not_fit_is_not_armed(lab: Any, trouble: str) -> None:
     program = lab.reachd(*NEAR, *log)
     assert program.wait() == 3
     words = {
-        "limits": "f_max is 100 N, 15 asked",
+        "limits": "f_max is 100 N, 10.6066 asked",
         "bias": "3.00 N and 0.000 N·m in free air",
         "fault": "mode 'fault'",
         "broken log": "cannot write a log",

@@ -90,6 +90,22 @@ def test_a_forger_with_the_same_id_is_told_by_the_order() -> None:
     assert again.judge(sample(10, data=b"forged"), at(0.001)) is Verdict.DUPLICATE
 
 
+def test_a_number_forged_under_the_first_one_s_name_locks_nobody_out() -> None:
+    """It is told, and once what it set has grown old the first publisher is heard again."""
+    pin = SourcePin(TAKEOVER)
+    pin.judge(sample(10), at(0.0))
+    pin.judge(sample(2**60, data=b"forged"), at(0.001))
+    heard = [pin.judge(sample(11 + k), at(0.01 * (k + 1))) for k in range(40)]
+    assert heard[0] is Verdict.DUPLICATE
+    assert heard[-1] is Verdict.ACCEPTED
+    assert heard.index(Verdict.ACCEPTED) <= 20
+    assert set(heard[20:]) == {Verdict.ACCEPTED}
+    assert pin.duplicated(at(0.2))
+    last = sample(51)
+    assert pin.judge(last, at(0.9)) is Verdict.ACCEPTED
+    assert pin.judge(last, at(2.0)) is Verdict.REPEATED, "the very same, however late"
+
+
 def test_the_same_sample_over_two_links_is_used_once() -> None:
     pin = SourcePin(TAKEOVER)
     pin.judge(sample(10), at(0.0))

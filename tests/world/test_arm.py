@@ -23,7 +23,7 @@ from sim_device.world.arm import (
 )
 from sim_device.world.mujoco_world import MujocoWorld
 from sim_device.world.scenes import Pose, Scene
-from tactile_bus.arm_types import ARM_LIMITS, ZERO, ArmLimits, ArmState, Twist
+from tactile_bus.arm_types import ARM_LIMITS, ZERO, ArmLimits, ArmState, Echo, Twist
 from tactile_bus.geometry import FINGER_OUTLINE
 from tactile_bus.instant import Instant, after, seconds_between
 
@@ -214,6 +214,37 @@ def test_a_stale_state_has_old_stamps_too(arm: SimulatedArm) -> None:
     states = drive(arm, 0.2, FORWARD)
     assert {s.captured for s in states} == {last.captured}
     assert states[-1].received == arm.now
+
+
+@pytest.mark.parametrize(
+    ("fault", "went"),
+    [
+        (ArmFault.BACKWARDS, (-0.01, 0.005, -0.1)),
+        (ArmFault.SIDEWAYS, (0.005, 0.01, 0.1)),
+        (ArmFault.FAST, (0.05, -0.025, 0.5)),
+    ],
+)
+def test_an_arm_that_is_mounted_wrongly_moves_otherwise(
+    fault: ArmFault, went: tuple[float, float, float], arm: SimulatedArm
+) -> None:
+    """And says so: its state is true, its limits do not help."""
+    arm.inject(fault)
+    state = drive(arm, 0.3, Twist(0.01, -0.005, 0.1))[-1]
+    twist = state.twist
+    assert (twist.vx, twist.vy, twist.omega) == pytest.approx(went, abs=1e-3)
+    arm.clear(fault)
+    right = drive(arm, 0.3, Twist(0.01, -0.005, 0.1))[-1].twist
+    assert right.vx == pytest.approx(0.01, abs=1e-3)
+
+
+def test_states_echo_the_command_in_force(arm: SimulatedArm) -> None:
+    assert arm.advance(after(arm.now, 0.01))[-1].echo is None
+    first, second = (Echo("reach-1", k, Instant(100 + k)) for k in (1, 2))
+    arm.command(Twist(0.01, 0.0, 0.0), arm.now, echo=first)
+    assert arm.advance(after(arm.now, 0.01))[-1].echo == first
+    arm.command(Twist(0.01, 0.0, 0.0), after(arm.now, 0.02), echo=second)
+    assert wait(arm, 0.01)[-1].echo == first, "not yet in force"
+    assert wait(arm, 0.3)[-1].echo == second, "the last that was, although it is over"
 
 
 def test_a_biased_force_sensor_is_biased_in_its_own_frame(build: Any) -> None:

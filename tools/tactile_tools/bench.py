@@ -123,6 +123,14 @@ GROUPS = (
         ("stop_ms_max_features", "stop_ms_max_arm_state", "stop_ms_max_commands"),
     ),
     Group("cpu", "cpu", "bench_cpu", "processor time of tactiled with one and four fingers"),
+    Group(
+        "contact_force",
+        "contact",
+        "bench_contact_force",
+        "force of a hundred reaches in lockstep, only when named",
+        ("contact_peak_n_max", "contact_above_limit_ms_max"),
+        asked=True,
+    ),
     Group("soak", "soak", "bench_soak", "memory over an hour of simulated frames"),
     Group(
         "stress",
@@ -174,6 +182,8 @@ AIMS: Mapping[str, Aim] = {
     "stop_ms_max_features": Aim("≤", 200.0),
     "stop_ms_max_arm_state": Aim("≤", 50.0),
     "stop_ms_max_commands": Aim("≤", 100.0),
+    "contact_peak_n_max": Aim("≤", 18.0),
+    "contact_above_limit_ms_max": Aim("≤", 20.0),
     "stress_late_ms_p99.9": Aim("≤", 5.0),
     "stress_late_moving": Aim("≤", 0.0),
 }

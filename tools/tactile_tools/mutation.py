@@ -27,7 +27,7 @@ from rich.progress import Progress
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "host" / "reachd"
-FILES = ("safety.py", "limits.py", "stillness.py")
+FILES = ("safety.py", "limits.py", "motion.py")
 TESTS = (
     "test_gate_limits.py",
     "test_gate_workspace.py",
@@ -37,6 +37,9 @@ TESTS = (
     "test_gate_inputs.py",
     "test_gate_ages.py",
     "test_gate_arming.py",
+    "test_gate_motion.py",
+    "test_gate_loads.py",
+    "test_gate_echo.py",
     "test_gate_random.py",
 )
 RANDOM_INPUTS = "2000"

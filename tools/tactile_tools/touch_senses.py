@@ -73,8 +73,9 @@ class ContactSense:
             if force > greatest:
                 peak, greatest, peak_side = contact, force, side
         if peak is None:
-            return Touch(now, now, True, 0.0, Side.NONE, 0.0, 0.0, 0.0, 0.0)
-        return Touch(now, now, True, greatest, peak_side, peak.x, peak.y, total, tip)
+            return Touch(now, now, True, 0.0, Side.NONE, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        # The engine's own contacts are exact.
+        return Touch(now, now, True, greatest, peak_side, peak.x, peak.y, total, tip, 0.0, 0.0)
 
 
 def side_of(x: float, y: float) -> Side:
@@ -162,4 +163,6 @@ def touch_of(cycle: Cycle) -> Touch:
         peak_y=y,
         total_force=features.normal_force,
         tip_force=features.tip_force,
+        peak_force_bound=features.peak_force_bound,
+        normal_force_bound=features.normal_force_bound,
     )

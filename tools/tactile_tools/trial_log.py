@@ -16,6 +16,7 @@ from sim_device.catalogue import factory_calibration
 from sim_device.world.base import FingerContact
 from sim_device.world.scene_markers import scene_markers
 from sim_device.world.scenes import Scene
+from tactile_bus.commanding import command_message
 from tactile_bus.geometry import Side
 from tactile_bus.instant import Instant, WallClock
 from tactile_bus.markers import frame_transform, wipe
@@ -96,7 +97,7 @@ class TrialLog:
         state = MSG.ArmState(
             stamp, arm.captured, self._sequence, arm.x, arm.y, arm.heading, _twist(arm.twist),
             MSG.Wrench(MSG.Vector3(arm.fx, arm.fy, 0.0), moment), arm.mode,
-            arm.v_max, arm.omega_max, arm.f_max, arm.m_max,
+            arm.v_max, arm.omega_max, arm.f_max, arm.m_max, "", 0, 0,
         )  # fmt: skip
         self._write(ARM_STATE, ARM, state, now)
         if now >= self._next_frame:
@@ -111,8 +112,10 @@ class TrialLog:
             else:
                 self._contacts(touch, step.world.contacts())
         stamp = header(self._wall.wall_ns(now), "cupboard")
-        sent = _twist(step.decision.twist)
-        self._write(COMMAND, ARM, MSG.TwistStamped(stamp, sent), now)
+        sent, expiry = step.decision.twist, step.decision.expiry
+        wall_ns = self._wall.wall_ns(now)
+        command = command_message(sent, now, expiry, wall_ns, sequence=self._sequence + 1)
+        self._write(COMMAND, ARM, command, now)
         self._write(REACH_STATE, REACH, self._reach_state(step, stamp), now)
         for event in step.command.events:
             self._event(now, "excavation", event.kind, f"{event.direction} {event.trigger}")

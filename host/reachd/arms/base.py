@@ -15,8 +15,8 @@ class ArmError(Exception):
 class Arm(Protocol):
     """A planar velocity-controlled arm.
 
-    `state`, `command` and `duplicated` are called by the control loop and never block; `open`,
-    `request_limits` and `close` by other threads, and may. Every driver must see to it that the
+    `state`, `command`, `duplicated` and `rivalled` are called by the control loop and never
+    block; the others by other threads, and may. Every driver must see to it that the
     arm rests within 0.1 s after commands have ceased (each carries its expiry), even when this
     process is killed.
     """
@@ -32,19 +32,39 @@ class Arm(Protocol):
         """Newest state, None before the first."""
         ...
 
-    def command(self, twist: Twist, expiry: float, now: Instant) -> None:
-        """Move the pivot at ``twist`` for at most ``expiry`` s, decided at ``now``.
+    def command(self, twist: Twist, expiry: float, now: Instant) -> bytes:
+        """Move the pivot at ``twist`` for at most ``expiry`` s from ``now``, when it was decided.
 
-        `ArmError` when it can no longer be commanded at all.
+        Returns the ``ArmCommand`` that was sent, for the log, empty when none was because the arm
+        has not granted its command. `ArmError` when it can no longer be commanded at all.
+        """
+        ...
+
+    @property
+    def denied(self) -> str | None:
+        """Why the arm does not grant its command; None once it did, or before it answered.
+
+        It is asked for again and again, by a thread of the driver.
         """
         ...
 
     def duplicated(self, now: Instant) -> bool:
-        """Whether somebody else was seen to speak for the arm, or to command it."""
+        """Whether somebody else was seen to speak for the arm."""
+        ...
+
+    def rivalled(self, now: Instant) -> bool:
+        """Whether somebody else was seen to send it commands, which it does not obey."""
         ...
 
     def request_limits(self, limits: ArmLimits) -> ArmLimits:
         """Ask for limits; returns those that the arm confirms; `ArmError` when it does not say."""
+        ...
+
+    def request_clear(self) -> str:
+        """Have a fault or stop cleared, at an operator's wish; returns the arm's mode.
+
+        `ArmError` when it is not.
+        """
         ...
 
     def counters(self) -> dict[str, int]:

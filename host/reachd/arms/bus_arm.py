@@ -1,11 +1,16 @@
 """An arm behind the topics ``arm/<name>/...``: the simulated one, or any driver that speaks them.
 
-Commands are ``TwistStamped`` at ``cmd_vel``. They carry no expiry: the arm's side ends each by
-itself within 0.1 s of its receipt.
+Commands are ``ArmCommand`` at ``cmd_vel``, each with its instant, number, expiry and the proof that
+it comes from the one to whom the arm granted its command (`tactile_bus.commanding`).
 """
 
 from __future__ import annotations
 
+import logging
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from types import MappingProxyType
 from typing import Any
 
 import msgspec
@@ -14,9 +19,9 @@ import zenoh
 from reachd.arms.base import ArmError
 from reachd.snapshot import Input, SourcePin, make_arm_state
 from tactile_bus.arm_types import ArmLimits, ArmState, Twist
+from tactile_bus.commanding import ClaimRequest, Grant, Signer, clock_domain, limits_fields
 from tactile_bus.instant import Instant, WallClock, monotonic_now, seconds_between
-from tactile_bus.messages import MSG, codec, header
-from tactile_bus.services import ServiceError, call
+from tactile_bus.services import NoAnswerError, ServiceError, call
 from tactile_bus.streams import (
     BusSample,
     Latest,
@@ -27,25 +32,32 @@ from tactile_bus.streams import (
 )
 from tactile_bus.topics import ARM_STATE, COMMAND, service_key
 
-FRAME = "cupboard"
+log = logging.getLogger(__name__)
 
-LIMITS_TIMEOUT = 1.0
+ANSWER_TIMEOUT = 1.0
 """s for the arm's answer. It is asked while an operator waits, whose request dies in 2 s."""
 
-COMMANDER_GONE = 1.0
+CLAIM_AGAIN = 0.1
+"""s between two requests for the arm's command."""
+
+GRANT_SHOWN = 0.5
+"""s after a grant by which the arm's state must show it; else it is asked for anew."""
+
+DENIED_FOR = 1.0
+"""s of refusals after which the arm is taken to be another's: a commander that was killed is
+forgotten sooner."""
+
+RELEASE_TIMEOUT = 0.2
+"""s for the arm to take its command back; if it does not, silence ends it."""
+
+RIVAL_GONE = 1.0
 """s after the last command of somebody else until they are taken to be gone."""
-
-
-def command_message(twist: Twist, wall_ns: int) -> Any:
-    """``TwistStamped`` in ``cupboard``, stamped in wall-clock ns."""
-    linear, angular = MSG.Vector3(twist.vx, twist.vy, 0.0), MSG.Vector3(0.0, 0.0, twist.omega)
-    return MSG.TwistStamped(header(wall_ns, FRAME), MSG.Twist(linear, angular))
 
 
 class BusArm:
     """See `reachd.arms.base.Arm`. ``takeover``: s of silence after which another sender is heeded.
 
-    ``remote``: the arm's driver runs on another machine.
+    ``reach``: as whom the arm is commanded. ``remote``: the arm's driver runs on another machine.
     """
 
     def __init__(
@@ -55,21 +67,30 @@ class BusArm:
         wall: WallClock,
         takeover: float,
         *,
+        reach: str = "reach",
         remote: bool = False,
     ) -> None:
         self.name = name
         self._session = session
         self._wall = wall
-        self._codec = codec()
-        self._input: Input[ArmState] = Input(ARM_STATE, make_arm_state, takeover, remote=remote)
+        self._reach = reach
+        self._input: Input[ArmState] = Input(ARM_STATE, self._make_state, takeover, remote=remote)
         self._watch = SourcePin(takeover)
         self._rival: Instant | None = None
+        self._rivals = 0
         self._latest: Latest | None = None
         self._publisher: Publisher | None = None
         self._taps: list[Tap] = []
+        self._signer: Signer | None = None
+        self._granted_at = Instant(0)
+        self._signing = threading.Lock()  # requests come from several threads
+        self._denied: str | None = None
+        self._denied_since: Instant | None = None
+        self._closing = threading.Event()
+        self._claimer = threading.Thread(target=self._claim, name="claim", daemon=True)
 
     def open(self) -> None:
-        """Subscribe and publish; whether an arm is there shows in its state."""
+        """Subscribe, publish, and begin to ask for the arm; whether it is there shows later."""
         state_key, command_key = ARM_STATE.key(self.name), COMMAND.key(self.name)
         self._latest = latest(self._session, state_key)
         # The newest sample may hide another publisher's, so all of them are watched beside it.
@@ -78,6 +99,7 @@ class BusArm:
             Tap(self._session, command_key, self._watch_commands, remote_only=True),
         ]
         self._publisher = declare_publisher(self._session, COMMAND, self.name)
+        self._claimer.start()
 
     def state(self, now: Instant) -> ArmState | None:
         """Newest state, None before the first."""
@@ -86,43 +108,61 @@ class BusArm:
             self._input.take(sample, now)
         return self._input.value
 
-    def command(self, twist: Twist, expiry: float, now: Instant) -> None:  # noqa: ARG002 - `Arm` gives it
-        """Publish ``twist``; its expiry is the arm's own. `ArmError` when the bus is closed."""
-        if self._publisher is not None:
-            wall_ns = self._wall.wall_ns(now)
-            message = command_message(twist, wall_ns)
-            try:
-                self._publisher.put(self._codec.encode(COMMAND, message), wall_ns)
-            except zenoh.ZError as error:
-                raise ArmError(f"arm {self.name!r} cannot be commanded: {error}") from error
+    def command(self, twist: Twist, expiry: float, now: Instant) -> bytes:
+        """Publish ``twist``; nothing without a grant. `ArmError` when the bus is closed."""
+        signer, publisher = self._signer, self._publisher
+        if signer is None or publisher is None:
+            return b""
+        wall_ns = self._wall.wall_ns(now)
+        data = signer.command(twist, now, expiry, wall_ns)
+        try:
+            publisher.put(data, wall_ns)
+        except zenoh.ZError as error:
+            raise ArmError(f"arm {self.name!r} cannot be commanded: {error}") from error
+        return data
+
+    @property
+    def denied(self) -> str | None:
+        """Why the arm does not grant its command, once it has refused for `DENIED_FOR`."""
+        since = self._denied_since
+        if since is None or seconds_between(since, monotonic_now()) < DENIED_FOR:
+            return None
+        return self._denied
 
     def duplicated(self, now: Instant) -> bool:
-        """Whether a second sender of states, or of commands, was heard of late."""
+        """Whether a second sender of states was heard of late."""
+        return self._input.pin.duplicated(now) or self._watch.duplicated(now)
+
+    def rivalled(self, now: Instant) -> bool:
+        """Whether commands of somebody else were heard of late."""
         rival = self._rival
-        return (
-            self._input.pin.duplicated(now)
-            or self._watch.duplicated(now)
-            or (rival is not None and seconds_between(rival, now) < COMMANDER_GONE)
-        )
+        return rival is not None and seconds_between(rival, now) < RIVAL_GONE
 
     def request_limits(self, limits: ArmLimits) -> ArmLimits:
         """Ask the arm's ``limits`` service."""
-        key = service_key(self.name, "limits", "arm")
+        reply = self._ask("limits", limits_fields(limits))
         try:
-            reply = call(self._session, key, limits, LIMITS_TIMEOUT)
             return msgspec.convert(reply, ArmLimits)
-        except ServiceError as error:
-            raise ArmError(f"arm {self.name!r} does not take limits: {error}") from error
         except msgspec.ValidationError as error:
             raise ArmError(f"arm {self.name!r} confirms no limits: {error}") from error
 
+    def request_clear(self) -> str:
+        """Ask the arm's ``clear`` service; returns its mode."""
+        reply = self._ask("clear")
+        return str(reply.get("mode", "")) if isinstance(reply, dict) else ""
+
     def counters(self) -> dict[str, int]:
-        """States received, and what was not used, by reason."""
+        """States received, what was not used, by reason, and others' commands."""
         refused = 0 if self._latest is None else self._latest.refused
-        return self._input.counters | {"oversized": refused}
+        return self._input.counters | {"oversized": refused, "rival_commands": self._rivals}
 
     def close(self) -> None:
-        """Take subscriptions and publisher back."""
+        """Give the arm's command back, and take subscriptions and publisher back."""
+        self._closing.set()
+        if self._signer is not None:
+            with suppress(ArmError):
+                self._ask("release", timeout=RELEASE_TIMEOUT)
+            self._signer = None
         for tap in self._taps:
             tap.close()
         self._taps.clear()
@@ -133,8 +173,70 @@ class BusArm:
             self._publisher.close()
             self._publisher = None
 
+    def _ask(
+        self,
+        service: str,
+        fields: Mapping[str, object] = MappingProxyType({}),
+        timeout: float = ANSWER_TIMEOUT,
+    ) -> Any:
+        """Have the arm do what its commander may ask for; `ArmError` when it does not."""
+        signer = self._signer
+        if signer is None:
+            raise ArmError(f"arm {self.name!r} has not granted its command: {self._why()}")
+        with self._signing:
+            request = signer.sign(service, **fields)
+        try:
+            return call(self._session, service_key(self.name, service, "arm"), request, timeout)
+        except ServiceError as error:
+            raise ArmError(f"arm {self.name!r} does not take {service}: {error}") from error
+
+    def _why(self) -> str:
+        return self._denied or "is its driver running, and is it of this version?"
+
+    def _make_state(self, message: Any, captured: Instant, received: Instant) -> ArmState:
+        signer = self._signer
+        own = "" if signer is None else signer.commander
+        return make_arm_state(message, captured, received, own)
+
     def _watch_state(self, sample: BusSample) -> None:
         self._watch.judge(sample, monotonic_now())
 
     def _watch_commands(self, _: BusSample) -> None:
         self._rival = monotonic_now()
+        self._rivals += 1
+
+    # What follows runs in the claimer's thread.
+
+    def _claim(self) -> None:
+        """Ask for the arm's command whenever it is not ours."""
+        while not self._closing.wait(CLAIM_AGAIN):
+            if self._signer is not None and self._ours():
+                continue
+            try:
+                self._ask_for_it()
+            except (ServiceError, zenoh.ZError) as error:
+                if isinstance(error, ServiceError) and not isinstance(error, NoAnswerError):
+                    self._denied = str(error)
+                    self._denied_since = self._denied_since or monotonic_now()
+                log.debug("arm %s: %s", self.name, error)
+
+    def _ours(self) -> bool:
+        """Whether the arm says so; it is given time to, after a grant."""
+        state, now = self._input.value, monotonic_now()
+        if seconds_between(self._granted_at, now) < GRANT_SHOWN or state is None:
+            return True
+        return state.echo is not None and state.echo.own
+
+    def _ask_for_it(self) -> None:
+        request = ClaimRequest(self._reach, clock_domain())
+        key = service_key(self.name, "claim", "arm")
+        try:
+            grant = msgspec.convert(call(self._session, key, request, ANSWER_TIMEOUT), Grant)
+            signer = Signer(grant)
+        except (msgspec.ValidationError, ValueError) as error:
+            text = f"arm {self.name!r} grants its command in other words: {error}"
+            raise ServiceError(text) from error
+        self._granted_at = monotonic_now()
+        self._signer = signer
+        self._denied = self._denied_since = None
+        log.info("arm %s granted its command to %s", self.name, grant.commander)

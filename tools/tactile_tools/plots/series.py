@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactile_bus.log_bytes import Progress
 from tactile_bus.log_records import LogError
-from tactile_bus.messages import DROPS_PREFIX, DecodeError, codec, stamp_ns
+from tactile_bus.messages import DROPS_PREFIX, LATER_FIELDS, DecodeError, codec, stamp_ns
 from tactile_bus.topics import (
     AMBIENT,
     DIAGNOSTICS,
@@ -302,7 +302,7 @@ def _require_fields(decoder: Decoder, stream: Stream) -> None:
     """DecodeError where another version's definition lacks a field that this one goes by."""
     ours = {name for name, _ in codec().fields(stream.msgtype)}
     theirs = {name for name, _ in decoder.reader(stream).fields[stream.msgtype][1]}
-    if lacking := ours - theirs:
+    if lacking := ours - theirs - LATER_FIELDS.get(stream.msgtype, frozenset()):
         raise DecodeError(
             f"{stream.topic} is of another version: its {stream.msgtype} has no "
             f"{', '.join(sorted(lacking))}; use the tools of the version that wrote it"

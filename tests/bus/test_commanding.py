@@ -1,0 +1,303 @@
+"""Who commands an arm: grants, proofs, numbers and expiry, whatever strangers send."""
+
+from __future__ import annotations
+
+import hmac
+import math
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tactile_bus.arm_types import ArmLimits, Twist
+from tactile_bus.commanding import (
+    FIRST_COMMAND,
+    LONGEST_EXPIRY,
+    PROOF_BYTES,
+    REFUSALS,
+    TAKEOVER,
+    ClaimRequest,
+    CommandDesk,
+    LimitsRequest,
+    NotGrantedError,
+    Order,
+    Signed,
+    Signer,
+    clock_domain,
+    command_message,
+    limits_fields,
+)
+from tactile_bus.instant import Instant, after
+from tactile_bus.messages import MSG, codec
+from tactile_bus.topics import COMMAND
+
+T0 = Instant(5_000_000_000)
+AHEAD = Twist(0.02, 0.0, 0.1)
+LIMITS = ArmLimits(0.05, 0.3, 10.0, 1.5)
+
+
+class Owner:
+    """A commander whose commands take ``way`` s."""
+
+    def __init__(self, desk: CommandDesk, now: Instant = T0, clock: str | None = None) -> None:
+        self.desk = desk
+        request = ClaimRequest("reach", clock_domain() if clock is None else clock)
+        self.grant = desk.claim(request, now)
+        self.signer = Signer(self.grant)
+
+    def data(self, now: Instant, twist: Twist = AHEAD, expiry: float = 0.06) -> bytes:
+        return self.signer.command(twist, now, expiry, 1)
+
+    def send(self, now: Instant, way: float = 0.001, **how: Any) -> Order | None:
+        came = after(now, way)
+        self.desk.hear(self.data(now, **how), came)
+        return self.desk.newest(came)
+
+
+def changed(data: bytes, **values: Any) -> bytes:
+    """The same command with other values, and the old proof."""
+    message = replace(codec().decode(COMMAND, data), **values)
+    return codec().encode(COMMAND, message)
+
+
+def test_the_owner_is_obeyed_and_echoed() -> None:
+    owner = Owner(CommandDesk())
+    for k in range(1, 100):
+        now = after(T0, 0.01 * k)
+        order = owner.send(now)
+        assert order is not None
+        assert (order.twist, order.sequence, order.decided) == (AHEAD, k, now)
+        assert order.expires == after(now, 0.06), "counted from the decision"
+        assert order.commander == owner.desk.commander == owner.grant.commander
+    assert not any(owner.desk.refused.values())
+
+
+@pytest.mark.parametrize(("way", "obeyed"), [(0.0, True), (0.059, True), (0.06, False), (2, False)])
+def test_a_command_that_comes_after_its_expiry_is_dropped(way: float, obeyed: bool) -> None:
+    owner = Owner(CommandDesk())
+    assert (owner.send(T0, way) is not None) == obeyed
+    assert owner.desk.refused["late"] == (0 if obeyed else 1)
+
+
+def test_one_that_waits_for_the_arm_too_long_is_dropped() -> None:
+    owner = Owner(CommandDesk())
+    owner.desk.hear(owner.data(T0), T0)
+    assert owner.desk.newest(after(T0, 0.061)) is None
+    assert owner.desk.refused["late"] == 1
+    assert owner.desk.newest(T0) is None, "handed out once"
+
+
+def test_of_several_the_newest_is_handed_out() -> None:
+    owner = Owner(CommandDesk())
+    for k in range(3):
+        owner.desk.hear(owner.data(after(T0, 0.01 * k), Twist(k, 0.0, 0.0)), after(T0, 0.03))
+    order = owner.desk.newest(after(T0, 0.03))
+    assert order is not None
+    assert order.twist.vx == 2.0
+
+
+def forgeries(owner: Owner, now: Instant) -> list[tuple[str, bytes]]:
+    """What somebody who reads every command can make of it."""
+    own = owner.data(now)
+    other = Signer(CommandDesk().claim(ClaimRequest("evil", clock_domain()), T0))
+    back = MSG.Twist(MSG.Vector3(-0.3, 0.0, 0.0), MSG.Vector3(0.0, 0.0, 0.0))
+    message = codec().decode(COMMAND, own)
+    return [
+        ("forged", changed(own, sequence=2**60)),
+        ("forged", changed(own, twist=back)),
+        ("forged", changed(own, decided_ns=now + 10**9, sequence=message.sequence + 1)),
+        ("forged", own[:-PROOF_BYTES] + bytes(PROOF_BYTES)),
+        ("foreign", changed(own, commander="reach-00000000")),
+        ("foreign", changed(own, commander="")),
+        ("foreign", other.command(AHEAD, now, 0.06, 1)),
+        ("malformed", own[:-1]),
+        ("malformed", b""),
+        ("malformed", own + b"\x00" * 4),
+    ]
+
+
+def test_no_forgery_is_obeyed_or_takes_anything_from_the_owner() -> None:
+    """Row 45: names, numbers and stamps can be read on the bus; the secret cannot."""
+    owner = Owner(CommandDesk())
+    desk, now = owner.desk, T0
+    for kind, data in forgeries(owner, now):
+        before = desk.refused[kind]
+        assert desk.hear(data, now) == kind
+        assert desk.refused[kind] == before + 1
+        assert desk.newest(now) is None
+    for k in range(1000):  # a flood between every two of the owner's
+        now = after(T0, 0.01 * k)
+        for _, data in forgeries(owner, now)[:3]:
+            desk.hear(data, now)
+        assert owner.send(now) is not None
+        for _, data in forgeries(owner, now)[3:5]:
+            desk.hear(data, after(now, 0.002))
+
+
+def test_what_was_sent_once_is_obeyed_once() -> None:
+    owner = Owner(CommandDesk())
+    first = owner.data(T0)
+    second = owner.data(after(T0, 0.01))
+    assert owner.desk.hear(second, after(T0, 0.011)) is None
+    assert owner.desk.hear(second, after(T0, 0.011)) == "repeated"
+    assert owner.desk.hear(first, after(T0, 0.012)) == "repeated", "overtaken"
+
+
+@pytest.mark.parametrize(
+    ("reason", "made"),
+    [
+        ("bad_expiry", {"expiry": 0.0}),
+        ("bad_expiry", {"expiry": math.nan}),
+        ("bad_expiry", {"expiry": LONGEST_EXPIRY * 1.01}),
+    ],
+)
+def test_an_owner_out_of_order_is_not_obeyed(reason: str, made: dict) -> None:
+    owner = Owner(CommandDesk())
+    assert owner.desk.hear(owner.data(T0, **made), T0) == reason
+    assert owner.send(after(T0, 0.01)) is not None
+
+
+def test_decisions_of_tomorrow_are_not_obeyed() -> None:
+    owner = Owner(CommandDesk())
+    assert owner.desk.hear(owner.data(after(T0, 0.02)), T0) == "future"
+    assert owner.desk.hear(owner.data(after(T0, 0.009)), T0) is None
+
+
+def test_numbers_that_are_not_finite_reach_the_arm_which_stops() -> None:
+    order = Owner(CommandDesk()).send(T0, twist=Twist(math.nan, 0.0, 0.0))
+    assert order is not None
+    assert math.isnan(order.twist.vx)
+
+
+def test_one_commander_at_a_time() -> None:
+    desk = CommandDesk()
+    owner = Owner(desk)
+    for seconds in (0.0, FIRST_COMMAND - 0.01):
+        with pytest.raises(NotGrantedError, match="another reachd \\(reach 'reach'\\)"):
+            desk.claim(ClaimRequest("other", ""), after(T0, seconds))
+    last = after(T0, 3.0)
+    assert owner.send(last) is not None, "its own, as long as nobody else asked"
+    with pytest.raises(NotGrantedError):
+        desk.claim(ClaimRequest("other", ""), after(last, TAKEOVER - 0.01))
+    assert desk.refused["not_granted"] == 3
+    second = Owner(desk, after(last, TAKEOVER + 0.01))
+    assert owner.send(after(last, 0.6)) is None
+    assert desk.refused["foreign"] == 1
+    assert second.send(after(last, 0.6)) is not None
+    for name in ("", "a/b", "x" * 65, "*"):
+        with pytest.raises(NotGrantedError, match="cannot be the name"):
+            CommandDesk().claim(ClaimRequest(name, ""), T0)
+
+
+def test_strangers_do_not_keep_the_lease_of_a_commander_that_is_gone() -> None:
+    desk = CommandDesk()
+    owner = Owner(desk)
+    owner.send(T0)
+    for k in range(200):
+        now = after(T0, 0.01 * k)
+        for _, data in forgeries(owner, now)[:3]:
+            desk.hear(data, now)
+    assert Owner(desk, after(T0, FIRST_COMMAND + 0.01)).grant.commander == desk.commander
+
+
+def asked(owner: Owner, service: str, kind: type[Signed] = Signed, **fields: object) -> Any:
+    return msgspec.convert(owner.signer.sign(service, **fields), kind)
+
+
+def test_what_only_the_commander_may_ask_for() -> None:
+    desk = CommandDesk()
+    owner = Owner(desk)
+    given = limits_fields(LIMITS)
+    request = asked(owner, "limits", LimitsRequest, **given)
+    desk.authorise("limits", request, T0, **given)
+    for service, one, fields in (
+        ("limits", request, given),  # the very same again
+        ("limits", asked(owner, "clear"), {}),
+        ("limits", asked(owner, "limits", LimitsRequest, **given), given | {"f_max": 99.0}),
+        ("clear", Signed(), {}),
+        ("clear", Signed(commander=desk.commander, number=99, proof="00" * 16), {}),
+        ("clear", Signed(commander=desk.commander, number=99, proof="é"), {}),
+        ("clear", asked(Owner(CommandDesk()), "clear"), {}),
+    ):
+        with pytest.raises(NotGrantedError, match="is for the arm's commander"):
+            desk.authorise(service, one, T0, **fields)
+    desk.authorise("clear", asked(owner, "clear"), T0)
+    with pytest.raises(NotGrantedError):
+        desk.release(Signed())
+    desk.release(asked(owner, "release"))
+    assert desk.commander == ""
+    desk.release(Signed())
+    desk.authorise("clear", Signed(), T0)  # nobody commands it
+    assert owner.send(after(T0, 0.01)) is None
+    assert Owner(desk).send(T0) is not None, "at once"
+
+
+def test_limits_of_a_silent_commander_may_be_set_by_whoever_is_there() -> None:
+    desk = CommandDesk()
+    Owner(desk)
+    desk.authorise("limits", Signed(), after(T0, FIRST_COMMAND + 0.01))
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.inf])
+def test_limits_that_would_not_limit_are_refused(bad: float) -> None:
+    with pytest.raises((ValueError, msgspec.ValidationError)):
+        LimitsRequest(v_max=bad, omega_max=1.0, f_max=1.0, m_max=1.0)
+
+
+def test_a_commander_on_another_machine_is_read_by_its_quickest_command() -> None:
+    """A constant way is not seen by the arm, and one that grows is."""
+    owner = Owner(CommandDesk(), clock="another machine")
+    assert owner.grant.clock == "remote"
+    shift = 3_600_000_000_000
+    for k in range(100):
+        sent = after(T0, 0.01 * k)
+        owner.desk.hear(owner.data(Instant(sent - shift)), after(sent, 0.02))
+        assert owner.desk.newest(after(sent, 0.02)) is not None
+    sent = after(T0, 1.1)
+    assert owner.desk.hear(owner.data(Instant(sent - shift)), after(sent, 0.079)) is None
+    sent = after(T0, 1.2)
+    assert owner.desk.hear(owner.data(Instant(sent - shift)), after(sent, 0.085)) == "late"
+    order = owner.send(Instant(after(T0, 1.3) - shift), way=3600.02)
+    assert order is not None
+    assert order.decided == after(T0, 1.3) - shift, "echoed as the commander stamped it"
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.binary(max_size=250))
+def test_any_bytes_are_refused_and_counted(data: bytes) -> None:
+    desk = Owner(CommandDesk()).desk
+    assert desk.hear(data, T0) in REFUSALS
+    assert sum(desk.refused.values()) == 1
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.integers(0, 134), st.integers(1, 255))
+def test_any_byte_changed_is_refused(index: int, flip: int) -> None:
+    owner = Owner(CommandDesk())
+    data = bytearray(owner.data(T0))
+    data[index % len(data)] ^= flip
+    # The encapsulation's options and padding are not read, but proved like the rest.
+    assert owner.desk.hear(bytes(data), T0) is not None
+
+
+def test_the_frame_and_plane_are_those_of_the_cupboard() -> None:
+    owner = Owner(CommandDesk())
+    key = bytes.fromhex(owner.grant.key)
+    for sequence, (reason, spoil) in enumerate(
+        (
+            ("wrong_frame", lambda m: setattr(m.header, "frame_id", "map")),
+            ("not_planar", lambda m: setattr(m.twist.linear, "z", 0.01)),
+            ("not_planar", lambda m: setattr(m.twist.angular, "x", 0.01)),
+        ),
+        1,
+    ):
+        message = command_message(
+            AHEAD, T0, 0.06, 1, commander=owner.desk.commander, sequence=sequence
+        )
+        spoil(message)
+        data = codec().encode(COMMAND, message)[:-PROOF_BYTES]
+        proof = hmac.digest(key, data, "sha256")[:PROOF_BYTES]
+        assert owner.desk.hear(data + proof, T0) == reason

@@ -1,0 +1,137 @@
+"""The gate judges whose commands the arm obeys, and how late they come into force."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from reachd.safety_settings import ALWAYS_ON, Check
+from reachd.seam import ZERO
+from tactile_bus.arm_types import Echo
+from tactile_bus.instant import Instant, after
+
+MS = 1_000_000
+
+
+class Way:
+    """Commands that take ``delay`` ms to the arm, whose states tell which is in force."""
+
+    def __init__(self, rig: Any) -> None:
+        self.rig = rig
+        self.sent: list[Instant] = []
+        self.delay = 0.0
+        self.slow = 0.0  # ms/s by which the delay grows
+
+    def step(self) -> Any:
+        now = Instant(self.rig.now + self.rig.period)
+        self.delay += self.slow * 0.01
+        arrived = [at for at in self.sent if at + round(self.delay * MS) <= now]
+        echo = Echo("r-1", len(arrived), arrived[-1] if arrived else Instant(0))
+        decision = self.rig.step(arm=self.rig.fresh_arm(-self.rig.period, echo=echo))
+        self.sent.append(now)
+        return decision
+
+    def run(self, cycles: int) -> tuple[int | None, Any]:
+        for k in range(cycles):
+            decision = self.step()
+            if decision.held is not None:
+                return k, decision
+        return None, decision
+
+
+@pytest.fixture
+def way(rig: Callable) -> Way:
+    made = Way(rig())
+    assert made.run(20)[0] is None
+    return made
+
+
+@pytest.mark.parametrize("delay", [0.0, 10.0, 30.0, 39.9])
+def test_a_short_way_is_nothing(delay: float, way: Way) -> None:
+    way.delay = delay
+    assert way.run(100)[0] is None
+
+
+@pytest.mark.parametrize("delay", [60.0, 100.0, 250.0])
+def test_a_long_way_stops_at_once_and_latches(delay: float, way: Way) -> None:
+    """Row 37: within 100 ms after the echo lags by 50."""
+    way.delay = delay
+    seen = [way.step() for _ in range(30)]
+    stopped = [k for k, d in enumerate(seen) if d.twist == ZERO]
+    latched = [k for k, d in enumerate(seen) if d.held is not None]
+    assert stopped[0] <= 5
+    assert latched[0] - stopped[0] <= 6
+    assert seen[latched[0]].held is Check.ECHO_LOST
+    assert "come into force" in seen[latched[0]].interventions[0].text
+
+
+def test_a_way_that_grows_slowly_is_seen_at_50_ms(way: Way) -> None:
+    way.slow = 10.0
+    when, decision = way.run(700)
+    assert when is not None
+    assert decision.held is Check.ECHO_LOST
+    assert 40.0 <= way.delay <= 52.0
+
+
+def test_one_hiccup_only_stops(way: Way) -> None:
+    way.delay = 80.0
+    stopped = sum(way.step().twist == ZERO for _ in range(4))
+    way.delay = 5.0
+    seen = [way.step() for _ in range(10)]
+    assert stopped
+    assert all(d.held is None for d in seen)
+    assert seen[-1].twist != ZERO
+
+
+def test_a_loop_that_stood_still_sent_nothing_to_be_late(way: Way) -> None:
+    way.rig.now = after(way.rig.now, 0.5)
+    decisions = [way.step() for _ in range(5)]
+    codes = {i.code for d in decisions for i in d.interventions}
+    assert not codes & {Check.ECHO_LATE, Check.ECHO_LOST}
+
+
+def test_the_checks_can_be_switched_off(rig: Callable) -> None:
+    way = Way(rig(Check.ECHO_LATE, Check.ECHO_LOST))
+    way.run(10)
+    way.delay = 300.0
+    assert way.run(60)[0] is None
+    assert way.step().twist != ZERO
+    only = Way(rig(Check.ECHO_LOST))
+    only.run(10)
+    only.delay = 300.0
+    assert only.run(60)[0] is None
+    assert only.step().twist == ZERO
+
+
+@pytest.mark.parametrize("who", ["", "other-2"])
+def test_an_arm_that_obeys_another_latches(who: str, way: Way) -> None:
+    r = way.rig
+    echo = Echo(who, 5, Instant(r.now), own=False)
+    decision = r.step(arm=r.fresh_arm(-r.period, echo=echo))
+    assert decision.held is Check.COMMANDER
+    assert (repr(who) if who else "nobody") in decision.interventions[0].text
+    assert "commander" in r.request(arm=r.fresh_arm(echo=echo))
+    assert Check.COMMANDER in ALWAYS_ON
+
+
+def test_after_a_new_grant_nothing_is_late_before_the_first_command(rig: Callable) -> None:
+    r = rig()
+    for _ in range(50):
+        r.step(ZERO)
+    other = Echo("", 0, Instant(0), own=False)
+    r.step(arm=r.fresh_arm(-r.period, echo=other))
+    for k in range(12):
+        decision = r.step(arm=r.fresh_arm(-r.period, echo=Echo("r-9", 0, Instant(0))))
+        codes = {i.code for i in decision.interventions}
+        assert (Check.ECHO_LATE in codes) == (k > 4)
+
+
+def test_commands_of_others_are_told_and_stop_nothing(rig: Callable, codes: Callable) -> None:
+    r = rig()
+    decision = r.step(rivalled=True)
+    assert codes(decision) == ["rival_commands"]
+    assert decision.interventions[0].effect == "ignored"
+    assert decision.twist != ZERO
+    assert codes(rig(Check.RIVAL_COMMANDS).step(rivalled=True)) == []

@@ -1,0 +1,261 @@
+"""The gate judges what the arm does: its speed, its way beside what it was told, dead poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reachd.motion import DEAD, OFF_THE_WAY, TOO_FAST, MotionWatch
+from reachd.parameters import SETS
+from reachd.safety_settings import Check
+from reachd.seam import ZERO, Twist
+from tactile_bus.instant import Instant, after
+
+AHEAD = Twist(0.04, 0.0, 0.0)
+L = 0.158
+MS = 1_000_000
+
+
+class Plant:
+    """An arm that makes of each command what ``does`` makes of it, seen by a gate at 100 Hz."""
+
+    def __init__(self, rig: Any, does: Callable[[Twist], Twist], **state: Any) -> None:
+        self.rig, self.does, self.state = rig, does, state
+        self.x, self.y, self.heading = -0.2, 0.0, 0.0
+        self.last = ZERO
+        self.travelled = 0.0
+        self.rng = np.random.default_rng(0)
+        self.noise = 0.0
+
+    def step(self, wanted: Twist = AHEAD, **how: Any) -> Any:
+        moves = self.does(self.last)
+        self.x += 0.01 * moves.vx
+        self.y += 0.01 * moves.vy
+        self.heading += 0.01 * moves.omega
+        self.travelled += 0.01 * math.hypot(moves.vx, moves.vy)
+        nx, ny, nh = self.rng.normal(0.0, self.noise, 3) if self.noise else (0.0, 0.0, 0.0)
+        values = {"x": self.x + nx, "y": self.y + ny, "heading": self.heading + nh / L}
+        told = {"twist": moves} | self.state
+        arm = self.rig.fresh_arm(-self.rig.period, **values, **told)
+        decision = self.rig.step(wanted, arm=arm, **how)
+        self.last = decision.twist
+        return decision
+
+    def run(self, cycles: int, wanted: Twist = AHEAD) -> tuple[int | None, Any]:
+        """Cycle in which the gate latched, None for never, and the last decision."""
+        for k in range(cycles):
+            decision = self.step(wanted)
+            if decision.held is not None:
+                return k, decision
+        return None, decision
+
+
+OFF = (Check.ACCELERATION, Check.WORKSPACE)
+
+
+@pytest.mark.parametrize(
+    ("does", "code"),
+    [
+        (lambda t: Twist(-t.vx, -t.vy, -t.omega), Check.ARM_TRACKING),
+        (lambda t: Twist(-t.vy, t.vx, t.omega), Check.ARM_TRACKING),
+        (lambda t: Twist(5 * t.vx, 5 * t.vy, 5 * t.omega), Check.ARM_SPEED),
+        (lambda t: Twist(2 * t.vx, 2 * t.vy, 2 * t.omega), Check.ARM_TRACKING),
+    ],
+)
+@pytest.mark.parametrize(
+    "wanted", [AHEAD, Twist(-0.03, 0.02, 0.0), Twist(0.0, -0.04, 0.1), Twist(0.02, 0.0, -0.1)]
+)
+def test_an_arm_that_moves_otherwise_latches_within_150_ms_and_10_mm(
+    does: Callable, code: Check, wanted: Twist, rig: Callable
+) -> None:
+    plant = Plant(rig(*OFF), does)
+    when, decision = plant.run(60, wanted)
+    assert when is not None
+    assert when <= 15
+    assert plant.travelled <= 0.010
+    assert decision.held in {Check.ARM_TRACKING, Check.ARM_SPEED}
+    assert decision.held is code or wanted.omega != 0.0 or code is Check.ARM_SPEED
+    assert Plant(rig(*OFF, *MOTION), does).run(60, wanted)[0] is None, "all of them are off"
+
+
+MOTION = (Check.ARM_SPEED, Check.ARM_TRACKING, Check.ARM_PATH, Check.ARM_FROZEN)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.2, 0.6, 1.0])
+def test_it_may_lag_behind_when_a_load_holds_it(part: float, rig: Callable) -> None:
+    def does(told: Twist) -> Twist:
+        return Twist(part * told.vx, part * told.vy, part * told.omega)
+
+    plant = Plant(rig(*OFF, Check.WRENCH), does, fx=-8.0)
+    assert plant.run(120)[0] is None
+    assert plant.run(40, Twist(0.0, 0.0, 0.1))[0] is None
+
+
+@pytest.mark.parametrize("late", [0.0, 0.01, 0.03, 0.05])
+def test_commands_may_act_as_late_as_they_hold(late: float, rig: Callable) -> None:
+    queue = [ZERO] * round(late / 0.01)
+
+    def does(told: Twist) -> Twist:
+        queue.append(told)
+        return queue.pop(0)
+
+    plant = Plant(rig(*OFF), does)
+    for k in range(300):
+        angle = k * 0.04
+        wanted = Twist(0.04 * math.cos(angle), 0.04 * math.sin(angle), 0.1 * math.sin(angle / 3))
+        assert plant.step(wanted).held is None
+
+
+@pytest.mark.parametrize("noise", [0.0, 2e-5])
+@pytest.mark.parametrize("wanted", [AHEAD, Twist(0.0, 0.004, 0.0), Twist(0.0, 0.0, -0.1)])
+def test_a_dead_pose_latches_within_half_a_second_even_if_it_is_noisy(
+    noise: float, wanted: Twist, rig: Callable
+) -> None:
+    plant = Plant(rig(*OFF), lambda _: ZERO)
+    plant.noise = noise
+    when, decision = plant.run(60, wanted)
+    assert when is not None
+    assert when <= 50
+    assert decision.held is Check.ARM_FROZEN
+
+
+def test_a_jammed_arm_may_tremble(rig: Callable) -> None:
+    """Its load explains that it stays; a twist far below what was told does not contradict it."""
+    for wanted, load, twist in (
+        (Twist(0.0, 0.0, 0.1), {"mz": -2.0}, Twist(0.0, 0.0, 0.004)),
+        (AHEAD, {"fx": -6.0}, Twist(0.002, 0.0, 0.0)),
+    ):
+        plant = Plant(rig(*OFF, Check.WRENCH), lambda _: ZERO, twist=twist, **load)
+        plant.noise = 3e-5
+        assert plant.run(100, wanted)[0] is None
+        lying = Plant(rig(*OFF, Check.WRENCH), lambda _: ZERO, twist=wanted, **load)
+        lying.noise = 3e-5
+        assert lying.run(100, wanted)[1].held is Check.ARM_FROZEN
+
+
+def test_half_the_way_that_nothing_holds_back_latches(rig: Callable) -> None:
+    plant = Plant(rig(*OFF), lambda t: Twist(0.4 * t.vx, 0.4 * t.vy, t.omega))
+    when, decision = plant.run(60)
+    assert when is not None
+    assert decision.held is Check.ARM_PATH
+    assert "was told to go" in decision.interventions[0].text
+    turning = Plant(rig(*OFF), lambda t: Twist(t.vx, t.vy, 0.4 * t.omega))
+    assert turning.run(60, Twist(0.0, 0.0, 0.1))[1].held is Check.ARM_PATH
+    slow = Plant(rig(*OFF), lambda t: Twist(t.vx, t.vx, t.omega))
+    assert slow.run(60, Twist(0.008, 0.0, 0.0))[1].held is Check.ARM_PATH
+
+
+def test_a_slow_command_says_little(rig: Callable) -> None:
+    assert Plant(rig(*OFF), lambda _: ZERO).run(100, Twist(0.0019, 0.0, 0.0))[0] is None
+
+
+def test_noise_in_free_motion_latches_nothing(rig: Callable) -> None:
+    plant = Plant(rig(*OFF), lambda t: t)
+    plant.noise = 2e-5
+    assert plant.run(300, Twist(0.03, 0.01, 0.05))[0] is None
+
+
+def test_an_arm_at_its_limit_of_force_may_be_pushed_off_its_way(rig: Callable) -> None:
+    def pushed(told: Twist) -> Twist:
+        return Twist(0.5 * told.vx, 0.03 if told.vx else 0.0, told.omega)
+
+    for load, held in (({"fx": -9.0, "fy": 1.5}, False), ({"mz": 3.7, "fy": 1.5}, False),
+                       ({"fy": 9.0}, False), ({"fx": -5.0}, True)):  # fmt: skip
+        plant = Plant(rig(*OFF, Check.WRENCH), pushed, **load)
+        assert (plant.run(40)[0] is not None) == held, load
+
+
+def test_speed_is_judged_by_the_twist_and_by_the_pose(rig: Callable) -> None:
+    for field in ("vx", "vy"):
+        twist = replace(ZERO, **{field: -0.0608 * TOO_FAST * 1.01})
+        r = rig(*OFF)
+        assert r.step(arm=r.fresh_arm(-r.period, twist=twist)).held is Check.ARM_SPEED
+    r = rig(*OFF)
+    twist = Twist(0.0, 0.0, 0.1 * TOO_FAST * 1.01)
+    decision = r.step(arm=r.fresh_arm(-r.period, twist=twist))
+    assert decision.held is Check.ARM_SPEED
+    assert "turns at" in decision.interventions[0].text
+    r = rig(*OFF)
+    assert r.step(arm=r.fresh_arm(-r.period, twist=Twist(0.09, 0.0, 0.149))).held is None
+    for does in (lambda _: Twist(0.0, 0.12, 0.0), lambda _: Twist(0.0, 0.0, -0.3)):
+        plant = Plant(rig(*OFF, Check.ARM_TRACKING), does, twist=ZERO)
+        when, decision = plant.run(20)
+        assert decision.held is Check.ARM_SPEED
+        assert when is not None
+        assert when <= 5
+
+
+def test_a_pose_that_is_taken_anew_is_not_motion(rig: Callable) -> None:
+    """As after a reset of a simulated world: nothing is said of the way before it."""
+    for jump in ({"x": 0.1}, {"heading": 0.5}):
+        r = rig(*OFF)
+        for _ in range(20):
+            r.step(ZERO)
+        assert r.step(ZERO, arm=r.fresh_arm(-r.period, **jump)).held is None
+    r = rig(*OFF)
+    for _ in range(20):
+        r.step(ZERO)
+    assert r.step(ZERO, arm=r.fresh_arm(-r.period, x=-0.16)).held is not None
+
+
+def test_states_with_gaps_or_from_before_begin_anew(settings: Any, make_arm: Callable) -> None:
+    watch = MotionWatch(settings)
+    t0 = Instant(5_000_000_000)
+    watch.told(AHEAD, t0)
+    assert watch.judge(make_arm(t0)) == ()
+    bad = make_arm(after(t0, 0.01), twist=Twist(1.0, 0.0, 0.0))
+    assert [c for c, _ in watch.judge(bad)] == [Check.ARM_SPEED]
+    assert watch.judge(bad) == watch.judge(bad), "the same state says the same"
+    assert watch.judge(make_arm(after(t0, 0.5), x=-0.18)) == ()
+    assert watch.judge(make_arm(after(t0, 0.2), x=-0.15)) == ()
+    watch.restart()
+    assert watch.judge(make_arm(after(t0, 0.21), x=-0.19)) == ()
+
+
+def test_what_was_told_is_known_for_long_and_forgotten_when_time_goes_back(
+    settings: Any, make_arm: Callable
+) -> None:
+    watch = MotionWatch(settings)
+    t0 = Instant(5_000_000_000)
+    assert watch.first_after(t0) is None
+    x = -0.2
+    for k in range(3000):
+        now = Instant(t0 + k * 10 * MS)
+        watch.told(AHEAD if k % 2000 < 1000 else Twist(-0.04, 0.0, 0.0), now)
+        x += 0.0004 if k % 2000 < 1000 else -0.0004
+        assert watch.judge(make_arm(Instant(now + 10 * MS), x=x)) == ()
+    assert watch.first_after(Instant(now - 15 * MS)) == now - 10 * MS
+    assert watch.first_after(now) is None
+    watch.told(AHEAD, t0)
+    assert watch.first_after(Instant(t0 - 1)) == t0
+    assert watch.first_after(t0) is None
+
+
+def test_a_command_that_nothing_followed_died(settings: Any, make_arm: Callable) -> None:
+    """The loop stood still: the arm went on for the command's life, and no further."""
+    for went, right in ((0.06, True), (0.17, False)):
+        watch = MotionWatch(settings)
+        t0 = Instant(5_000_000_000)
+        x = 0.0
+        for k in range(30):
+            watch.told(AHEAD, Instant(t0 + k * 10 * MS))
+            watch.judge(make_arm(Instant(t0 + (k + 1) * 10 * MS), x=x + 0.0004))
+            x += 0.0004
+        seen: tuple = ()
+        for k in range(1, 20):
+            x += 0.0004 if k * 0.01 <= went - 0.009 else 0.0
+            seen = watch.judge(make_arm(Instant(t0 + (30 + k) * 10 * MS), x=x)) or seen
+        assert (seen == ()) == right
+
+
+def test_the_constants_stand_apart() -> None:
+    """What is asked of the arm is above what simulated arms do in every set, with room."""
+    assert OFF_THE_WAY >= 1.5 * 0.0006
+    assert 0 < DEAD < 0.5
+    for one in SETS.values():
+        assert one.safety.arm_v_max * TOO_FAST > one.safety.speed
