@@ -256,7 +256,7 @@ class BoardPipeline:
                 if regained is not None:
                     rest.suspect(regained, self._noise)
             self._watch_rest(field, forces, estimate, healthy, captured)
-            self._feel_warmth(temperature)
+            self._feel_warmth(temperature, healthy)
             if sick:
                 np.copyto(forces, np.nan, where=~healthy[:, None])
         else:
@@ -287,7 +287,8 @@ class BoardPipeline:
             rest.note_peak(features.peak_force)
         if self.settings.rest_tracking_s is not None and valid and not reasons:
             self._follow_rest(field, estimate, healthy, captured)
-        if known and self._last_captured is not None and rest.state is RestState.KNOWN:
+        follows = known and rest.state is RestState.KNOWN and not self._net.fitted
+        if follows and self._last_captured is not None:
             elapsed = max(0.0, (captured - self._last_captured) / NS_PER_S)
             left_over = field - self._model.plane_field(estimate.theta)
             rest.recover(left_over, healthy, float(self._noise.max()), elapsed)
@@ -428,9 +429,10 @@ class BoardPipeline:
         elif self._rest.suspicion is not None and self._watch.restored(forces, estimate, healthy):
             self._rest.trust()
 
-    def _feel_warmth(self, temperature: Float) -> None:
+    def _feel_warmth(self, temperature: Float, healthy: Bool) -> None:
         """What the warming since the tare may look like, from the taxels' own thermometers."""
-        warmer = self._layout.flat(self._model.warmer(temperature))
+        # a masked chip's thermometer says nothing
+        warmer = self._layout.flat(np.where(healthy, self._model.warmer(temperature), 0.0))
         if float(np.abs(warmer - self._warmer).max()) > WARMING_STEP_K:
             self._warmer = warmer.copy()
             self._drift = self._bounds.drift_sigma(warmer)
