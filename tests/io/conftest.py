@@ -161,6 +161,11 @@ class Outcome:
         except Exception as error:  # noqa: BLE001 - kept for the test to judge
             self.error = error
 
+    @property
+    def ended(self) -> bool:
+        """Whether the function has returned or raised."""
+        return not self._thread.is_alive()
+
     def join(self) -> None:
         self._thread.join(SLOW)
         assert not self._thread.is_alive()

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import zenoh
 
@@ -159,7 +160,11 @@ def attack(rig: Rig, stranger: zenoh.Session) -> list[Any]:
     for number in range(150):
         wall = time.time_ns()
         twist = MSG.Twist(MSG.Vector3(-0.3, 0.0, 0.0), MSG.Vector3(0.0, 0.0, 0.0))
-        data = codec().encode(COMMAND, MSG.TwistStamped(header(wall, "cupboard"), twist))
+        command = MSG.ArmCommand(
+            header(wall, "cupboard"), twist, time.monotonic_ns(), 2**40 + number, 0.05,
+            before.commander, np.zeros(16, np.uint8),
+        )  # fmt: skip
+        data = codec().encode(COMMAND, command)
         stranger.put(key, data, attachment=ATTACHMENT.pack(2**40 + number, wall, 16, b"E" * 16))
         time.sleep(0.005)
     asked = (

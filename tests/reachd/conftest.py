@@ -344,6 +344,13 @@ class Lab:
     def ask(self, service: str, request: object = None) -> Any:
         return call(self.arm.session, service_key("reach", service, "reach"), request, SLOW)
 
+    def arms(self) -> bool:
+        """Ask to arm; False as long as it is refused, as before the arm has granted its command."""
+        try:
+            return bool(self.ask("arm")["armed"])
+        except ServiceError:
+            return False
+
     def codes(self, kind: str) -> list[str]:
         return [event.code for event in list(self.events) if event.kind == kind]
 

@@ -11,7 +11,6 @@ import pytest
 from mcap.reader import make_reader
 
 from tactile_bus.messages import codec
-from tactile_bus.services import ServiceError
 from tactile_bus.topics import REACH_EVENT
 
 NEAR = ("--strategy", "straight", "--target", "0.04,0.0", "--seed", "1")
@@ -176,7 +175,7 @@ def test_a_second_reachd_that_sees_only_the_arm_is_refused(lab: Any, wait_until:
         assert second.wait() == 3, second.said
         assert "commanded by another reachd (reach 'reach')" in second.said
     assert arm.desk.commander.startswith("reach-")
-    lab.ask("arm")
+    wait_until(lab.arms)
     assert lab.ask("status")["armed"] is True
 
 
@@ -185,7 +184,7 @@ def test_the_arm_is_ours_again_after_its_driver_started_anew(lab: Any, wait_unti
     arm, _ = lab.arm, lab.board()
     program = lab.reachd("--serve", "--strategy", "straight", "--no-log")
     wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
-    wait_until(lambda: _arms(lab))
+    wait_until(lab.arms)
     lab.ask("goal", {"x": 0.36, "y": 0.0})
     wait_until(lambda: arm.moving)
     first = arm.desk.commander
@@ -193,17 +192,10 @@ def test_the_arm_is_ours_again_after_its_driver_started_anew(lab: Any, wait_unti
     wait_until(lambda: lab.ask("status")["held"] == "commander")
     assert "obeys nobody's commands" in lab.ask("status")["outcome"]["text"]
     wait_until(lambda: arm.desk.commander not in ("", first))
-    wait_until(lambda: _arms(lab))
+    wait_until(lab.arms)
     program.signal(signal.SIGTERM)
     assert program.wait() == 0
     assert arm.desk.commander == "", "given back"
-
-
-def _arms(lab: Any) -> bool:
-    try:
-        return bool(lab.ask("arm")["armed"])
-    except ServiceError:
-        return False
 
 
 @pytest.mark.parametrize("delay", [0.25, 0.07])

@@ -36,7 +36,7 @@ def test_a_stamp_that_no_log_can_hold_does_not_end_the_log(lab: Any, wait_until:
     before = lab.ask("status")["log"]["written"]
     wait_until(lambda: lab.ask("status")["log"]["written"] > before + 100)
     assert lab.ask("status")["log"]["state"] == "recording"
-    lab.ask("arm")
+    wait_until(lab.arms)
     with pytest.raises(ServiceError, match="nothing to stop"):
         lab.ask("stop", {"reason": "\x1b[2J" * 7000})
     program.signal(signal.SIGTERM)
@@ -48,7 +48,7 @@ def test_no_reach_begins_without_the_log_that_was_asked_for(lab: Any, wait_until
     arm, _ = lab.arm, lab.board()
     program = lab.reachd("--serve", "--strategy", "straight", "--log", "logs")
     wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
-    lab.ask("arm")
+    wait_until(lab.arms)
     logs: Path = lab.folder / "logs"
     logs.rename(lab.folder / "gone")
     logs.touch()  # where there was a folder: no file can be opened there
@@ -121,5 +121,6 @@ def _arm() -> Any:
     zero = MSG.Vector3(0.0, 0.0, 0.0)
     twist, wrench = MSG.Twist(zero, zero), MSG.Wrench(zero, zero)
     return MSG.ArmState(
-        header(0, "cupboard"), 1, 2, 0.1, -0.2, 0.3, twist, wrench, "moving", 0.05, 0.35, 10.0, 1.5
-    )
+        header(0, "cupboard"), 1, 2, 0.1, -0.2, 0.3, twist, wrench, "moving", 0.05, 0.35, 10.0, 1.5,
+        "", 0, 0,
+    )  # fmt: skip

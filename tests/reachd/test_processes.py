@@ -186,7 +186,7 @@ def test_served_over_the_bus(lab: Any, wait_until: Until) -> None:
     assert second.wait() == 3
     assert f"process {program.process.pid}" in second.said
 
-    lab.ask("arm")
+    wait_until(lab.arms)
     lab.ask("goal", goal)
     wait_until(lambda: arm.moving)
     lab.ask("stop", {"reason": "enough"})
@@ -205,7 +205,7 @@ def test_served_over_the_bus(lab: Any, wait_until: Until) -> None:
         lab.ask("arm")
     arm.mode = "ready"
     assert lab.ask("status")["armed"] is False  # the arm's health alone never arms it
-    wait_until(lambda: _armed(lab))
+    wait_until(lab.arms)
     lab.ask("reset")
     wait_until(lambda: lab.ask("status")["state"] == "idle")
 
@@ -215,20 +215,11 @@ def test_served_over_the_bus(lab: Any, wait_until: Until) -> None:
     forger.put(b"forged", 0)
     wait_until(lambda: lab.ask("status")["held"] == "duplicate_publisher")
     wait_until(lambda: stopped(lab) or not arm.moving)
-    wait_until(lambda: _armed(lab))
+    wait_until(lab.arms)
 
     program.signal(signal.SIGTERM)
     assert program.wait() == 0, program.said
     lab.told_to_stand()
-
-
-def _armed(lab: Any) -> bool:
-    """Ask to arm; False as long as it is refused."""
-    try:
-        lab.ask("arm")
-    except ServiceError:
-        return False
-    return True
 
 
 def test_without_features_or_arm_nothing_begins(lab: Any) -> None:

@@ -23,6 +23,8 @@ Bool = NDArray[np.bool_]
 
 MIN_FREE = 0.5
 """Share of a small array's healthy taxels that must be free for its ambient field to be seen."""
+CONTACT_UT = 1.2
+"""µT rms of a press's slight beginnings that may have been taken for the ambient field."""
 UNKNOWN_UT = 60.0
 """µT rms a component, where the ambient field is not known at all: the earth's, turned."""
 LONGEST_GAP_S = 5.0
@@ -100,11 +102,6 @@ class SmallArrays:
         if self._rest is not None:
             self._rest.reset(rested)
 
-    def predict(self, change: Float, sigma: float) -> None:
-        """The ambient field changes by ``change`` (3,) µT in ``ee`` until the next cycle."""
-        for array in self._arrays.values():
-            array.predict(change, sigma)
-
     def update(self, field_ee: Float, forces: Float, healthy: Bool, captured: Instant) -> Estimate:
         """Estimate for one cycle."""
         layout, model = self._layout, self._model
@@ -128,7 +125,9 @@ class SmallArrays:
             said = array.update(target[a, :, :n], healthy[a, :n], elapsed)
             theta[a] = 0.0
             theta[a, :, 0] = said.field
-            sigma[a], slope_sigma[a], leap[a] = said.sigma, 0.0, said.leap
+            touched = not bool(said.free[healthy[a, :n]].all())
+            sigma[a] = np.hypot(said.sigma, CONTACT_UT if touched else 0.0)
+            slope_sigma[a], leap[a] = 0.0, said.leap
             sound = int(np.count_nonzero(healthy[a]))
             support[a] = np.count_nonzero(said.free & healthy[a, :n]) / sound if sound else 0.0
             residual[a] = said.left_over

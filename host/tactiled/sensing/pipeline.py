@@ -452,18 +452,19 @@ class BoardPipeline:
         taxels = bounds.taxels(estimate, self._drift)
         least = extractor.smallest
         unseen = float(least.max())
-        peak = float(taxels[extractor.peak_taxel])
-        if not extractor.summed:
-            peak = math.hypot(peak, unseen)
-        normal = math.hypot(bounds.together(extractor.summed, estimate, self._drift), unseen)
-        tip = math.hypot(bounds.together(extractor.tip_summed, estimate, self._drift), unseen)
         odd = bounds.implausible(force)
-        peak, normal, tip = peak + odd, normal + odd, tip + odd
+        peak = float(taxels[extractor.peak_taxel]) + odd
+        normal = bounds.together(extractor.summed, estimate, self._drift) + odd
+        tip = bounds.together(extractor.tip_summed, estimate, self._drift) + odd
         limit = self.settings.bound_limit_n
         valid, reasons = features.valid, features.reasons
         if peak > limit or (bounds.few and normal > limit):
             valid = False
             reasons = (*reasons, self._doubt(max(peak, normal)))
+        # contacts too slight to be seen are no matter for what acts on half a newton
+        if not extractor.summed:
+            peak = math.hypot(peak, unseen)
+        normal, tip = math.hypot(normal, unseen), math.hypot(tip, unseen)
         features = dataclasses.replace(
             features,
             valid=valid,

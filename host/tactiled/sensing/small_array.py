@@ -14,7 +14,8 @@ price; the filter takes a frame only when it is known which chips changed soon a
 the slow beginning of a press is never taken for the field of the room.
 
 What cannot be known: a contact that loads all chips alike, slowly, is not told from the field of
-the room, unless the arm's attitude predicts that field (`SmallArray.predict`).
+the room; nor is a field that turns while all chips are loaded told from their contact, which is
+why the bound then grows.
 """
 
 from __future__ import annotations
@@ -38,10 +39,11 @@ SMOOTH_S = 0.05
 EVENT = 13.0
 """Price of a contact that begins, or begins to change, in units of squared distance over variance;
 −2 ln of one in 700 frames."""
-NEAR_UT = 16.0
-NEAR_SHEAR_UT = 5.0
-PRESSED = 7.0
-OTHER = 11.0
+PRESSED, OTHER = 7.0, 11.0
+"""Least price of a chip that takes part in it, where it reads what a press makes and where not."""
+NEAR_UT, NEAR_SHEAR_UT = 16.0, 5.0
+"""µT rms along a press and across it that a contact may add at the other chips of the array
+without being seen at once."""
 TURN = 20.0
 """Price of an arm that begins to turn, or stops, while nothing touches."""
 FIRM_UT = 40.0
@@ -69,7 +71,7 @@ MODEL_ERROR_UT = 1.5
 UNEVEN = 0.02
 """Share by which they differ in a field that leaps."""
 CALM_UT_PER_S = 0.3
-"""µT/s rms, how fast the field of the room changes while nothing moves: an arm at 0.1 rad/s."""
+"""µT/s rms, how fast the field of the room changes while nothing moves: chips that warm up."""
 TURNING_UT_PER_S = 60.0
 """µT/s rms, how fast it may change at all: an arm at 1 rad/s in 60 µT."""
 UNSTEADY = 0.3
@@ -130,7 +132,6 @@ class _Frame:
     target: Float
     healthy: Bool
     elapsed: float
-    predicted: tuple[Float, float] | None
     changing: Bool
     pace: Float | None = None  # µT/s of the ambient field, by this frame and those before
 
@@ -166,15 +167,6 @@ class SmallArray:
         self._lean = np.zeros((3, n))
         self._lean_weight = 1.0
         self._pace = np.zeros(3)  # µT/s
-        self._predicted: tuple[Float, float] | None = None
-
-    def predict(self, change: Float, sigma: float) -> None:
-        """The ambient field changes by ``change`` (3,) µT ± ``sigma`` until the next frame.
-
-        For arms whose attitude is known. Without it the field is taken to move as fast as it was
-        seen to move.
-        """
-        self._predicted = change, sigma
 
     def update(self, target: Float, healthy: Bool, elapsed: float) -> Small:
         """Take one frame.
@@ -182,8 +174,7 @@ class SmallArray:
         ``target``: (3, n) µT in ``ee`` over rest, without what neighbours' contacts add.
         ``healthy``: (n,). ``elapsed``: s since the last frame.
         """
-        frame = _Frame(target, healthy, elapsed, self._predicted, np.zeros(self._n, dtype=bool))
-        self._predicted = None
+        frame = _Frame(target, healthy, elapsed, np.zeros(self._n, dtype=bool))
         self._waiting.append(frame)
         self._behind += elapsed
         self._smooth(target, elapsed)
@@ -265,24 +256,14 @@ class SmallArray:
         What is expected of a steady motion, how far off that may be, and how far if the motion
         has just begun or ended.
         """
-        moved, unsteady, turning = np.zeros(3), np.zeros(3), np.zeros(3)
-        pace = self._pace
-        doubt = np.maximum(CALM_UT_PER_S, UNSTEADY * float(np.linalg.norm(pace)))
-        for frame in self._waiting:
-            if frame.predicted is None:
-                moved += pace * frame.elapsed
-                unsteady += doubt * frame.elapsed
-                turning += TURNING_UT_PER_S * frame.elapsed
-            else:
-                moved += frame.predicted[0]
-                unsteady += frame.predicted[1]
-                turning += frame.predicted[1]
+        pace, behind = self._pace, self._behind
+        doubt = max(CALM_UT_PER_S, UNSTEADY * float(np.linalg.norm(pace)))
+        moved = pace * behind
+        unsteady, turning = np.full(3, doubt * behind), np.full(3, TURNING_UT_PER_S * behind)
         return moved, unsteady, turning
 
     def _follow_pace(self, frame: _Frame, seen: Float) -> None:
         """The field of the room was ``seen`` to move at so many µT/s, (3,)."""
-        if frame.predicted is not None:
-            return
         share = -math.expm1(-frame.elapsed / PACE_TAU_S)
         pace = self._pace + share * (seen - self._pace)
         fast = float(np.linalg.norm(pace))
@@ -349,15 +330,10 @@ class SmallArray:
     def _drift(self, frame: _Frame) -> None:
         """Let time pass: the ambient field moves on, loaded chips creep."""
         cov, elapsed = self._cov, frame.elapsed
-        if frame.predicted is not None:
-            change, sigma = frame.predicted
-            self._state[:, 0] += change
-            cov[:, 0, 0] += sigma**2
-        else:
-            self._state[:, 0] += self._pace * elapsed
-            # what is unknown of it is the same from frame to frame: deviations add up
-            step = max(CALM_UT_PER_S, UNSTEADY * float(np.linalg.norm(self._pace))) * elapsed
-            cov[:, 0, 0] += (2.0 * np.sqrt(cov[:, 0, 0]) + step) * step
+        self._state[:, 0] += self._pace * elapsed
+        # what is unknown of it is the same from frame to frame: deviations add up
+        step = max(CALM_UT_PER_S, UNSTEADY * float(np.linalg.norm(self._pace))) * elapsed
+        cov[:, 0, 0] += (2.0 * np.sqrt(cov[:, 0, 0]) + step) * step
         contact = np.where(self._free, 0.0, self._state[:, 1:])
         cov[:, 1:, 1:] += CREEP_PER_S**2 * elapsed * contact[:, :, None] * contact[:, None, :]
         index = np.arange(1, self._n + 1)

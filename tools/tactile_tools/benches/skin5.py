@@ -83,6 +83,7 @@ def bench_skin5(*, quick: bool = False, seed: int = 0) -> dict[str, float]:
     ``skin5_force_error``: of presses of 0.5 to 10 N at 25 places with three indenters, the rms over
     presses of the mean error of the normal force over what is allowed, the larger of 5 % and 0.1 N.
     ``skin5_force_error_pct``, ``skin5_light_force_error_n``: rms in % from 2 N and in N below.
+    ``skin5_press_coverage``: share of their cycles whose bound holds the truth.
     ``skin5_rest_n``: largest force of a still, untouched board. ``skin5_bound_coverage``: share of
     cycles whose bound holds the truth while the board turns at 1 rad/s in 50 µT with 0, 1, 3 and 5
     chips pressed, the worst of the four; ``skin5_bound_median_n`` the median of the bounds;
@@ -95,7 +96,7 @@ def bench_skin5(*, quick: bool = False, seed: int = 0) -> dict[str, float]:
 def _presses(rng: np.random.Generator, quick: bool) -> dict[str, float]:
     array = anyskin().arrays[0]
     axes, centre = array.rotation[0], array.position[0]
-    allowed, relative, light = [], [], []
+    allowed, relative, light, held = [], [], [], []
     every = [(r, x, y, f) for r in RADII_M for x in PLACES_M for y in PLACES_M for f in FORCES_N]
     if quick:
         every = every[::9]
@@ -118,6 +119,8 @@ def _presses(rng: np.random.Generator, quick: bool) -> dict[str, float]:
         truth, cycles = board.run(force_at, lambda _: np.eye(3), 1.2)
         late = [c.features.normal_force for c in cycles[70:]]
         true = truth[-1]
+        bounds = [c.features.normal_force_bound for c in cycles[70:]]
+        held += [abs(f - true) <= b for f, b in zip(late, bounds, strict=True)]
         error = float(np.mean(late)) - true
         allowed.append(error / max(0.05 * true, 0.1))
         if newton >= 2.0:
@@ -128,6 +131,7 @@ def _presses(rng: np.random.Generator, quick: bool) -> dict[str, float]:
         "skin5_force_error": _rms(allowed),
         "skin5_force_error_pct": _rms(relative),
         "skin5_light_force_error_n": _rms(light),
+        "skin5_press_coverage": float(np.mean(held)),
     }
 
 
