@@ -75,7 +75,9 @@ def glimpse(station: Station, now: Instant) -> Glimpse:
     valid, bound = False, math.inf
     if cycle is not None and seconds_between(cycle.received, now) < limit:
         features = cycle.features
-        valid, bound = features.valid, features.normal_force_bound
+        valid = features.valid
+        if cycle.calibrated:  # nominal figures are right to a factor of two, which says little
+            bound = features.normal_force_bound
         reasons = tuple(reason.text for reason in features.reasons)
         if station.choice is not None:
             arrays = station.choice.calibration.geometry.arrays
