@@ -25,6 +25,8 @@ MIN_FREE = 0.5
 """Share of a small array's healthy taxels that must be free for its ambient field to be seen."""
 CONTACT_UT = 1.2
 """µT rms of a press's slight beginnings that may have been taken for the ambient field."""
+COVERED_UT = 4.0
+"""The same where every chip bears something: nothing corrects it."""
 UNKNOWN_UT = 60.0
 """µT rms a component, where the ambient field is not known at all: the earth's, turned."""
 LONGEST_GAP_S = 5.0
@@ -125,8 +127,9 @@ class SmallArrays:
             said = array.update(target[a, :, :n], healthy[a, :n], elapsed)
             theta[a] = 0.0
             theta[a, :, 0] = said.field
-            touched = not bool(said.free[healthy[a, :n]].all())
-            sigma[a] = np.hypot(said.sigma, CONTACT_UT if touched else 0.0)
+            free = said.free[healthy[a, :n]]
+            taken = 0.0 if free.all() else CONTACT_UT if free.any() else COVERED_UT
+            sigma[a] = np.hypot(said.sigma, taken)
             slope_sigma[a], leap[a] = 0.0, said.leap
             sound = int(np.count_nonzero(healthy[a]))
             support[a] = np.count_nonzero(said.free & healthy[a, :n]) / sound if sound else 0.0

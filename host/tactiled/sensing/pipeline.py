@@ -464,6 +464,8 @@ class BoardPipeline:
         # contacts too slight to be seen are no matter for what acts on half a newton
         if not extractor.summed:
             peak = math.hypot(peak, unseen)
+        else:
+            unseen *= BESIDE
         normal, tip = math.hypot(normal, unseen), math.hypot(tip, unseen)
         features = dataclasses.replace(
             features,
@@ -535,6 +537,8 @@ class BoardPipeline:
         return True
 
 
+BESIDE = 0.5
+"""Share of what is too slight to be seen by itself that may be there beside a contact that is."""
 WARMING_STEP_K = 0.5
 """K of warming after which bounds and thresholds are worked out anew."""
 WARMING_SIGMAS = 0.5
