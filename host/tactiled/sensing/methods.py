@@ -25,8 +25,8 @@ MIN_FREE = 0.5
 """Share of a small array's healthy taxels that must be free for its ambient field to be seen."""
 CONTACT_UT = 1.2
 """µT rms of a press's slight beginnings that may have been taken for the ambient field."""
-COVERED_UT = 4.0
-"""The same where every chip bears something: nothing corrects it."""
+COVERED_UT = 7.0
+"""The same where every chip bears something while the field turns: nothing corrects it."""
 UNKNOWN_UT = 60.0
 """µT rms a component, where the ambient field is not known at all: the earth's, turned."""
 LONGEST_GAP_S = 5.0
@@ -128,7 +128,8 @@ class SmallArrays:
             theta[a] = 0.0
             theta[a, :, 0] = said.field
             free = said.free[healthy[a, :n]]
-            taken = 0.0 if free.all() else CONTACT_UT if free.any() else COVERED_UT
+            blind = said.moving and not free.any()
+            taken = COVERED_UT if blind else 0.0 if free.all() else CONTACT_UT
             sigma[a] = np.hypot(said.sigma, taken)
             slope_sigma[a], leap[a] = 0.0, said.leap
             sound = int(np.count_nonzero(healthy[a]))

@@ -116,7 +116,7 @@ class Small:
     ``field``: (3,) µT in ``ee``, the ambient field since the tare. ``sigma``: (3,) µT rms of it.
     ``free``: (n,) bool, chips that bear nothing. ``changing``: (n,) bool. ``leap``: µT by which
     the field has leapt, more than turning explains; 0 otherwise. ``left_over``: µT rms of the
-    chips that the field explains about it.
+    chips that the field explains about it. ``moving``: the field is seen to turn.
     """
 
     field: Float
@@ -125,6 +125,7 @@ class Small:
     changing: Bool
     leap: float
     left_over: float
+    moving: bool
 
 
 @dataclass(slots=True, eq=False)
@@ -281,6 +282,7 @@ class SmallArray:
             changing.copy(),
             leap,
             left_over,
+            float(np.linalg.norm(self._pace)) >= MOVING_UT_PER_S,
         )
 
     # The filter, a moment later
