@@ -45,7 +45,10 @@ copy@5s+2s (every third frame an old one), seed=N (default: the board's).
 Chips: WHAT=ARRAY:TAXEL@Ts+Ds, TAXEL * for all, such as zeros=left:3@2s+5s; with :SHARE only that
 share of readings, such as zeros=skin:*:0.05@4s. WHAT: stuck, saturated, failed (flagged, where the
 board can); zeros, ones (failed reads), rail, wrap (over the end of 16 bits under a press), jump,
-twin (another chip's bits), dither (dead but for the last bits), hot (99 °C), inf (anyskin only)."""
+twin (another chip's bits), dither (dead but for the last bits), hot (99 °C), inf (anyskin only),
+loose (its magnet has come off).
+The whole skin: skinoff@4s+2s, newskin@6s (another skin is on from then), gain=1.67@4s (of all
+chips), leap=2000@4s+2s (µT of a field that leaps: a magnet near)."""
 
 
 def make_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:

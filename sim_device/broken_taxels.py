@@ -118,6 +118,8 @@ class BrokenTaxels:
                 counts[taxel] = reading.counts[taxel - 1 if taxel else 1 % len(counts)]
             case TaxelFaultKind.HOT:
                 temperature[taxel] = HOT_C
+            case TaxelFaultKind.LOOSE:
+                pass  # the skin's, not the chip's: see `SkinChanges`
             case TaxelFaultKind.INFINITE:
                 infinite[taxel] = True
 

@@ -40,6 +40,7 @@ class TaxelFaultKind(StrEnum):
     TWIN = "twin"  # the bits of the chip before it (chip 0: of chip 1)
     DITHER = "dither"  # stuck but for the last bits, which toggle
     HOT = "hot"  # a thermometer that shows 99 °C
+    LOOSE = "loose"  # its magnet has come off
     INFINITE = "inf"  # what is not a number; boards that send floats only
 
 
@@ -83,6 +84,10 @@ class FaultPlan:
     reset: tuple[float, ...] = ()
     busoff: tuple[Window, ...] = ()
     copy: tuple[Window, ...] = ()
+    skinoff: tuple[Window, ...] = ()
+    newskin: tuple[Window, ...] = ()
+    gain: tuple[tuple[float, Window], ...] = ()
+    leap: tuple[tuple[float, Window], ...] = ()
     taxels: tuple[TaxelFault, ...] = ()
 
     def __post_init__(self) -> None:
@@ -100,7 +105,8 @@ class FaultPlan:
 
         Entries, parted by commas: ``seed=N``; ``NAME=PROBABILITY`` for flip, byteloss,
         byteinsert, loss, duplicate, reorder, splice; ``delay=PROBABILITY:SECONDSs``;
-        ``silence@Ts+Ds``, ``busoff@Ts+Ds``, ``copy@Ts+Ds``, ``reset@Ts``; a `TaxelFaultKind`
+        ``silence@Ts+Ds``, ``busoff@Ts+Ds``, ``copy@Ts+Ds``, ``reset@Ts``; ``skinoff@Ts+Ds``,
+        ``newskin@Ts``, ``gain=FACTOR@Ts+Ds``, ``leap=MICROTESLA@Ts+Ds``; a `TaxelFaultKind`
         such as ``zeros=ARRAY:TAXEL`` (``*``: every taxel) with an optional ``:SHARE`` of its
         readings and an optional ``@Ts`` or ``@Ts+Ds`` (``nan`` is ``failed``). ScriptError names
         the entry and what is allowed.
@@ -144,7 +150,11 @@ PROBABILITIES = (
     "delay",
 )
 _TAXEL_FAULTS = {**{kind.value: kind for kind in TaxelFaultKind}, "nan": TaxelFaultKind.FAILED}
-TIMED = ("silence", "reset", "busoff", "copy")
+TIMED = ("silence", "reset", "busoff", "copy", "skinoff", "newskin")
+STARTING = ("reset", "newskin")
+"""Those that begin and have no end."""
+SIZED = ("gain", "leap")
+"""A figure, then when: ``gain=FACTOR@Ts+Ds``, ``leap=MICROTESLA@Ts+Ds``."""
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _ENTRY = re.compile(r"(?P<name>[a-z_]+)\s*(?P<mark>[=@])\s*(?P<rest>.+)")
@@ -156,7 +166,8 @@ _TAXEL = re.compile(
 )
 _FORMS = (
     "allowed: seed=N; flip, byteloss, byteinsert, loss, duplicate, reorder, splice = probability "
-    "from 0 to 1; delay=PROBABILITY:SECONDSs; silence@Ts+Ds; busoff@Ts+Ds; copy@Ts+Ds; reset@Ts; "
+    "from 0 to 1; delay=PROBABILITY:SECONDSs; silence@Ts+Ds; busoff@Ts+Ds; copy@Ts+Ds; "
+    "reset@Ts; skinoff@Ts+Ds; newskin@Ts; gain=FACTOR@Ts+Ds; leap=MICROTESLA@Ts+Ds; "
     f"{', '.join(TaxelFaultKind)} (or nan: failed) = ARRAY:TAXEL:SHARE@Ts+Ds"
 )
 
@@ -166,6 +177,7 @@ def _collect(entries: list[tuple[str, str]]) -> FaultPlan:
     figures: dict[str, float] = {}
     seed: int | None = None
     windows: dict[str, list[Window]] = {name: [] for name in TIMED}
+    sized: dict[str, list[tuple[float, Window]]] = {name: [] for name in SIZED}
     taxels: list[TaxelFault] = []
     for entry, label in entries:
         match = _ENTRY.fullmatch(entry)
@@ -174,12 +186,14 @@ def _collect(entries: list[tuple[str, str]]) -> FaultPlan:
         name, mark, rest = match["name"], match["mark"], match["rest"].strip()
         if name in TIMED and mark == "@":
             windows[name].append(
-                _window(rest, label, needs_end=name != "reset", may_end=name != "reset")
+                _window(rest, label, needs_end=name not in STARTING, may_end=name not in STARTING)
             )
         elif mark != "=":
             raise ScriptError(f"{label} is not understood; {_FORMS}")
         elif name in _TAXEL_FAULTS:
             taxels.append(_taxel_fault(_TAXEL_FAULTS[name], rest, label))
+        elif name in SIZED:
+            sized[name].append(_sized(rest, label))
         elif name in figures or (name == "seed" and seed is not None):
             raise ScriptError(f"{label}: {name} is given twice; give it once")
         elif name == "seed":
@@ -208,6 +222,10 @@ def _collect(entries: list[tuple[str, str]]) -> FaultPlan:
         reset=tuple(w.start for w in windows["reset"]),
         busoff=tuple(windows["busoff"]),
         copy=tuple(windows["copy"]),
+        skinoff=tuple(windows["skinoff"]),
+        newskin=tuple(windows["newskin"]),
+        gain=tuple(sized["gain"]),
+        leap=tuple(sized["leap"]),
         taxels=tuple(taxels),
     )
 
@@ -230,6 +248,20 @@ def _delay(text: str, label: str) -> dict[str, float]:
     if match["s"]:
         plan["delay_s"] = float(match["s"])
     return plan
+
+
+def _sized(text: str, label: str) -> tuple[float, Window]:
+    figure, mark, when = text.partition("@")
+    try:
+        value = float(figure)
+    except ValueError:
+        value = math.nan
+    if not mark or not 0 < value < 1e5:
+        raise ScriptError(
+            f"{label}: allowed: a figure above 0, then @Ts or @Ts+Ds, such as gain=1.67@4s (factor "
+            "of all counts) or leap=2000@4s+2s (µT)"
+        )
+    return value, _window(when, label, needs_end=False, may_end=True)
 
 
 def _window(text: str, label: str, needs_end: bool, may_end: bool) -> Window:

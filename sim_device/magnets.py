@@ -43,7 +43,12 @@ class MagnetArray:
         self._starts = np.searchsorted(chip, np.arange(len(chips)))
         # Components apart: numpy is several times faster on long rows than on triples.
         self._offset = np.ascontiguousarray((chips[chip] - rest[self._magnet]).T)
-        self._moment = np.ascontiguousarray(moment[self._magnet].T)
+        self._whole = np.ascontiguousarray(moment[self._magnet].T)
+        self._moment = self._whole
+
+    def scale(self, factor: Float) -> None:
+        """Let every moment be ``factor`` (N,) of what it was made as; 0: the magnet is gone."""
+        self._moment = self._whole * factor[self._magnet]
 
     @property
     def pairs(self) -> tuple[Index, Index]:

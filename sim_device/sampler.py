@@ -12,6 +12,7 @@ from sim_device.chips import Reading
 from sim_device.environment import Environment
 from sim_device.faults import FaultPlan
 from sim_device.skin import Contact, SkinModel
+from sim_device.skin_changes import SkinChanges
 from tactile_bus.instant import Instant
 
 Float = NDArray[np.float64]
@@ -41,6 +42,7 @@ class Sampler:
         self.temperature_c = environment.at(0.0).temperature_c
         taxels = {array.name: array.taxels for array in skin.geometry.arrays}
         self._broken = BrokenTaxels(plan or FaultPlan(), taxels)
+        self._changes = SkinChanges(plan or FaultPlan(), skin, taxels)
 
     @property
     def fault_counters(self) -> dict[str, int]:
@@ -53,7 +55,9 @@ class Sampler:
         attitude = self.attitude(seconds) if callable(self.attitude) else self.attitude
         surroundings = self.environment.at(seconds, attitude)
         self.temperature_c = surroundings.temperature_c
-        return self._broken.spoil(self.skin.sample(now, contacts, surroundings), seconds)
+        surroundings = self._changes.surround(seconds, surroundings)
+        reading = self._changes.amplify(seconds, self.skin.sample(now, contacts, surroundings))
+        return self._broken.spoil(reading, seconds)
 
 
 class SkinOwner:

@@ -12,7 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_device.skin import Contact
+from sim_device.environment import Environment, EnvironmentParameters, rotation_about
+from sim_device.faults import FaultPlan
+from sim_device.parameters import anyskin_parameters
+from sim_device.sampler import Sampler
+from sim_device.skin import Contact, SkinModel
 from tactile_bus.calibration import nominal
 from tactile_bus.geometry import anyskin
 from tactile_bus.instant import Instant
@@ -144,8 +148,6 @@ def test_every_taxel_has_its_bound_and_it_grows_while_nothing_shows_the_field():
     board = Board(5)
     load = np.zeros((5, 3))
     load[:, 2] = -2.0
-    from sim_device.environment import rotation_about
-
     _, cycles = board.run(
         lambda t: load * min(1.0, max(0.0, t - 0.5) / 0.15),
         lambda t: rotation_about(TURN_AXIS, max(0.0, t - 2.0)),
@@ -260,3 +262,42 @@ def test_what_a_skin_has_not_recovered_fades_and_is_not_a_contact_for_good():
     cycles = owner.play(lambda _: REST + left, 15.0)
     assert cycles[-1].features.normal_force < 0.3
     assert owner.play(lambda _: REST + left, 3.0)[-1].features.valid
+
+
+@pytest.mark.parametrize(
+    ("spec", "code"),
+    [
+        ("leap=1500@2s+1s", "field_jump"),
+        ("gain=0.6@2s", "gain_changed"),
+        ("skinoff@2s+1.5s,newskin@2s", "skin_off:skin"),
+        ("loose=skin:2@2s", "magnet_lost:skin"),
+    ],
+)
+def test_the_simulator_plays_what_befalls_a_skin(spec, code):
+    rng = np.random.default_rng(4)
+    skin = SkinModel(anyskin(), anyskin_parameters(), rng)
+    board = Sampler(
+        skin, Environment(EnvironmentParameters(self_heating_k=0.0)), (), FaultPlan.parse(spec)
+    )
+    pipeline = BoardPipeline(nominal("anyskin", ""), PipelineSettings())
+    cycles = []
+    for k in range(600):
+        now = Instant(round(k * 1e7))
+        reading = board.read(now, k / 100)
+        block = SampleBlock(
+            0, k, now, now, 1e-3, reading.counts * skin.chips.lsb_ut, reading.temperature_c,
+            reading.status,
+        )  # fmt: skip
+        cycles += pipeline.feed(block)
+    assert code in codes(cycles)
+    assert not any(c.features.valid and c.features.normal_force > 0.5 for c in cycles)
+    assert cycles[-1].features.valid
+
+
+@pytest.mark.parametrize(
+    "spec", ["gain=fast@2s", "gain=1.5", "leap=-1@2s", "newskin@2s+1s", "loose=skin:9@1s"]
+)
+def test_changes_that_cannot_be_are_refused(spec):
+    skin = SkinModel(anyskin(), anyskin_parameters(), np.random.default_rng(1))
+    with pytest.raises(ValueError, match=r"allowed|taxels 0 to 4"):
+        Sampler(skin, Environment(), (), FaultPlan.parse(spec))

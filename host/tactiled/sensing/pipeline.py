@@ -399,8 +399,8 @@ class BoardPipeline:
             return
         field -= shift
         if stripped:
-            self._rest.bare |= self._watch.lost(before)
-            self._rest.bare &= ~self._watch.covered()
+            lost = self._watch.lost(before)
+            self._rest.bare = lost | (self._rest.bare & ~self._watch.covered())
         self._forgotten = None
         self._monitor.set_rest(self._model.chip_rest())
         self._compensator.reset(rested=True)

@@ -31,8 +31,11 @@ BARE_SHARE = 0.6
 """Share of the chips that must be bare for the skin to be off."""
 LOST_AFTER_S = 0.3
 """s that a single chip must be bare: a press may carry its field through zero."""
-AT_ONCE = 0.8
-"""Share of its rest field that a chip must lose within `SCRAMBLE_S` to have lost it at once."""
+AT_ONCE = 0.6
+"""Share of its rest field by which a chip must change within `SCRAMBLE_S` to have lost its magnet."""
+GONE_SHARE = 0.3
+"""Share of its rest field that a chip without its magnet reads at most: its neighbours' magnets add
+a tenth."""
 EARTH_UT = 150.0
 """µT beyond which the ambient field has not been turned: the earth's 65 turned round, and noise."""
 GAIN_STEP = 0.12
@@ -59,6 +62,7 @@ class RestWatch:
         self._small = layout.counts < PLANE_TAXELS
         self._last: tuple[Instant, Float] | None = None
         self._bare_since = np.full(layout.real.shape, -1, np.int64)
+        self._gone = np.zeros_like(layout.real)
         self.off = False
         """Whether there is no skin on the board now: nothing to take a rest field of."""
 
@@ -70,7 +74,8 @@ class RestWatch:
     def regained(self, field: Float, bare: Bool) -> Reason | None:
         """A magnet over one of the taxels ``bare`` (A, n) that had none: the skin was changed."""
         reading = np.linalg.norm(field + self._model.rest, axis=1)
-        if not (bare & (reading > MAGNET_UT)).any():
+        least = np.maximum(MAGNET_UT, 2.0 * np.linalg.norm(self._model.rest, axis=1))
+        if not (bare & (reading > least)).any():
             return None
         return why.field_jump(float(reading[bare].max()))
 
@@ -104,8 +109,10 @@ class RestWatch:
         rest = self._model.rest
         magnet = (rest**2).sum(axis=1) > MAGNET_UT**2
         reading = ((field + rest) ** 2).sum(axis=1)
+        strong = np.linalg.norm(rest, axis=1)
+        fallen = self._fallen(field, reading, strong, healthy & magnet, captured, last)
         bare = healthy & magnet & (reading < BARE_UT**2)
-        if not bare.any():
+        if not (bare.any() or fallen.any()):
             self._bare_since[:] = -1
             return None
         begun = bare & (self._bare_since < 0)
@@ -116,26 +123,41 @@ class RestWatch:
             if chips[a].sum() >= 3 and bare[a].sum() >= BARE_SHARE * chips[a].sum():
                 self.off = True
                 return why.skin_off(self._names[a])
-        strong = np.linalg.norm(rest, axis=1)
         for a, i in np.argwhere(bare & (strong > 2 * MAGNET_UT)).tolist():
             since = Instant(int(self._bare_since[a, i]))
-            at_once = (
-                last is not None
-                and seconds_between(last[0], captured) <= SCRAMBLE_S
-                and np.linalg.norm(field[a, :, i] - last[1][a, :, i]) > AT_ONCE * strong[a, i]
-            )
-            if at_once or seconds_between(since, captured) >= LOST_AFTER_S:
-                return why.magnet_lost(self._names[a], i)
-        return None
+            fallen[a, i] |= seconds_between(since, captured) >= LOST_AFTER_S
+        if not fallen.any():
+            return None
+        self._gone |= fallen
+        a, i = np.argwhere(fallen)[0].tolist()
+        return why.magnet_lost(self._names[a], i)
+
+    def _fallen(
+        self,
+        field: Float,
+        reading: Float,
+        strong: Float,
+        chips: Bool,
+        captured: Instant,
+        last: tuple[Instant, Float] | None,
+    ) -> Bool:
+        """(A, n) chips that have lost most of their field at once, as no press makes it."""
+        if last is None or seconds_between(last[0], captured) > SCRAMBLE_S:
+            return np.zeros_like(chips)
+        step = np.linalg.norm(field - last[1], axis=1)
+        low = reading < (GONE_SHARE * strong) ** 2
+        return np.asarray(chips & low & (strong > 2 * MAGNET_UT) & (step > AT_ONCE * strong))
 
     def lost(self, before: Float) -> Bool:
         """(A, n) taxels whose magnet is gone, by the rest field ``before`` (A, 3, n) and now."""
         magnet = (before**2).sum(axis=1) > MAGNET_UT**2
-        return np.asarray(magnet & ((self._model.rest**2).sum(axis=1) < BARE_UT**2))
+        low = (self._model.rest**2).sum(axis=1) < BARE_UT**2
+        gone, self._gone = self._gone, np.zeros_like(self._gone)
+        return np.asarray(magnet & (low | gone))
 
     def covered(self) -> Bool:
         """(A, n) taxels whose rest field in force has a magnet's size."""
-        return np.asarray((self._model.rest**2).sum(axis=1) > MAGNET_UT**2)
+        return np.asarray((self._model.rest**2).sum(axis=1) > 4 * MAGNET_UT**2)
 
     def _leapt(self, estimate: Estimate) -> Reason | None:
         size = float(estimate.leap.max())
