@@ -22,7 +22,7 @@ Float = NDArray[np.float64]
 
 QUANTILE_95 = 1.96
 """Normal errors are within this many sigma in 95 % of cycles."""
-MEASURED_SCALE = 0.05
+MEASURED_SCALE = 0.06
 """Share of a force that a calibration of the very board leaves unknown (95 %): hysteresis of up to
 6 %, curvature of the dipole law of 7 % at twice the calibrated load."""
 NOMINAL_SCALE = 1.0

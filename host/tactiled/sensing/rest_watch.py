@@ -32,7 +32,7 @@ BARE_SHARE = 0.6
 LOST_AFTER_S = 0.3
 """s that a single chip must be bare: a press may carry its field through zero."""
 AT_ONCE = 0.6
-"""Share of its rest field by which a chip must change within `SCRAMBLE_S` to have lost its magnet."""
+"""Share of its rest field by which a chip must change within `SCRAMBLE_S`: its magnet is gone."""
 GONE_SHARE = 0.3
 """Share of its rest field that a chip without its magnet reads at most: its neighbours' magnets add
 a tenth."""
