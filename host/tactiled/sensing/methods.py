@@ -26,7 +26,8 @@ MIN_FREE = 0.5
 CONTACT_UT = 1.2
 """µT rms of a press's slight beginnings that may have been taken for the ambient field."""
 COVERED_UT = 7.0
-"""The same where every chip bears something while the field turns: nothing corrects it."""
+"""The same while the field turns and every chip bears something, or a contact just changes: which is
+which is not known at once."""
 UNKNOWN_UT = 60.0
 """µT rms a component, where the ambient field is not known at all: the earth's, turned."""
 LONGEST_GAP_S = 5.0
@@ -128,7 +129,7 @@ class SmallArrays:
             theta[a] = 0.0
             theta[a, :, 0] = said.field
             free = said.free[healthy[a, :n]]
-            blind = said.moving and not free.any()
+            blind = said.moving and (said.changing.any() or not free.any())
             taken = COVERED_UT if blind else 0.0 if free.all() else CONTACT_UT
             sigma[a] = np.hypot(said.sigma, taken)
             slope_sigma[a], leap[a] = 0.0, said.leap
