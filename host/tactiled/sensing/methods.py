@@ -26,8 +26,8 @@ MIN_FREE = 0.5
 CONTACT_UT = 1.2
 """µT rms of a press's slight beginnings that may have been taken for the ambient field."""
 COVERED_UT = 7.0
-"""The same while the field turns and every chip bears something, or a contact just changes: which is
-which is not known at once."""
+"""The same while the field turns and every chip bears something, or a contact just changes: which
+is which is not known at once."""
 UNKNOWN_UT = 60.0
 """µT rms a component, where the ambient field is not known at all: the earth's, turned."""
 LONGEST_GAP_S = 5.0
