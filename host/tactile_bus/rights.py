@@ -143,7 +143,7 @@ def may_ask(role: str, key: str) -> bool:
     """Whether a certificate of ``role`` entitles to ask the service at ``key``."""
     import zenoh
 
-    rights = RIGHTS.get(role)  # type: ignore[call-overload]
+    rights = RIGHTS.get(role)  # type: ignore[call-overload]  # a name of no role has no rights
     if rights is None:
         return False
     wanted = zenoh.KeyExpr(key)

@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -99,12 +99,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     remove.set_defaults(func=lambda options: _guarded(_uninstall, options))
 
 
-def _guarded(work: object, options: argparse.Namespace) -> int:
+def _guarded(work: Callable[[argparse.Namespace], object], options: argparse.Namespace) -> int:
     if not options.root.is_dir():
         print(f"tactile service: --root {options.root}: there is no such folder", file=sys.stderr)
         return 2
     try:
-        work(options)  # type: ignore[operator]
+        work(options)
     except ServiceProblem as problem:
         print(f"tactile service: {problem}", file=sys.stderr)
         return REFUSED

@@ -75,11 +75,6 @@ class FeatureExtractor:
         """The taxel of the peak force; the first where nothing is in contact."""
 
     @property
-    def smallest(self) -> Float:
-        """(N,) N, normal force from which a taxel is in contact."""
-        return self._on
-
-    @property
     def contact(self) -> Bool:
         """(N,) taxels in contact in the last cycle."""
         return self._contact

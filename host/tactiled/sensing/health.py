@@ -74,8 +74,7 @@ class HealthMonitor:
     After `update`: ``fault``: (A, n) uint8 of `Fault`. ``revived``: (A, n) bool, taxels that are
     well again in this cycle after they were gone for `REVIVED_S` or went to another level: what
     was their rest need not be. ``restored``: those that had gone to another level and now read
-    again what they did at rest. ``rescaled``: (A,) bool, arrays whose counts have come to have
-    another size, gain or resolution having been set anew; for the reader to clear.
+    again what they did at rest.
     """
 
     def __init__(
@@ -104,7 +103,6 @@ class HealthMonitor:
         self._same = np.zeros(shape[0], bool)
         self._clear = np.zeros(shape, np.uint8)
         self.revived = self.restored = self._never
-        self.rescaled: Bool = self._same.copy()
         self.fault: UInt8 = self._clear
         self.set_noise(np.array(NOISE_UT))
         self.reset()
@@ -146,7 +144,7 @@ class HealthMonitor:
     def told(self, array: int, scale: Scale) -> None:
         """The board says what a count of ``array`` is: µT of x and y, of z."""
         if self.scales.told(array, scale):
-            self._rescale(array)
+            self._jumps.forget_wraps(array)
 
     def update(
         self,
@@ -167,7 +165,7 @@ class HealthMonitor:
         scales, jumps, activity = self.scales, self._jumps, self._activity
         if scales.seeking:
             for array in scales.learn(raw):
-                self._rescale(array)
+                self._jumps.forget_wraps(array)
         whole = np.count_nonzero(present) == len(present)
         if not whole:
             raw[~present] = self._last[~present]
@@ -389,10 +387,6 @@ class HealthMonitor:
         if self._readings > REMEMBERED:
             self._readings /= 2
             self._repeated /= 2
-
-    def _rescale(self, array: int) -> None:
-        self.rescaled[array] = True
-        self._jumps.forget_wraps(array)
 
 
 def _mark(fault: UInt8, where: Bool, what: Fault) -> None:

@@ -450,8 +450,7 @@ class BoardPipeline:
             return features, np.full(len(force), np.nan)
         bounds, extractor = self._bounds, self._features
         taxels = bounds.taxels(estimate, self._drift)
-        least = extractor.smallest
-        unseen = float(least.max())
+        unseen = float(extractor.least_n.max())
         odd = bounds.implausible(force)
         peak = float(taxels[extractor.peak_taxel]) + odd
         normal = bounds.together(extractor.summed, estimate, self._drift) + odd
@@ -475,7 +474,7 @@ class BoardPipeline:
             normal_force_bound=normal + bounds.scaled(features.normal_force),
             tip_force_bound=tip + bounds.scaled(features.tip_force),
         )
-        normal_bound = taxels + np.array([bounds.scaled(1.0)]) * np.abs(force[:, 2])
+        normal_bound = taxels + bounds.scaled(1.0) * np.abs(force[:, 2])
         return features, normal_bound
 
     def _doubt(self, bound: float) -> Reason:
