@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 SOAK_MINUTES ?= 60
 KILLS ?= 1000
 
-.PHONY: setup test test-random lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage stress soak fuzz-pipeline kills clean
+.PHONY: setup test test-random lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage stress soak fuzz-pipeline kills docs pictures clean
 
 setup: $(STAMP)
 
@@ -59,7 +59,7 @@ gate-random: setup
 # Every branch of the safety gate is taken by its tests, or this fails.
 gate-coverage: setup
 	REACH_RANDOM_INPUTS=4000 $(BIN)/python -m coverage run --branch --source=host/reachd -m pytest -q tests/reach -k gate
-	$(BIN)/python -m coverage report -m --fail-under=100 --include='*/safety.py,*/limits.py,*/motion.py,*/finite.py'
+	$(BIN)/python -m coverage report -m --fail-under=100 --include='*/gate/*.py'
 
 # An hour of reaching while the machine is loaded and its memory churned.
 stress: setup
@@ -76,6 +76,16 @@ fuzz-pipeline: setup
 # A thousand kills of simulator, tactiled and reachd while they reach; two to three hours.
 kills: setup
 	$(BIN)/tactile crash --processes --kills $(KILLS) --json docs/results/kills.json
+
+# The documents as a site in build/site, offline.
+docs: setup
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(BIN)/mkdocs build --strict
+
+# Pages and pictures that are made from the code.
+pictures: setup
+	$(BIN)/python -m tactile_tools.dev.architecture docs/pictures
+	$(BIN)/python -m tactile_tools.dev.topics_page docs/topics.md
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -5,12 +5,24 @@ from __future__ import annotations
 import re
 from collections import deque
 
-from sensor_proto import cobs, packet
-from sensor_proto.decoder import ACCEPTED, Reject, Tally
-from sensor_proto.packets import Message, Received
-from sensor_proto.wire import decode_payload
+from sensor_proto import cobs
+from sensor_proto.packets import (
+    ACCEPTED,
+    HEADER_SIZE,
+    MAX_PACKET,
+    MAX_UNKNOWN,
+    Message,
+    Received,
+    Reject,
+    Tally,
+    decode_payload,
+    intact,
+    pack,
+    request_number,
+    shape_error,
+)
 
-MAX_FRAME = cobs.max_encoded(packet.MAX_PACKET)
+MAX_FRAME = cobs.max_encoded(MAX_PACKET)
 """Bytes of the longest frame without its zero: the most that is held of an unfinished one."""
 
 _RUN = re.compile(rb"[^\0]+")
@@ -30,7 +42,7 @@ _REASONS = (
 
 def encode_serial(message: Message) -> bytes:
     """Frame of ``message`` with the ending zero; ValueError for values that do not fit."""
-    return cobs.encode(packet.pack(message)) + b"\0"
+    return cobs.encode(pack(message)) + b"\0"
 
 
 class SerialDecoder:
@@ -40,7 +52,7 @@ class SerialDecoder:
         self._partial = b""
         self._discarding = False
         self._tally = Tally(_REASONS)
-        self._unknown: deque[tuple[int, int]] = deque(maxlen=packet.MAX_UNKNOWN)
+        self._unknown: deque[tuple[int, int]] = deque(maxlen=MAX_UNKNOWN)
 
     def take_unknown(self) -> list[tuple[int, int]]:
         """Type and request number of the whole messages skipped as unknown since the last call."""
@@ -105,7 +117,7 @@ class SerialDecoder:
         if raw is None:
             self._tally[Reject.COBS] += 1
             return
-        error = packet.shape_error(raw)
+        error = shape_error(raw)
         if error is not None:
             self._tally[error] += 1
             return
@@ -115,18 +127,18 @@ class SerialDecoder:
     def _read(self, packets: list[bytes], trailing: list[int]) -> list[Received]:
         tally = self._tally
         received = []
-        for raw, after, good in zip(packets, trailing, packet.intact(packets), strict=True):
+        for raw, after, good in zip(packets, trailing, intact(packets), strict=True):
             if not good:
                 tally[Reject.CRC] += 1
                 continue
             if raw[1]:
                 tally[Reject.BOARD] += 1
                 continue
-            message = decode_payload(raw[0], raw, packet.HEADER_SIZE, len(raw) - 4)
+            message = decode_payload(raw[0], raw, HEADER_SIZE, len(raw) - 4)
             if isinstance(message, Reject):
                 tally[message] += 1
                 if message is Reject.UNKNOWN_TYPE:
-                    self._unknown.append((raw[0], packet.request_number(raw)))
+                    self._unknown.append((raw[0], request_number(raw)))
                 continue
             received.append(Received(message, 0, after))
         tally[ACCEPTED] += len(received)

@@ -12,9 +12,8 @@ import re
 from collections import Counter, deque
 from enum import StrEnum
 
-from sensor_proto import can_errors
-from sensor_proto.can_errors import BusState
-from sensor_proto.canseg import CanFrame
+from sensor_proto import can_transfers
+from sensor_proto.can_transfers import BusState, CanFrame
 
 CR = b"\r"
 BEL = b"\a"
@@ -174,7 +173,7 @@ class SlcanDecoder:
             else:
                 self._counts[frame] += 1
         elif line[:1] == b"s" and len(line) == 8 and line[1] in _STATES:
-            frames.append(can_errors.state_frame(_STATES[line[1]]))
+            frames.append(can_transfers.state_frame(_STATES[line[1]]))
         elif line[:1] == b"e" and len(line) >= 3:
             frames.append(_error_of(line))
         elif _REPORT.fullmatch(line):
@@ -198,7 +197,7 @@ class SlcanDecoder:
         state = state_of_flags(answer)
         if flags is None or state is None:
             return []
-        frames = [can_errors.state_frame(state)]
+        frames = [can_transfers.state_frame(state)]
         errors = flags & ERROR_FLAGS
         if errors and errors != self._errors_told:
             frames.append(_errors_of_flags(errors))
@@ -229,18 +228,18 @@ def _report_of(line: bytes) -> list[CanFrame]:
     state, last, firmware = int(line[1:2], 16), int(line[2:3], 16), int(line[3:5], 16)
     frames = []
     if state < len(_REPORT_STATES):
-        frames.append(can_errors.state_frame(_REPORT_STATES[state]))
+        frames.append(can_transfers.state_frame(_REPORT_STATES[state]))
     error_class = controller = protocol = 0
     if last == 3:
-        error_class |= can_errors.NO_ACK
+        error_class |= can_transfers.NO_ACK
     elif 0 < last < len(_REPORT_PROTOCOL):
-        error_class |= can_errors.PROTOCOL | can_errors.BUS_ERROR
+        error_class |= can_transfers.PROTOCOL | can_transfers.BUS_ERROR
         protocol = _REPORT_PROTOCOL[last]
     if firmware & 0x0C:
-        error_class |= can_errors.CONTROLLER
+        error_class |= can_transfers.CONTROLLER
         controller = (0x02 if firmware & 0x04 else 0) | (0x01 if firmware & 0x08 else 0)
     if error_class:
-        frames.append(can_errors.error_frame(error_class, controller, protocol))
+        frames.append(can_transfers.error_frame(error_class, controller, protocol))
     return frames
 
 
@@ -250,14 +249,14 @@ def _error_of(line: bytes) -> CanFrame:
     error_class = controller = protocol = 0
     for letter in line[2:].decode("ascii", "replace"):
         if letter == "a":
-            error_class |= can_errors.NO_ACK
+            error_class |= can_transfers.NO_ACK
         elif letter in "oO":
-            error_class |= can_errors.CONTROLLER
+            error_class |= can_transfers.CONTROLLER
             controller |= 0x01 if letter == "o" else 0x02
         else:
-            error_class |= can_errors.PROTOCOL | can_errors.BUS_ERROR
+            error_class |= can_transfers.PROTOCOL | can_transfers.BUS_ERROR
             protocol |= {"f": 0x02, "s": 0x04, "b": 0x08, "B": 0x10}.get(letter, 0)
-    return can_errors.error_frame(error_class, controller, protocol)
+    return can_transfers.error_frame(error_class, controller, protocol)
 
 
 FLAG_RX_FULL = 0x01
@@ -304,9 +303,9 @@ def _errors_of_flags(errors: int) -> CanFrame:
     if errors & FLAG_TX_FULL:
         controller |= 0x02
     if controller:
-        error_class |= can_errors.CONTROLLER
+        error_class |= can_transfers.CONTROLLER
     if errors & FLAG_ARBITRATION:
-        error_class |= can_errors.LOST_ARBITRATION
+        error_class |= can_transfers.LOST_ARBITRATION
     if errors & FLAG_BUS_ERROR:
-        error_class |= can_errors.BUS_ERROR
-    return can_errors.error_frame(error_class, controller)
+        error_class |= can_transfers.BUS_ERROR
+    return can_transfers.error_frame(error_class, controller)

@@ -9,11 +9,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sensor_proto.anyskin_search import MAX_MAGNETOMETERS
-from sim_device.formats import SKETCHES
-from sim_device.slcan import DIALECTS
+from sensor_proto.anyskin import MAX_MAGNETOMETERS
+from sim_device.board.anyskin import SKETCHES
+from sim_device.board.slcan_adapter import DIALECTS
 from sim_device.world.engines import ENGINES
-from tactile_bus.arguments import Parser
+from tactile_core.arguments import Parser
 
 if TYPE_CHECKING:
     Commands = argparse._SubParsersAction[argparse.ArgumentParser]
@@ -146,7 +146,7 @@ def _add_boards(commands: Commands) -> argparse.ArgumentParser:
 
 
 def _add_cupboard(commands: Commands) -> argparse.ArgumentParser:
-    from tactile_bus.options import add_bus
+    from tactile_core.options import add_bus
 
     cupboard = commands.add_parser(
         "cupboard",
@@ -320,7 +320,7 @@ def _parse_whole(text: str, high: float = 2**32) -> int:
 
 
 def _parse_bus(text: str) -> object:
-    from tactile_bus.can_bus import CanSpec
+    from tactile_core.can_bus import CanSpec
 
     spec = CanSpec.parse(text)
     if spec.interface == "slcan":
@@ -329,20 +329,20 @@ def _parse_bus(text: str) -> object:
 
 
 def _parse_rotation(text: str) -> str:
-    from sim_device.environment import parse_rotation
+    from sim_device.skin.environment import parse_rotation
 
     parse_rotation(text)
     return text
 
 
 def _parse_window(text: str) -> object:
-    from sim_device.stations import parse_window
+    from sim_device.ports_plan import parse_window
 
     return parse_window(text)
 
 
 def _parse_serial(text: str) -> bytes:
-    from sim_device.stations import parse_serial
+    from sim_device.ports_plan import parse_serial
 
     return parse_serial(text)
 

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from sim_device.arguments import Handler, make_parser
-from tactile_bus.ending import leave
+from tactile_core.ending import leave
 
 if TYPE_CHECKING:
-    from sim_device.cupboard_plan import CupboardRequest
+    from sim_device.arm.cupboard_plan import CupboardRequest
+    from sim_device.ports_plan import BoardsRequest, Planned
     from sim_device.runner import Runner
-    from sim_device.stations import BoardsRequest, Planned
 
 OK, BAD_ARGUMENT, REFUSED = 0, 2, 3
 
@@ -70,7 +70,7 @@ def _version(_: argparse.Namespace) -> int:
 
 
 def _boards(arguments: argparse.Namespace) -> int:
-    from sim_device.stations import plan_boards
+    from sim_device.ports_plan import plan_boards
 
     try:
         planned = plan_boards(_request(arguments))
@@ -80,7 +80,7 @@ def _boards(arguments: argparse.Namespace) -> int:
 
 
 def _request(arguments: argparse.Namespace) -> BoardsRequest:
-    from sim_device.stations import BoardsRequest
+    from sim_device.ports_plan import BoardsRequest
 
     return BoardsRequest(
         ptys=tuple(arguments.pty),
@@ -106,7 +106,7 @@ def _request(arguments: argparse.Namespace) -> BoardsRequest:
 
 
 def _cupboard(arguments: argparse.Namespace) -> int:
-    from sim_device.cupboard_plan import goal_text, plan_cupboard, scene_of
+    from sim_device.arm.cupboard_plan import goal_text, plan_cupboard, scene_of
     from sim_device.world.base import WorldError
     from sim_device.world.engines import EngineMissing
 
@@ -129,10 +129,10 @@ def _cupboard(arguments: argparse.Namespace) -> int:
 
 
 def _cupboard_request(arguments: argparse.Namespace) -> CupboardRequest:
-    from sim_device.arm_options import arm_settings, parse_arm_faults
-    from sim_device.cupboard_plan import CupboardRequest
-    from sim_device.stations import BoardsRequest
-    from tactile_bus.options import BusTable, bus_config
+    from sim_device.arm.cupboard_plan import CupboardRequest
+    from sim_device.arm.server import arm_settings, parse_arm_faults
+    from sim_device.ports_plan import BoardsRequest
+    from tactile_core.options import BusTable, bus_config
 
     return CupboardRequest(
         scene=arguments.scene,
@@ -155,11 +155,11 @@ def _cupboard_request(arguments: argparse.Namespace) -> CupboardRequest:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
+    from sim_device.board.recorded import RecordingError, ReplayBoard, load
     from sim_device.faults import FaultPlan
     from sim_device.ports import PtyPort
-    from sim_device.replay import RecordingError, ReplayBoard, load
+    from sim_device.ports_plan import Planned
     from sim_device.runner import ReplayStation
-    from sim_device.stations import Planned
 
     try:
         recording = load(arguments.recording)
@@ -188,8 +188,8 @@ def _replay(arguments: argparse.Namespace) -> int:
 def _calibration(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
-    from sim_device.catalogue import factory_calibration, identity
-    from tactile_bus.calibration import CalibrationError, load, save
+    from sim_device.board.catalogue import factory_calibration, identity
+    from tactile_core.calibration import CalibrationError, load, save
 
     if len(arguments.serial) > 1:
         raise _Refusal(BAD_ARGUMENT, "more than one --serial given; a calibration is of one board")
@@ -247,8 +247,8 @@ def _serve(planned: Sequence[Planned], duration: float | None) -> int:
 
 def _open(runner: Runner) -> None:
     from sim_device.ports import LinkRefused
-    from tactile_bus.can_bus import CanUnavailable, Trouble
-    from tactile_bus.session import BusError
+    from tactile_core.bus.session import BusError
+    from tactile_core.can_bus import CanUnavailable, Trouble
 
     try:
         runner.open()

@@ -18,13 +18,12 @@ from collections import Counter, deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sensor_proto import can_errors
-from sensor_proto.can_errors import BusState
-from sensor_proto.canseg import CanFrame
-from sim_device.bus_timing import TimedBus
-from sim_device.slcan import SlcanAdapter
-from tactile_bus.can_bus import DEFAULT_BITRATE, CanSpec, from_message, open_bus, to_message
-from tactile_bus.instant import Instant
+from sensor_proto import can_transfers
+from sensor_proto.can_transfers import BusState, CanFrame
+from sim_device.board.slcan_adapter import SlcanAdapter
+from sim_device.board.wire import TimedBus
+from tactile_core.can_bus import DEFAULT_BITRATE, CanSpec, from_message, open_bus, to_message
+from tactile_core.types import Instant
 
 if TYPE_CHECKING:
     import can
@@ -172,7 +171,7 @@ class SlcanPort:
     """A simulated USB-CAN adapter on a pseudo-terminal, with a bus behind it.
 
     Frames take their time on the bus, and the lowest identifier goes first. ``fd``: the adapter
-    takes CAN FD. ``dialect``: of its firmware, see `sim_device.slcan.DIALECTS`.
+    takes CAN FD. ``dialect``: of its firmware, see `sim_device.board.slcan_adapter.DIALECTS`.
     """
 
     def __init__(self, link: str | Path, fd: bool = True, dialect: str = "lawicel") -> None:
@@ -236,7 +235,7 @@ class SlcanPort:
         self._answer()
 
     def _suffer(self, frame: CanFrame) -> None:
-        state = can_errors.told_state(frame)
+        state = can_transfers.told_state(frame)
         if state is not None:
             self.adapter.set_bus_off(state is BusState.BUS_OFF)
 
@@ -272,7 +271,7 @@ class PythonCanPort:
         return self._bus.fileno()
 
     def open(self) -> None:
-        """Open; raises `tactile_bus.can_bus.CanUnavailable`."""
+        """Open; raises `tactile_core.can_bus.CanUnavailable`."""
         self._bus = open_bus(self.spec)
 
     def close(self) -> None:

@@ -7,11 +7,11 @@ import select
 from collections.abc import Callable, Sequence
 from typing import Generic, Protocol, TypeVar
 
-from sensor_proto.canseg import CanFrame
+from sensor_proto.can_transfers import CanFrame
+from sim_device.board.recorded import ReplayBoard
 from sim_device.faults import Window
 from sim_device.ports import PtyPort, PythonCanPort, SlcanPort
-from sim_device.replay import ReplayBoard
-from tactile_bus.instant import Instant, after, monotonic_now, seconds_between
+from tactile_core.types import Instant, after, monotonic_now, seconds_between
 
 TICK = 0.001
 """s between two looks at every board, the period of a USB frame: no sample waits longer."""
@@ -37,7 +37,7 @@ Payload = TypeVar("Payload", bytes, tuple[CanFrame, ...])
 
 
 class Board(Protocol[Payload]):
-    """A simulated board; see `sim_device.firmware`."""
+    """A simulated board; see `sim_device.board.firmware`."""
 
     @property
     def counters(self) -> dict[str, int]:

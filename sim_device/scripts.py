@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NoReturn
 
-from tactile_bus.toml_text import TomlError, parse, printable, read_text
+from tactile_core.toml_text import TomlError, parse, printable, read_text
 
 MAX_SCRIPT = 1 << 20
 """Bytes of a script: real ones have a few kB."""

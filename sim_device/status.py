@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TextIO
 
-from sim_device.stations import Planned
+from sim_device.ports_plan import Planned
 
 
 class StatusLine:

@@ -12,7 +12,7 @@ from hypothesis import settings
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from tactile_bus.messages import codec
+from tactile_core.bus.messages import codec
 
 # A red `make test` must be red again when it is looked into. `make test-random` draws new examples
 # and prints how to get a failing one again.

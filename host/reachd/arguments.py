@@ -7,11 +7,11 @@ from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
-from reachd.parameters import SETS
 from reachd.settings import DEFAULT_SET, DEFAULT_STRATEGY, DEFAULT_WAIT
-from reachd.strategies.registry import BUILT_IN
-from tactile_bus.arguments import Parser
-from tactile_bus.options import add_log_and_bus, finite_above_zero
+from reachd.strategies.parameters import SETS
+from reachd.strategies.runner import BUILT_IN
+from tactile_core.arguments import Parser
+from tactile_core.options import add_log_and_bus, finite_above_zero
 
 EPILOG = """\
 examples:

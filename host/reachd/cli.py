@@ -15,14 +15,14 @@ from rich.console import Console
 
 from reachd.arguments import make_parser
 from reachd.daemon import Daemon, StartError
-from reachd.outcome import Outcome
-from reachd.report import show
-from reachd.seam import Strategy
+from reachd.interfaces import Strategy
+from reachd.publish import show
 from reachd.settings import Settings, SettingsError, make_settings
 from reachd.status import StatusLine
 from reachd.strategies import StrategyError, load_strategy
-from tactile_bus.ending import leave
-from tactile_bus.terminal import set_up_logging
+from reachd.trial import Outcome
+from tactile_core.ending import leave
+from tactile_core.terminal import set_up_logging
 
 log = logging.getLogger(__name__)
 

@@ -23,30 +23,24 @@ from typing import Any
 import zenoh
 
 from reachd.arms import Arm, ArmError, BusArm
-from reachd.cycle import Controller, Cycle, Inputs
-from reachd.listen import Listener
+from reachd.control import Controller, ControlLoop, Cycle, Inputs, ask_real_time
+from reachd.gate.gate import SafetyGate
+from reachd.gate.settings import Check, SafetySettings
+from reachd.inputs import TouchInput
+from reachd.interfaces import Goal, Strategy
 from reachd.lock import ArmLock, LockError
-from reachd.loop import ControlLoop, ask_real_time
-from reachd.operator_requests import OperatorRequests, RefusedError
-from reachd.outcome import Outcome
-from reachd.publish import Reporter
-from reachd.report import as_json
-from reachd.safety import SafetyGate
-from reachd.safety_settings import Check, SafetySettings
-from reachd.seam import Goal, Strategy
-from reachd.services import ReachServices
+from reachd.publish import Listener, Reporter, as_json
+from reachd.services import OperatorRequests, ReachServices, RefusedError
 from reachd.settings import Settings
-from reachd.supervisor import State, Supervisor
-from reachd.touch_input import TouchInput
-from tactile_bus.arm_types import Echo
-from tactile_bus.disk_watch import DiskWatch
-from tactile_bus.instant import Instant, WallClock, monotonic_now, seconds_between
-from tactile_bus.messages import codec
-from tactile_bus.recorder import Recorder, RecorderError
-from tactile_bus.session import BusError, close_session, open_session
-from tactile_bus.streams import list_alive
-from tactile_bus.supervision import Watchdog
-from tactile_bus.topics import ARM_STATE, FEATURES, alive_key, commander_key, service_key
+from reachd.trial import Outcome, State, Supervisor
+from tactile_core.bus.messages import codec
+from tactile_core.bus.session import BusError, close_session, open_session
+from tactile_core.bus.streams import list_alive
+from tactile_core.bus.topics import ARM_STATE, FEATURES, alive_key, commander_key, service_key
+from tactile_core.log.recorder import Recorder, RecorderError
+from tactile_core.log.retention import DiskWatch
+from tactile_core.supervision import Watchdog
+from tactile_core.types import Echo, Instant, WallClock, monotonic_now, seconds_between
 
 log = logging.getLogger(__name__)
 

@@ -5,6 +5,7 @@ A thread of its own does it, so that the control loop only ever drops a value in
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import queue
@@ -15,19 +16,181 @@ from dataclasses import dataclass
 from typing import Any
 
 import zenoh
+from rich.console import Console
+from rich.table import Table
 
-from reachd.cycle import Cycle
-from reachd.outcome import Outcome
-from reachd.seam import Twist
-from reachd.supervisor import State
-from tactile_bus.commanding import FRAME
-from tactile_bus.instant import Instant, WallClock, monotonic_now
-from tactile_bus.messages import MSG, codec, header
-from tactile_bus.recorder import Recorder
-from tactile_bus.streams import declare_publisher
-from tactile_bus.throttle import Throttle
-from tactile_bus.toml_text import printable
-from tactile_bus.topics import COMMAND, REACH_EVENT, REACH_STATE, Topic
+from reachd.control import Cycle
+from reachd.interfaces import Goal, Twist
+from reachd.trial import Outcome, State
+from tactile_core.bus.commanding import FRAME
+from tactile_core.bus.messages import MSG, codec, header
+from tactile_core.bus.streams import BusSample, Tap, declare_publisher
+from tactile_core.bus.topics import (
+    ARM_STATE,
+    COMMAND,
+    NAME,
+    REACH_EVENT,
+    REACH_STATE,
+    TF,
+    WORLD,
+    Topic,
+    find_topic,
+    service_key,
+)
+from tactile_core.log.recorder import Recorder
+from tactile_core.throttle import Throttle
+from tactile_core.toml_text import printable
+from tactile_core.types import Instant, WallClock, monotonic_now
+
+# Everything that is said on the bus about a trial, into the log as it came.
+
+
+MAX_NAMES = 16
+"""Names of streams that are logged: a board's, an arm's and a world's, and some to spare; so that
+a publisher that makes up names cannot fill the log with channels."""
+
+ANSWER = 5.0
+"""s for which an answer of the board may come."""
+
+
+class Listener:
+    """Logs all streams of ``board``, the state of ``arm``, frames, and every world's objects.
+
+    ``refused``: samples of topics or names that are not logged.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, recorder: Recorder, wall: WallClock, board: str, arm: str
+    ) -> None:
+        self.refused = 0
+        self._session = session
+        self._geometry = service_key(board, "geometry")
+        self._asked = False
+        self._recorder = recorder
+        self._wall = wall
+        self._names: set[str] = set()
+        keys = (
+            f"tactile/{board}/*",
+            ARM_STATE.key(arm),
+            TF.template,
+            WORLD.template.format(name="*"),
+        )
+        self._taps = [Tap(session, key, self._take) for key in keys]
+
+    def ask_geometry(self) -> None:
+        """Have the board's geometry published once more, for it was before this began to listen.
+
+        To be called when features come, so that the board can be asked. Nobody waits for the
+        answer; a second call does nothing.
+        """
+        if not self._asked:
+            self._asked = True
+            self._session.get(self._geometry, lambda _: None, timeout=ANSWER)
+
+    def close(self) -> None:
+        """Stop listening."""
+        for tap in self._taps:
+            tap.close()
+
+    def _take(self, sample: BusSample) -> None:
+        found = find_topic(sample.key)
+        if found is None or not self._known(found[1]):
+            self.refused += 1
+            return
+        topic, name = found
+        now_ns = self._wall.wall_ns(monotonic_now())
+        stamp_ns = now_ns if sample.wall_ns is None else sample.wall_ns
+        self._recorder.write(topic, name, sample.data, now_ns, stamp_ns)
+
+    def _known(self, name: str) -> bool:
+        if name in self._names:
+            return True
+        if len(self._names) >= MAX_NAMES or not NAME.fullmatch(name):
+            return False
+        self._names.add(name)
+        return True
+
+
+# The outcome of a reach, for people and for programs.
+
+
+DIRECTIONS = ("ccw", "cw")
+
+
+def as_json(outcome: Outcome, goal: Goal, about: dict[str, Any]) -> str:
+    """One JSON object: ``about`` (strategy, set, seed), goal and outcome. m, s, N."""
+    values = about | {
+        "goal": {"x": goal.x, "y": goal.y, "radius": goal.radius, "time_limit": goal.time_limit},
+        "success": outcome.success,
+        "reason": str(outcome.reason),
+        "text": outcome.text,
+        "distance": _finite(outcome.distance),
+        "closest": _finite(outcome.closest),
+        "time": outcome.time,
+        "peak_force": outcome.peak_force,
+        "peak_load": outcome.peak_load,
+        "excavations": [
+            {"direction": e.direction, "trigger": e.trigger, "at": e.at}
+            for e in outcome.excavations
+        ],
+        "interventions": outcome.interventions,
+    }
+    return json.dumps(values)
+
+
+def excavations(outcome: Outcome) -> str:
+    """Excavations by direction and trigger."""
+    count = len(outcome.excavations)
+    if not count:
+        return "none"
+    directions = [f"{outcome.count(direction=d)} {d}" for d in DIRECTIONS]
+    names = dict.fromkeys(e.trigger for e in outcome.excavations)
+    triggers = [f"{outcome.count(trigger=t)} by {t}" for t in names]
+    return f"{count} ({', '.join(directions)}; {', '.join(triggers)})"
+
+
+def interventions(outcome: Outcome) -> str:
+    """Interventions by code, the most frequent first."""
+    ordered = sorted(outcome.interventions.items(), key=lambda item: -item[1])
+    return ", ".join(f"{code} {n}" for code, n in ordered) or "none"
+
+
+def last_line(outcome: Outcome) -> str:
+    """All that matters, in one line."""
+    word = "REACHED" if outcome.success else f"NOT REACHED ({outcome.reason})"
+    return (
+        f"{word}: {_mm(outcome.distance)} from the target, {outcome.time:.2f} s, peak force "
+        f"{outcome.peak_force:.1f} N, excavations {excavations(outcome)}, interventions "
+        f"{interventions(outcome)}"
+    )
+
+
+def show(console: Console, outcome: Outcome, goal: Goal, about: dict[str, Any]) -> None:
+    """Print the table and the last line."""
+    table = Table(show_header=False, box=None, padding=(0, 2), title_justify="left")
+    table.add_row("strategy", f"{about['strategy']}, set {about['set']}, seed {about['seed']}")
+    table.add_row("target", f"{goal.x:g}, {goal.y:g} m, radius {_mm(goal.radius)}")
+    table.add_row("ended", outcome.text or str(outcome.reason))
+    table.add_row("distance", f"{_mm(outcome.distance)}, closest {_mm(outcome.closest)}")
+    table.add_row("time", f"{outcome.time:.2f} s of {goal.time_limit:g}")
+    table.add_row(
+        "peak force", f"{outcome.peak_force:.1f} N at a taxel, {outcome.peak_load:.1f} N at the arm"
+    )
+    if about.get("note"):
+        table.add_row("", about["note"])
+    table.add_row("excavations", excavations(outcome))
+    table.add_row("interventions", interventions(outcome))
+    console.print(table, highlight=False, markup=False)
+    console.print(last_line(outcome), highlight=False, markup=False, soft_wrap=True)
+
+
+def _mm(metres: float) -> str:
+    return f"{metres * 1e3:.1f} mm" if math.isfinite(metres) else "unknown distance"
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
 
 log = logging.getLogger(__name__)
 

@@ -18,17 +18,17 @@ import msgspec
 from msgspec import Meta
 
 from reachd.fields import SettingError
-from reachd.goals import make_goal, parse_target
-from reachd.homing import Pose
-from reachd.parameter_fields import Parameters
-from reachd.parameters import SETS, parameters
-from reachd.seam import Goal
-from tactile_bus.config import ConfigError, Duration, Positive, load_toml
-from tactile_bus.options import BusTable, LogTable, bus_config, log_destination
-from tactile_bus.recorder import RecorderSettings
-from tactile_bus.session import BusConfig
-from tactile_bus.toml_lines import key_lines
-from tactile_bus.topics import NAME
+from reachd.interfaces import Goal
+from reachd.services import make_goal, parse_target
+from reachd.strategies.parameter_fields import Parameters
+from reachd.strategies.parameters import SETS, parameters
+from reachd.trial import Pose
+from tactile_core.bus.session import BusConfig
+from tactile_core.bus.topics import NAME
+from tactile_core.config import ConfigError, Duration, Positive, load_toml
+from tactile_core.log.recorder import RecorderSettings
+from tactile_core.options import BusTable, LogTable, bus_config, log_destination
+from tactile_core.toml_lines import key_lines
 
 DEFAULT_STRATEGY = "hybrid_event"
 """The paper's best."""

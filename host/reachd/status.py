@@ -9,10 +9,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from reachd.cycle import Cycle
-from reachd.loop import ControlLoop
-from tactile_bus.recorder import Recorder
-from tactile_bus.terminal import LiveLines
+from reachd.control import ControlLoop, Cycle
+from tactile_core.log.recorder import Recorder
+from tactile_core.terminal import LiveLines
 
 
 class StatusLine(LiveLines):

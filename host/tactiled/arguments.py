@@ -9,10 +9,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tactile_bus.arguments import Parser
-from tactile_bus.options import add_log_and_bus, finite_above_zero
-from tactiled.links.line import KINDS, board_kind
-from tactiled.sensing.pipeline_settings import METHODS
+from tactile_core.arguments import Parser
+from tactile_core.options import add_log_and_bus, finite_above_zero
+from tactiled.boards.line import KINDS, board_kind
+from tactiled.sensing.settings import METHODS
 from tactiled.settings import DEFAULT_BAUD, array_sizes
 
 EPILOG = """\

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sensor_proto.canseg import CanFrame
-from tactile_bus.geometry import Side
-from tactile_bus.instant import Instant
+from sensor_proto.can_transfers import CanFrame
+from tactile_core.geometry import Side
+from tactile_core.types import Instant
 
 Float = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ class Chunk:
 
 
 class TaxelHealth(IntFlag):
-    """Why a taxel is not to be trusted; the low bits are those of `sensor_proto.TaxelStatus`."""
+    """Why a taxel is not to be trusted; the low bits are `sensor_proto.packets.TaxelStatus`."""
 
     OK = 0
     SATURATED = 1

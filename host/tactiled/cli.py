@@ -12,9 +12,9 @@ from types import FrameType
 
 from rich.console import Console
 
-from tactile_bus.ending import leave
-from tactile_bus.instant import monotonic_now, seconds_between
-from tactile_bus.terminal import set_up_logging
+from tactile_core.ending import leave
+from tactile_core.terminal import set_up_logging
+from tactile_core.types import monotonic_now, seconds_between
 from tactiled.arguments import make_parser
 from tactiled.daemon import Daemon, StartError
 from tactiled.settings import Settings, SettingsError, make_settings

@@ -19,33 +19,31 @@ from typing import Any
 
 import zenoh
 
-from tactile_bus.calibration import CalibrationError
-from tactile_bus.instant import Instant, WallClock, after, monotonic_now, seconds_between
-from tactile_bus.recorder import Recorder, RecorderError
-from tactile_bus.services import ServiceError
-from tactile_bus.session import BusError, close_session, open_session
-from tactile_bus.streams import declare_alive
-from tactile_bus.supervision import Watchdog
-from tactile_bus.topics import DIAGNOSTICS, alive_key
+from tactile_core.bus.services import ServiceError
+from tactile_core.bus.session import BusError, close_session, open_session
+from tactile_core.bus.streams import declare_alive
+from tactile_core.bus.topics import DIAGNOSTICS, alive_key
+from tactile_core.calibration import CalibrationError
+from tactile_core.log.recorder import Recorder, RecorderError
+from tactile_core.supervision import Watchdog
+from tactile_core.types import Instant, WallClock, after, monotonic_now, seconds_between
 from tactiled import diagnostics
-from tactiled.alarms import Alarms
-from tactiled.inbox import MAX_AGE, Inbox, Wake
-from tactiled.links.events import Identity, Refusal
-from tactiled.links.line import SerialLine
-from tactiled.links.lines import bus_names, make_line
+from tactiled.board_session import Station
+from tactiled.boards.events import Identity, Refusal
+from tactiled.boards.line import SerialLine, bus_names, make_line
+from tactiled.calibration_store import Shelf
+from tactiled.diagnostics import Alarms
+from tactiled.journal import Journal
 from tactiled.memory import Collector, return_large_buffers
-from tactiled.outlet import Outlet
 from tactiled.port import Port, Trouble
-from tactiled.reader import PortReader
-from tactiled.replay.journal import Journal
-from tactiled.replay.recorded import PORT_PREFIX, RecordedError, describe, recorded_port
+from tactiled.publisher import Outlet
+from tactiled.reader import MAX_AGE, Inbox, PortReader, Wake
+from tactiled.rerun import PORT_PREFIX, RecordedError, describe, recorded_port
 from tactiled.services import BoardServices
 from tactiled.settings import REPLAY_PREFIX, PortSettings, Settings
-from tactiled.shelf import Shelf
-from tactiled.station import Station
 from tactiled.transports import Transport, TransportError
 from tactiled.transports.can_bus import CanTransport
-from tactiled.transports.mcap_file import McapTransport
+from tactiled.transports.recorded_log import McapTransport
 from tactiled.transports.serial_port import SerialTransport
 
 log = logging.getLogger(__name__)

@@ -7,16 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from tactile_bus.instant import Instant, monotonic_now
-from tactile_bus.throttle import Throttle
+from tactile_core.throttle import Throttle
+from tactile_core.types import Instant, monotonic_now
+from tactiled import journal as kinds
 from tactiled.blocks import Chunk
-from tactiled.inbox import Inbox, Item, PortLost, PortOpened
-from tactiled.links.events import Diagnosed, Event, Found, Identity, Refusal, Waiting
-from tactiled.links.line import Line, LineEvent
-from tactiled.links.link import BoardLink
-from tactiled.replay import journal as kinds
-from tactiled.replay.journal import Journal
-from tactiled.station import Station
+from tactiled.board_session import Station
+from tactiled.boards.board import BoardLink
+from tactiled.boards.events import Diagnosed, Event, Found, Identity, Refusal, Waiting
+from tactiled.boards.line import Line, LineEvent
+from tactiled.journal import Journal
+from tactiled.reader import Inbox, Item, PortLost, PortOpened
 from tactiled.transports.base import Transport
 
 log = logging.getLogger(__name__)

@@ -16,17 +16,17 @@ import msgspec
 import zenoh
 
 from sensor_proto.packets import AckResult, SetRate
-from tactile_bus.calibration import CalibrationError
-from tactile_bus.instant import monotonic_now
-from tactile_bus.services import Service, ServiceError, declare_service
-from tactile_bus.topics import service_key
+from tactile_core.bus.services import Service, ServiceError, declare_service
+from tactile_core.bus.topics import service_key
+from tactile_core.calibration import CalibrationError
+from tactile_core.types import monotonic_now
+from tactiled import journal
+from tactiled.board_session import Station
+from tactiled.boards.board import BoardLink
+from tactiled.boards.events import Answered, Event
+from tactiled.calibration_store import Shelf
 from tactiled.diagnostics import log_summary, summary
-from tactiled.links.events import Answered, Event
-from tactiled.links.link import BoardLink
 from tactiled.port import Port
-from tactiled.replay import journal
-from tactiled.shelf import Shelf
-from tactiled.station import Station
 
 PIPELINE_TIMEOUT = 1.0
 """s the pipeline's thread may take to look at a request: it does so every 10 ms."""

@@ -15,19 +15,19 @@ from typing import Annotated, Literal, TypeVar
 import msgspec
 from msgspec import Meta
 
-from sensor_proto.layout import Kind
-from tactile_bus.calibration import CalibrationError, load
-from tactile_bus.can_bus import CanSpec
-from tactile_bus.config import ConfigError, Count, Duration, Positive, Rate, load_toml
-from tactile_bus.nominal import MAX_ANYSKIN_MAGNETOMETERS
-from tactile_bus.options import BusTable, LogTable, bus_config, log_destination
-from tactile_bus.recorder import RecorderSettings
-from tactile_bus.session import BusConfig
-from tactile_bus.topics import NAME
-from tactiled.links.line import KINDS, board_kind
-from tactiled.sensing.pipeline_settings import PipelineSettings
+from sensor_proto.layouts import Kind
+from tactile_core.bus.session import BusConfig
+from tactile_core.bus.topics import NAME
+from tactile_core.calibration import CalibrationError, load
+from tactile_core.calibration.nominal import MAX_ANYSKIN_MAGNETOMETERS
+from tactile_core.can_bus import CanSpec
+from tactile_core.config import ConfigError, Count, Duration, Positive, Rate, load_toml
+from tactile_core.log.recorder import RecorderSettings
+from tactile_core.options import BusTable, LogTable, bus_config, log_destination
+from tactiled.boards.line import KINDS, board_kind
+from tactiled.sensing.settings import PipelineSettings
 from tactiled.transports import listing
-from tactiled.transports.slcan_link import slcan_commands
+from tactiled.transports.slcan import slcan_commands
 
 DEFAULT_BAUD = 115_200
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bus.geometry import SkinGeometry
-from tactile_bus.instant import NS_PER_S, Instant
-from tactile_bus.markers import ARROW, SPHERE, SPHERE_LIST, TEXT, Colour, Triple, marker, wipe
-from tactile_bus.messages import MSG
-from tactile_bus.topics import CONTACTS
+from tactile_core.bus.markers import ARROW, SPHERE, SPHERE_LIST, TEXT, Colour, Triple, marker, wipe
+from tactile_core.bus.messages import MSG
+from tactile_core.bus.topics import CONTACTS
+from tactile_core.geometry import SkinGeometry
+from tactile_core.types import NS_PER_S, Instant
 from tactiled.blocks import Cycle
-from tactiled.outgoing import strongest
+from tactiled.publisher import strongest
 
 TAXELS, CONTACT, FORCE, LABEL = "taxels", "contacts", "forces", "labels"
 """Namespaces of the markers; the number of a contact is that of its patch."""

@@ -13,13 +13,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from tactile_bus.geometry import Side
-from tactile_bus.instant import Instant, monotonic_now, seconds_between
-from tactile_bus.recorder import Recorder
-from tactile_bus.terminal import LiveLines
+from tactile_core.geometry import Side
+from tactile_core.log.recorder import Recorder
+from tactile_core.terminal import LiveLines
+from tactile_core.types import Instant, monotonic_now, seconds_between
 from tactiled.blocks import Features
+from tactiled.board_session import Station
 from tactiled.port import Port
-from tactiled.station import Station
 
 REFRESH = 0.2
 """s between refreshes of the live lines."""

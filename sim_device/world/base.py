@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_device.world.scenes import Scene
-from tactile_bus.arm_types import Twist
-from tactile_bus.records import record
+from tactile_core.types import Twist, record
 
 Float = NDArray[np.float64]
 

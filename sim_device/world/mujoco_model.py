@@ -20,7 +20,7 @@ import numpy as np
 from sim_device.world.base import PHYSICS_STEP
 from sim_device.world.parameters import WorldParameters
 from sim_device.world.scenes import Scene, SceneObject, Shape
-from tactile_bus.geometry import FINGER_HEIGHT
+from tactile_core.geometry import FINGER_HEIGHT
 
 GRAVITY: Final = 9.81
 """m/s²."""

@@ -24,9 +24,9 @@ from sim_device.world.base import (
 )
 from sim_device.world.mujoco_model import FINGER_GEOM, MOTOR_TIME, cupboard_model, yaw_inertia
 from sim_device.world.parameters import WorldParameters, world_parameters
-from sim_device.world.plates import settled
+from sim_device.world.scene_squeeze import settled
 from sim_device.world.scenes import Scene
-from tactile_bus.arm_types import Twist
+from tactile_core.types import Twist
 
 _FALLEN = -0.02
 """m below the shelf at which an object counts as fallen; contacts give way by less than 1 mm."""

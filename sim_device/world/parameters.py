@@ -32,8 +32,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
 
-from tactile_bus.arm_types import ARM_LIMITS, ArmLimits
-from tactile_bus.geometry import FINGER_OUTLINE
+from tactile_core.geometry import FINGER_OUTLINE
+from tactile_core.types import ARM_LIMITS, ArmLimits
 
 FINGER_WIDTH: Final = max(y for _, y in FINGER_OUTLINE) - min(y for _, y in FINGER_OUTLINE)
 """m, of the finger as built."""

@@ -27,8 +27,8 @@ from sim_device.world.base import (
 from sim_device.world.mujoco_model import GRAVITY, yaw_inertia
 from sim_device.world.parameters import WorldParameters, world_parameters
 from sim_device.world.scenes import Scene, SceneObject, Shape
-from tactile_bus.arm_types import Twist
-from tactile_bus.geometry import FINGER_HEIGHT
+from tactile_core.geometry import FINGER_HEIGHT
+from tactile_core.types import Twist
 
 BULLET_STEP = 1 / 240
 """s, the authors' and Bullet's own."""

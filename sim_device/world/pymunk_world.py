@@ -25,9 +25,9 @@ from sim_device.world.base import (
 )
 from sim_device.world.mujoco_model import GRAVITY, MOTOR_TIME, mean_lever, yaw_inertia
 from sim_device.world.parameters import WorldParameters, world_parameters
-from sim_device.world.plates import settled
+from sim_device.world.scene_squeeze import settled
 from sim_device.world.scenes import Scene, SceneObject, Shape
-from tactile_bus.arm_types import Twist
+from tactile_core.types import Twist
 
 ITERATIONS = 30
 """Of the impulse solver; fewer let jams give way."""

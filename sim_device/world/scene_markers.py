@@ -8,9 +8,9 @@ from typing import Any, Final
 from sim_device.world.base import World
 from sim_device.world.scenes import Shape
 from sim_device.world.touch import SHELF_CLEARANCE
-from tactile_bus.geometry import FINGER_HEIGHT
-from tactile_bus.markers import CUBE, CYLINDER, DELETE, SPHERE, marker
-from tactile_bus.messages import MSG
+from tactile_core.bus.markers import CUBE, CYLINDER, DELETE, SPHERE, marker
+from tactile_core.bus.messages import MSG
+from tactile_core.geometry import FINGER_HEIGHT
 
 OBJECTS, CUPBOARD, FINGER, GOAL = "objects", "cupboard", "finger", "goal"
 """Namespaces of the markers; an object's id is its index in the scene."""

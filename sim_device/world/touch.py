@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from sim_device.elastomer import Contact
+from sim_device.skin.elastomer import Contact
 from sim_device.world.base import WALL, FingerContact
 from sim_device.world.scenes import Scene
-from tactile_bus.geometry import FINGER_HEIGHT
+from tactile_core.geometry import FINGER_HEIGHT
 
 SHELF_CLEARANCE: Final = 0.011
 """m from the shelf to the lower edge of the finger (simulator: z 1.11 over a floor at 1.0)."""

@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tactile_bus import topics
-from tactile_bus.log_info import LogInfo, info
-from tactile_bus.log_reader import read_messages
-from tactile_bus.markers import CYLINDER, SPHERE_LIST, frame_transform, marker, wipe
-from tactile_bus.mcap_file import DiskStorage
-from tactile_bus.messages import MSG, codec, diagnostic_status, header, log_message
-from tactile_bus.recorder import Recorder, RecorderSettings
-from tactile_bus.session import BusConfig, close_session, open_session
+from tactile_core.bus import topics
+from tactile_core.bus.markers import CYLINDER, SPHERE_LIST, frame_transform, marker, wipe
+from tactile_core.bus.messages import MSG, codec, diagnostic_status, header, log_message
+from tactile_core.bus.session import BusConfig, close_session, open_session
+from tactile_core.log.info import LogInfo, info
+from tactile_core.log.mcap_file import DiskStorage
+from tactile_core.log.reader import read_messages
+from tactile_core.log.recorder import Recorder, RecorderSettings
 
 WALL_NS = 1_700_000_000_123_456_789
 

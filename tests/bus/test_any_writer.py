@@ -20,11 +20,11 @@ from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from tactile_bus.log_info import info
-from tactile_bus.log_reader import LogReader, read_messages
-from tactile_bus.log_records import Block
-from tactile_bus.mcap_file import MAGIC
-from tactile_bus.recovery import recover
+from tactile_core.log.info import info
+from tactile_core.log.mcap_file import MAGIC
+from tactile_core.log.reader import LogReader, read_messages
+from tactile_core.log.records import Block
+from tactile_core.log.recovery import recover
 
 VECTORS = Path(__file__).parents[2].parent / "shared" / "data" / "mcap_conformance"
 MESSAGES = {"OneMessage": 1, "OneSchemalessMessage": 1, "TenMessages": 10}
@@ -433,7 +433,7 @@ def test_any_spoilt_file_gives_right_messages_or_a_damage(
 
 
 def recover_or_nothing(path: Path) -> int:
-    from tactile_bus.log_records import LogError
+    from tactile_core.log.records import LogError
 
     try:
         return recover(path, path.with_name("r.mcap"), keep_suspect=True).messages

@@ -10,7 +10,7 @@ import pytest
 from reachd.arguments import make_parser as reachd
 from reachd.cli import main
 from sim_device.arguments import make_parser as simdevice
-from tactile_bus.arguments import Parser
+from tactile_core.arguments import Parser
 from tactile_tools.cli import build_parser as tactile
 from tactiled.arguments import make_parser as tactiled
 

@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tactile_bus.arm_types import ArmLimits, Twist
-from tactile_bus.commanding import (
+from tactile_core.bus.commanding import (
     FIRST_COMMAND,
     LONGEST_EXPIRY,
     PROOF_BYTES,
@@ -30,9 +29,9 @@ from tactile_bus.commanding import (
     command_message,
     limits_fields,
 )
-from tactile_bus.instant import Instant, after
-from tactile_bus.messages import MSG, codec
-from tactile_bus.topics import COMMAND
+from tactile_core.bus.messages import MSG, codec
+from tactile_core.bus.topics import COMMAND
+from tactile_core.types import ArmLimits, Instant, Twist, after
 
 T0 = Instant(5_000_000_000)
 AHEAD = Twist(0.02, 0.0, 0.1)

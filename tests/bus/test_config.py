@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import Meta
 
-from tactile_bus.config import ConfigError, Count, Duration, Positive, Rate, load_toml, parse_toml
-from tactile_bus.recorder import RecorderSettings
-from tactile_bus.session import BusConfig
-from tactile_bus.toml_lines import key_lines
+from tactile_core.bus.session import BusConfig
+from tactile_core.config import ConfigError, Count, Duration, Positive, Rate, load_toml, parse_toml
+from tactile_core.log.recorder import RecorderSettings
+from tactile_core.toml_lines import key_lines
 
 
 class Board(msgspec.Struct, forbid_unknown_fields=True):

@@ -14,8 +14,8 @@ from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tactile_bus import topics
-from tactile_bus.messages import codec
+from tactile_core.bus import topics
+from tactile_core.bus.messages import codec
 
 WALL_NS = 1_700_000_000_000_000_000
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tactile_bus import runtime
-from tactile_bus.keys import load_keys
+from tactile_core.bus import runtime
+from tactile_core.bus.keys import load_keys
 from tactile_tools.cli import main
 
 pytest.importorskip("cryptography", reason="making keys needs cryptography")

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from tactile_bus import topics
-from tactile_bus.messages import MSG, codec, diagnostic_status, header
+from tactile_core.bus import topics
+from tactile_core.bus.messages import MSG, codec, diagnostic_status, header
 from tactile_tools.cli import main
 
 BASE_NS = 1_700_000_000_000_000_000

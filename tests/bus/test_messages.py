@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tactile_bus import topics
-from tactile_bus.messages import (
+from tactile_core.bus import topics
+from tactile_core.bus.messages import (
     LATER_FIELDS,
     MAX_PAYLOAD,
     MSG,

@@ -16,11 +16,11 @@ from typing import Any
 
 import pytest
 
-from tactile_bus import topics
-from tactile_bus.instant import WallClock
-from tactile_bus.log_info import info
-from tactile_bus.log_reader import read_messages
-from tactile_bus.recorder import RecorderSettings
+from tactile_core.bus import topics
+from tactile_core.log.info import info
+from tactile_core.log.reader import read_messages
+from tactile_core.log.recorder import RecorderSettings
+from tactile_core.types import WallClock
 
 BASE_NS = 1_700_000_000_000_000_000
 
@@ -51,7 +51,7 @@ def test_every_flush_reaches_the_disk(
 
 
 def test_the_flush_period_cannot_be_set_above_half_a_second(tmp_path: Path) -> None:
-    from tactile_bus.config import ConfigError, parse_toml
+    from tactile_core.config import ConfigError, parse_toml
 
     with pytest.raises(
         ConfigError, match=r"flush_period = 5\.0; allowed: seconds, above 0, at most"
@@ -273,8 +273,8 @@ def test_a_real_file_size_limit_is_met_like_a_full_disk(
     code = textwrap.dedent("""
         import os, sys, time
         from pathlib import Path
-        from tactile_bus import topics
-        from tactile_bus.recorder import Recorder, RecorderSettings
+        from tactile_core.bus import topics
+        from tactile_core.log.recorder import Recorder, RecorderSettings
         settings = RecorderSettings(
             min_free_bytes=0, flush_period=0.05, retry_seconds=0.05, chunk_bytes=8000
         )

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from tactile_bus import topics
-from tactile_bus.log_info import info
-from tactile_bus.log_reader import read_messages
-from tactile_bus.recorder import Recorder, RecorderError, RecorderSettings
+from tactile_core.bus import topics
+from tactile_core.log.info import info
+from tactile_core.log.reader import read_messages
+from tactile_core.log.recorder import Recorder, RecorderError, RecorderSettings
 
 BASE_NS = 1_700_000_000_000_000_000
 

@@ -11,13 +11,13 @@ from typing import Any
 
 import pytest
 
-from tactile_bus import topics
-from tactile_bus.gaps import OTHERS
-from tactile_bus.instant import NS_PER_S, STAMP_END_NS, WallClock, utc_text
-from tactile_bus.log_info import info
-from tactile_bus.log_reader import read_messages
-from tactile_bus.messages import MAX_PAYLOAD, header, stamp_ns
-from tactile_bus.recorder import MAX_CHANNELS, Recorder, RecorderSettings
+from tactile_core.bus import topics
+from tactile_core.bus.messages import MAX_PAYLOAD, header, stamp_ns
+from tactile_core.log.info import info
+from tactile_core.log.reader import read_messages
+from tactile_core.log.recorder import MAX_CHANNELS, Recorder, RecorderSettings
+from tactile_core.log.writer import OTHERS
+from tactile_core.types import NS_PER_S, STAMP_END_NS, WallClock, utc_text
 
 BASE_NS = 1_700_000_000_000_000_000
 ITEMS = 100_000

@@ -14,13 +14,13 @@ import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from tactile_bus import topics
-from tactile_bus.log_info import info
-from tactile_bus.log_reader import read_messages
-from tactile_bus.log_records import LogError
-from tactile_bus.mcap_file import CHUNK, MAGIC, ChunkBuffer, DiskStorage, McapFile
-from tactile_bus.messages import codec
-from tactile_bus.recovery import RecoveryError, recover
+from tactile_core.bus import topics
+from tactile_core.bus.messages import codec
+from tactile_core.log.info import info
+from tactile_core.log.mcap_file import CHUNK, MAGIC, ChunkBuffer, DiskStorage, McapFile
+from tactile_core.log.reader import read_messages
+from tactile_core.log.records import LogError
+from tactile_core.log.recovery import RecoveryError, recover
 
 BASE_NS = 1_700_000_000_000_000_000
 CHUNKS, PER_CHUNK = 6, 20

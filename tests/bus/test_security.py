@@ -19,10 +19,10 @@ from typing import Any
 import pytest
 import zenoh
 
-from tactile_bus import runtime, topics
-from tactile_bus.rights import CERTIFICATE_ROLES
-from tactile_bus.services import NoAnswerError, ServiceError, call, declare_service
-from tactile_bus.session import (
+from tactile_core.bus import runtime, topics
+from tactile_core.bus.rights import CERTIFICATE_ROLES
+from tactile_core.bus.services import NoAnswerError, ServiceError, call, declare_service
+from tactile_core.bus.session import (
     PORTS,
     BusConfig,
     BusError,
@@ -30,15 +30,15 @@ from tactile_bus.session import (
     close_session,
     open_session,
 )
-from tactile_bus.streams import declare_alive, declare_publisher, latest, list_alive
+from tactile_core.bus.streams import declare_alive, declare_publisher, latest, list_alive
 
 STRANGERS = 100
 
 PEER = textwrap.dedent("""
     import sys, time
-    from tactile_bus.session import BusConfig, open_session
-    from tactile_bus.streams import declare_publisher, latest
-    from tactile_bus.topics import FEATURES
+    from tactile_core.bus.session import BusConfig, open_session
+    from tactile_core.bus.streams import declare_publisher, latest
+    from tactile_core.bus.topics import FEATURES
     session = open_session(BusConfig(role=sys.argv[1]))
     publisher = declare_publisher(session, FEATURES, sys.argv[1])
     stream = latest(session, "tactile/*/features")
@@ -355,7 +355,7 @@ def test_a_services_folder_is_its_groups_too(
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A lab's keys for every role, those of a second lab, and some that are no good."""
-    keys = pytest.importorskip("tactile_tools.lab_keys")
+    keys = pytest.importorskip("tactile_tools.operate.lab_keys")
     pytest.importorskip("cryptography", reason="making keys needs cryptography")
     folder = tmp_path_factory.mktemp("lab")
     order, roles = keys.Order, keys.DEFAULT_PARTIES

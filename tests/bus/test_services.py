@@ -10,9 +10,9 @@ import msgspec
 import pytest
 import zenoh
 
-from tactile_bus.messages import MAX_PAYLOAD
-from tactile_bus.services import NoAnswerError, ServiceError, call, declare_service
-from tactile_bus.topics import service_key
+from tactile_core.bus.messages import MAX_PAYLOAD
+from tactile_core.bus.services import NoAnswerError, ServiceError, call, declare_service
+from tactile_core.bus.topics import service_key
 
 SLOW = 60.0
 """s that anything may take on a busy machine before a test gives it up."""

@@ -15,25 +15,25 @@ from typing import Any
 
 import pytest
 
-from tactile_bus import topics
-from tactile_bus.keys import Roles, TlsConfig
-from tactile_bus.messages import MAX_PAYLOAD
-from tactile_bus.session import (
+from tactile_core.bus import topics
+from tactile_core.bus.keys import Roles, TlsConfig
+from tactile_core.bus.messages import MAX_PAYLOAD
+from tactile_core.bus.session import (
     PORTS,
     BusConfig,
     BusError,
     close_session,
     open_session,
 )
-from tactile_bus.streams import Tap, declare_alive, declare_publisher, latest, list_alive
+from tactile_core.bus.streams import Tap, declare_alive, declare_publisher, latest, list_alive
 
 SLOW = 60.0
 """s that anything may take on a busy machine before a test gives it up."""
 
 SUBSCRIBER = textwrap.dedent("""
     import sys, time
-    from tactile_bus.session import BusConfig, open_session
-    from tactile_bus.streams import latest
+    from tactile_core.bus.session import BusConfig, open_session
+    from tactile_core.bus.streams import latest
     config = BusConfig(listen=(), connect=(f"tcp/127.0.0.1:{sys.argv[1]}",))
     stream = latest(open_session(config), sys.argv[2])
     print("ready", flush=True)
@@ -258,8 +258,8 @@ def test_daemons_find_one_another_whoever_starts_first(
 def test_a_process_that_used_the_bus_ends(free_port: Any, way: str) -> None:
     """With a subscriber callback and a service, which zenoh serves from threads of its own."""
     code = textwrap.dedent(f"""
-        from tactile_bus.session import BusConfig, open_session, close_session
-        from tactile_bus.services import declare_service
+        from tactile_core.bus.session import BusConfig, open_session, close_session
+        from tactile_core.bus.services import declare_service
         session = open_session(BusConfig(listen=("tcp/127.0.0.1:{free_port()}",), connect=()))
         session.declare_subscriber("a/b", lambda sample: None)
         declare_service(session, "tactile/b0/srv/status", lambda request: request)

@@ -10,8 +10,8 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from tactile_bus.recorder import Recorder
-from tactile_bus.terminal import LiveLines
+from tactile_core.log.recorder import Recorder
+from tactile_core.terminal import LiveLines
 
 
 class Lines(LiveLines):
@@ -56,7 +56,7 @@ def test_elsewhere_there_are_plain_lines_now_and_then(
     recorder: Recorder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     now: list[Any] = [0]
-    monkeypatch.setattr("tactile_bus.terminal.monotonic_now", lambda: now[0])
+    monkeypatch.setattr("tactile_core.terminal.monotonic_now", lambda: now[0])
     out = io.StringIO()
     caplog.set_level("INFO")
     with Lines(Console(file=out), recorder) as lines:

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from reachd.cli import main as reachd
 from sim_device.cli import main as simdevice
-from tactile_bus.calibration import CalibrationError, load
-from tactile_bus.toml_text import MAX_DEPTH, TomlError, parse, printable, read_text
+from tactile_core.calibration import CalibrationError, load
+from tactile_core.toml_text import MAX_DEPTH, TomlError, parse, printable, read_text
 from tactiled.cli import main as tactiled
 
 LIMIT = 1 << 20

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactile_bus.nominal import nominal
+from tactile_core.calibration.nominal import nominal
 from tactile_tools.calibrate.csv_pair import read_pair
 from tactile_tools.calibrate.recording import Recording
 

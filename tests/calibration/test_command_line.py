@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from tactile_bus.calibration import load, nominal, save
+from tactile_core.calibration import load, nominal, save
 from tactile_tools.calibrate import fit as fitting
 from tactile_tools.calibrate.recipes import FORCE_RECIPES
 from tactile_tools.cli import main

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tactile_bus.calibration import loads, nominal, saves
-from tactile_bus.instant import NS_PER_S, Instant
+from tactile_core.calibration import loads, nominal, saves
+from tactile_core.types import NS_PER_S, Instant
 from tactile_tools.calibrate.assemble import board
 from tactile_tools.calibrate.evaluate import predict, tail20
 from tactile_tools.calibrate.fit import Choice, choose, fit, folds
@@ -21,7 +21,7 @@ from tactile_tools.calibrate.recording import RecordingError
 from tactile_tools.calibrate.rows import align, causal, copies
 from tactile_tools.calibrate.splits import block_edges, block_masks
 from tactiled.blocks import SampleBlock
-from tactiled.sensing.net_force import NetEstimator, batch_features, readout
+from tactiled.sensing.forces import NetEstimator, batch_features, readout
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 
 LINEAR, CUBIC, CREEP, PLAY = FORCE_RECIPES

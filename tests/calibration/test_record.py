@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_bus.calibration import nominal, saves
-from tactile_bus.calibration_file import SUFFIX
-from tactile_bus.messages import MSG, codec, header
-from tactile_bus.recorder import Recorder, RecorderSettings
-from tactile_bus.services import call
-from tactile_bus.session import BusConfig, close_session, open_session
-from tactile_bus.streams import Latest, latest
-from tactile_bus.topics import FEATURES, FIELD, REFERENCE, service_key
+from tactile_core.bus.messages import MSG, codec, header
+from tactile_core.bus.services import call
+from tactile_core.bus.session import BusConfig, close_session, open_session
+from tactile_core.bus.streams import Latest, latest
+from tactile_core.bus.topics import FEATURES, FIELD, REFERENCE, service_key
+from tactile_core.calibration import nominal, saves
+from tactile_core.calibration.file import SUFFIX
+from tactile_core.log.recorder import Recorder, RecorderSettings
 from tactile_tools.calibrate.log_recording import read_log
 from tactile_tools.processes import command, free_port, running, wait_for
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim_device.catalogue import build_skin
-from sim_device.environment import Surroundings
-from sim_device.skin import Contact
-from tactile_bus.calibration import nominal, saves
-from tactile_bus.instant import NS_PER_S, Instant
-from tactile_bus.messages import MSG, codec, header
-from tactile_bus.recorder import Recorder
-from tactile_bus.topics import FIELD, REFERENCE
+from sim_device.board.catalogue import build_skin
+from sim_device.skin.environment import Surroundings
+from sim_device.skin.skin import Contact
+from tactile_core.bus.messages import MSG, codec, header
+from tactile_core.bus.topics import FIELD, REFERENCE
+from tactile_core.calibration import nominal, saves
+from tactile_core.log.recorder import Recorder
+from tactile_core.types import NS_PER_S, Instant
 from tactile_tools.calibrate.evaluate import predict
 from tactile_tools.calibrate.fit import Choice, choose, fit
 from tactile_tools.calibrate.log_recording import read_log

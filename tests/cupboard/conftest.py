@@ -18,14 +18,13 @@ import pytest
 import zenoh
 
 from sim_device.world.scenes import Pose, Scene, SceneObject, Shape
-from tactile_bus.arm_types import ZERO, Twist
-from tactile_bus.commanding import ClaimRequest, Grant, Signer, clock_domain
-from tactile_bus.instant import NS_PER_S, WallClock, monotonic_now
-from tactile_bus.messages import codec
-from tactile_bus.services import ServiceError, call
-from tactile_bus.session import BusConfig, close_session, open_session
-from tactile_bus.streams import BusSample, Publisher, Tap, declare_publisher
-from tactile_bus.topics import ARM_STATE, COMMAND, service_key
+from tactile_core.bus.commanding import ClaimRequest, Grant, Signer, clock_domain
+from tactile_core.bus.messages import codec
+from tactile_core.bus.services import ServiceError, call
+from tactile_core.bus.session import BusConfig, close_session, open_session
+from tactile_core.bus.streams import BusSample, Publisher, Tap, declare_publisher
+from tactile_core.bus.topics import ARM_STATE, COMMAND, service_key
+from tactile_core.types import NS_PER_S, ZERO, Twist, WallClock, monotonic_now
 
 RADIUS = 0.04
 DISC_X = 0.02

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from reachd.goals import make_goal, parse_target
-from reachd.parameters import SETS
+from reachd.services import make_goal, parse_target
+from reachd.strategies.parameters import SETS
 from sim_device.cli import main
-from sim_device.world import sources
-from sim_device.world.sources import FOLDER_VARIABLE, RECORDED_OUTCOMES, RECORDED_SCENES
+from sim_device.world import scene_loading
+from sim_device.world.scene_loading import FOLDER_VARIABLE, RECORDED_OUTCOMES, RECORDED_SCENES
 
 BAD = [
     (
@@ -120,7 +120,7 @@ def test_recorded_scenes_that_are_not_there_are_asked_for(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(sources, "_BESIDE", tmp_path / "none")
+    monkeypatch.setattr(scene_loading, "_BESIDE", tmp_path / "none")
     monkeypatch.delenv(FOLDER_VARIABLE, raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     if place == "folder":

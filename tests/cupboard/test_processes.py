@@ -15,16 +15,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_device.catalogue import factory_calibration
-from tactile_bus.arm_types import Twist
-from tactile_bus.instant import NS_PER_S, Instant, monotonic_now
-from tactile_bus.messages import MSG, codec
-from tactile_bus.services import ServiceError
-from tactile_bus.streams import Tap, latest
-from tactile_bus.topics import COMMAND, WORLD, alive_key
+from sim_device.board.catalogue import factory_calibration
+from tactile_core.bus.messages import MSG, codec
+from tactile_core.bus.services import ServiceError
+from tactile_core.bus.streams import Tap, latest
+from tactile_core.bus.topics import COMMAND, WORLD, alive_key
+from tactile_core.types import NS_PER_S, Instant, Twist, monotonic_now
 from tactiled.blocks import Cycle
-from tactiled.links.events import Sampled
-from tactiled.links.line import SerialLine
+from tactiled.boards.events import Sampled
+from tactiled.boards.line import SerialLine
 from tactiled.sensing.pipeline import BoardPipeline
 from tactiled.transports.serial_port import SerialTransport
 
@@ -34,11 +33,11 @@ STILL = 1e-4  # m/s
 COMMANDER = textwrap.dedent("""
     import sys, time
     import msgspec
-    from tactile_bus.arm_types import Twist
-    from tactile_bus.commanding import ClaimRequest, Grant, Signer, clock_domain
-    from tactile_bus.services import call
-    from tactile_bus.session import BusConfig, open_session
-    from tactile_bus.streams import Publisher
+    from tactile_core.types import Twist
+    from tactile_core.bus.commanding import ClaimRequest, Grant, Signer, clock_domain
+    from tactile_core.bus.services import call
+    from tactile_core.bus.session import BusConfig, open_session
+    from tactile_core.bus.streams import Publisher
     session = open_session(BusConfig(listen=(), connect=(f"tcp/127.0.0.1:{sys.argv[1]}",)))
     request = ClaimRequest("other", clock_domain())
     signer = Signer(msgspec.convert(call(session, "arm/arm/srv/claim", request, 20), Grant))

@@ -7,13 +7,12 @@ import itertools
 import numpy as np
 import pytest
 
-from sim_device.arm_options import parse_arm_faults
-from sim_device.cupboard import MAX_CATCH_UP, Cupboard, NotNow
-from sim_device.world.arm import FACTORY_LIMITS, ArmSettings
+from sim_device.arm.arm import FACTORY_LIMITS, ArmSettings
+from sim_device.arm.cupboard import MAX_CATCH_UP, Cupboard, NotNow
+from sim_device.arm.server import parse_arm_faults
 from sim_device.world.mujoco_world import MujocoWorld
 from sim_device.world.scenes import Scene
-from tactile_bus.arm_types import ARM_LIMITS, ArmState, Twist
-from tactile_bus.instant import Instant, after, seconds_between
+from tactile_core.types import ARM_LIMITS, ArmState, Instant, Twist, after, seconds_between
 
 T0 = Instant(7_000_000_123)
 AHEAD = Twist(0.05, 0.0, 0.0)

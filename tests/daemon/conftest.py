@@ -36,11 +36,11 @@ from sensor_proto.packets import (
     Status,
     Stop,
 )
-from tactile_bus.instant import NS_PER_S, Instant
-from tactile_bus.messages import codec
-from tactile_bus.services import call
-from tactile_bus.session import BusConfig, close_session, open_session
-from tactile_bus.topics import FEATURES, service_key
+from tactile_core.bus.messages import codec
+from tactile_core.bus.services import call
+from tactile_core.bus.session import BusConfig, close_session, open_session
+from tactile_core.bus.topics import FEATURES, service_key
+from tactile_core.types import NS_PER_S, Instant
 
 TICK_HZ = 1_000_000
 

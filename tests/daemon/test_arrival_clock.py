@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tactile_bus.instant import NS_PER_S, Instant
-from tactiled.links.arrival_clock import Arrival, ArrivalClock
+from tactile_core.types import NS_PER_S, Instant
+from tactiled.boards.clock import Arrival, ArrivalClock
 
 START = 7_200 * NS_PER_S
 

@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tactile_bus.geometry import anyskin, finger
-from tactile_bus.instant import Instant
-from tactiled.chip_watch import ChipWatch
-from tactiled.sensing.readings import Fault
+from tactile_core.geometry import anyskin, finger
+from tactile_core.types import Instant
+from tactiled.sensing.reasons import Fault
+from tactiled.watch import ChipWatch
 
 HZ = 40
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sensor_proto.packets import ClockReply
-from tactile_bus.instant import NS_PER_S, Instant
-from tactiled.links.clock import ClockMap, TickUnwrapper
+from tactile_core.types import NS_PER_S, Instant
+from tactiled.boards.clock import ClockMap, TickUnwrapper
 
 TICK_HZ = 1_000_000
 START = 3_600 * NS_PER_S

@@ -27,11 +27,11 @@ from sensor_proto.packets import (
     Samples,
     Start,
 )
-from tactile_bus.instant import NS_PER_S, Instant
+from tactile_core.types import NS_PER_S, Instant
 from tactiled.blocks import SampleBlock
-from tactiled.links.clock import StepWatch
-from tactiled.links.events import ClockJudged, Reset, Sampled
-from tactiled.links.link import BoardLink
+from tactiled.boards.board import BoardLink
+from tactiled.boards.clock import StepWatch
+from tactiled.boards.events import ClockJudged, Reset, Sampled
 
 STEP = 0.002
 SLACK_S = 1e-5

@@ -8,19 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sensor_proto.canseg import CanFrame
-from sim_device.board_clock import ClockParameters
-from sim_device.catalogue import build_skin, factory_calibration, identity
+from sensor_proto.can_transfers import CanFrame
+from sim_device.board.catalogue import build_skin, factory_calibration, identity
+from sim_device.board.firmware import CanBoard, ClockParameters, SerialBoard
 from sim_device.faults import FaultPlan
-from sim_device.firmware import CanBoard, SerialBoard
-from sim_device.skin import Contact
-from tactile_bus.geometry import Side
-from tactile_bus.instant import NS_PER_S, Instant
+from sim_device.skin.skin import Contact
+from tactile_core.geometry import Side
+from tactile_core.types import NS_PER_S, Instant
 from tactiled.blocks import Chunk, Cycle
-from tactiled.links.can_line import CanLine
-from tactiled.links.events import Identity, Refusal, Sampled
-from tactiled.links.line import SerialLine
-from tactiled.links.link import BoardLink
+from tactiled.boards.board import BoardLink
+from tactiled.boards.events import Identity, Refusal, Sampled
+from tactiled.boards.line import CanLine, SerialLine
 from tactiled.sensing.pipeline import BoardPipeline
 
 SEED = 7

@@ -14,12 +14,12 @@ from typing import Any
 
 import pytest
 
-from tactile_bus.instant import NS_PER_S, WallClock
-from tactile_bus.log_info import info
-from tactile_bus.messages import log_message
-from tactile_bus.session import BusConfig, close_session, open_session
-from tactile_bus.topics import LOG
-from tactiled.outlet import Outlet
+from tactile_core.bus.messages import log_message
+from tactile_core.bus.session import BusConfig, close_session, open_session
+from tactile_core.bus.topics import LOG
+from tactile_core.log.info import info
+from tactile_core.types import NS_PER_S, WallClock
+from tactiled.publisher import Outlet
 
 pytestmark = pytest.mark.timeout(300)
 

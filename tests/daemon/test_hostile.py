@@ -31,27 +31,27 @@ from sensor_proto.packets import (
     Start,
     Status,
 )
-from tactile_bus.geometry import Side
-from tactile_bus.instant import NS_PER_S, Instant, WallClock, after
-from tactile_bus.log_info import info
-from tactile_bus.log_reader import read_messages
-from tactile_bus.messages import MAX_PAYLOAD, codec, log_message
-from tactile_bus.recorder import Recorder, RecorderSettings
-from tactile_bus.throttle import Throttle
-from tactile_bus.topics import CONTACTS, FEATURES, FORCES, GEOMETRY, LOG, Topic
+from tactile_core.bus.messages import MAX_PAYLOAD, codec, log_message
+from tactile_core.bus.topics import CONTACTS, FEATURES, FORCES, GEOMETRY, LOG, Topic
+from tactile_core.geometry import Side
+from tactile_core.log.info import info
+from tactile_core.log.reader import read_messages
+from tactile_core.log.recorder import Recorder, RecorderSettings
+from tactile_core.throttle import Throttle
+from tactile_core.types import NS_PER_S, Instant, WallClock, after
 from tactiled.blocks import Chunk, Patch
-from tactiled.inbox import Inbox, Wake
-from tactiled.links.events import BoardLog
-from tactiled.links.line import SerialLine
-from tactiled.outgoing import MAX_PATCHES, MessageMaker
+from tactiled.board_session import FIRMWARE_BURST, SET_UP_BURST, Station
+from tactiled.boards.events import BoardLog
+from tactiled.boards.line import SerialLine
+from tactiled.calibration_store import Shelf
+from tactiled.journal import Journal
 from tactiled.port import Port
-from tactiled.replay.journal import Journal
-from tactiled.replay.rerun import RecordedSource
+from tactiled.publisher import MAX_PATCHES, MessageMaker
+from tactiled.reader import Inbox, Wake
+from tactiled.rerun import RecordedSource
 from tactiled.sensing.pipeline import BoardPipeline
-from tactiled.sensing.pipeline_settings import PipelineSettings
-from tactiled.shelf import Shelf
+from tactiled.sensing.settings import PipelineSettings
 from tactiled.skin_picture import SkinPicture
-from tactiled.station import FIRMWARE_BURST, SET_UP_BURST, Station
 from tactiled.transports import Medium
 from tactiled.transports.base import READ_LIMIT
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from tactile_bus.instant import Instant
+from tactile_core.types import Instant
 from tactiled.blocks import Chunk
-from tactiled.inbox import Inbox, PortLost, PortOpened, Wake
+from tactiled.reader import Inbox, PortLost, PortOpened, Wake
 
 
 def test_the_oldest_chunks_go_and_are_counted(instant: Callable[[float], Instant]) -> None:

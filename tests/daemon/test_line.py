@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 
 from sensor_proto.anyskin import encode_anyskin
-from sensor_proto.canseg import CanDecoder, CanEncoder, CanFrame
+from sensor_proto.can_transfers import CanDecoder, CanEncoder, CanFrame
 from sensor_proto.framing import SerialDecoder, encode_serial
 from sensor_proto.packets import FloatSamples, Identify
-from tactile_bus.instant import Instant
+from tactile_core.types import Instant
 from tactiled.blocks import Chunk
-from tactiled.links.can_line import CanLine
-from tactiled.links.events import Diagnosed, Found, Identified, Identity, Refusal, Refused, Sampled
-from tactiled.links.float_link import FloatLink
-from tactiled.links.line import LineEvent, SerialLine
-from tactiled.links.link import BoardLink
+from tactiled.boards.board import BoardLink
+from tactiled.boards.events import Diagnosed, Found, Identified, Identity, Refusal, Refused, Sampled
+from tactiled.boards.float_board import FloatLink
+from tactiled.boards.line import CanLine, LineEvent, SerialLine
 
 At = Callable[[float], Instant]
 

@@ -19,8 +19,9 @@ from sensor_proto.packets import (
     Start,
     Stop,
 )
-from tactile_bus.instant import NS_PER_S, Instant
-from tactiled.links.events import (
+from tactile_core.types import NS_PER_S, Instant
+from tactiled.boards.board import BoardLink, State
+from tactiled.boards.events import (
     Answered,
     BoardLog,
     FellSilent,
@@ -33,7 +34,6 @@ from tactiled.links.events import (
     Sampled,
     Streaming,
 )
-from tactiled.links.link import BoardLink, State
 
 STEP = 0.001
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from tactile_bus.log_info import info
-from tactile_bus.messages import codec
-from tactile_bus.topics import GEOMETRY
+from tactile_core.bus.messages import codec
+from tactile_core.bus.topics import GEOMETRY
+from tactile_core.log.info import info
 
 pytestmark = pytest.mark.timeout(300)
 

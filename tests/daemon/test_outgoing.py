@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tactile_bus.calibration import BoardCalibration, nominal
-from tactile_bus.geometry import Side
-from tactile_bus.instant import NS_PER_S, Instant, WallClock
-from tactile_bus.messages import MAX_PAYLOAD, codec, stamp_ns
-from tactile_bus.topics import AMBIENT, FEATURES, FIELD, FORCES, GEOMETRY, RAW
+from tactile_core.bus.messages import MAX_PAYLOAD, codec, stamp_ns
+from tactile_core.bus.topics import AMBIENT, FEATURES, FIELD, FORCES, GEOMETRY, RAW
+from tactile_core.calibration import BoardCalibration, nominal
+from tactile_core.geometry import Side
+from tactile_core.types import NS_PER_S, Instant, WallClock
 from tactiled.blocks import Ambient, Chunk, Cycle, Features, Patch
-from tactiled.outgoing import MessageMaker, split
+from tactiled.publisher import MessageMaker, split
 from tactiled.sensing.reasons import array_missing
-from tactiled.transports.raw_chunk import from_raw, to_raw
+from tactiled.transports.recorded_log import from_raw, to_raw
 
 WALL = WallClock(offset_ns=10**18)
 

@@ -15,8 +15,8 @@ from typing import Any
 
 import pytest
 
-from tactile_bus.log_info import info
-from tactile_bus.services import ServiceError
+from tactile_core.bus.services import ServiceError
+from tactile_core.log.info import info
 from tactiled.cli import main
 from tactiled.port import Port
 

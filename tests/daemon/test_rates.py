@@ -12,10 +12,11 @@ import pytest
 from sensor_proto.anyskin import encode_anyskin
 from sensor_proto.framing import SerialDecoder, encode_serial
 from sensor_proto.packets import Descriptor, FloatSamples
-from tactile_bus.calibration import nominal
-from tactile_bus.instant import Instant
+from tactile_core.calibration import nominal
+from tactile_core.types import Instant
 from tactiled.blocks import Chunk, Cycle, SampleBlock
-from tactiled.links.events import (
+from tactiled.boards.clock import SLOWEST_S, Pace
+from tactiled.boards.events import (
     Diagnosed,
     FellSilent,
     Identity,
@@ -25,8 +26,7 @@ from tactiled.links.events import (
     Sampled,
     Waiting,
 )
-from tactiled.links.line import SerialLine
-from tactiled.links.pace import SLOWEST_S, Pace
+from tactiled.boards.line import SerialLine
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 
 At = Callable[[float], Instant]

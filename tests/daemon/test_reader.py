@@ -10,10 +10,9 @@ from typing import Any
 
 import pytest
 
-from tactile_bus.instant import Instant
+from tactile_core.types import Instant
 from tactiled.blocks import Chunk
-from tactiled.inbox import Inbox, PortEnded, PortLost, PortOpened, Wake
-from tactiled.reader import PortReader, byte_time
+from tactiled.reader import Inbox, PortEnded, PortLost, PortOpened, PortReader, Wake, byte_time
 from tactiled.transports import (
     BusState,
     EndOfLog,

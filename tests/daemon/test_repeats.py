@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from tactile_bus.instant import Instant
-from tactiled.repeats import FEW, KINDS, WINDOW_S, Repeats, Silences
+from tactile_core.types import Instant
+from tactiled.watch import FEW, KINDS, WINDOW_S, Repeats, Silences
 
 At = Callable[[float], Instant]
 

@@ -22,13 +22,12 @@ from sensor_proto.packets import (
     SetRate,
     Status,
 )
-from tactile_bus.instant import NS_PER_S, Instant
+from tactile_core.types import NS_PER_S, Instant
 from tactiled.blocks import Chunk
-from tactiled.inbox import Inbox, Wake
-from tactiled.links.commands import COMMANDS
-from tactiled.links.events import Sampled
-from tactiled.links.line import SerialLine
-from tactiled.links.link import BoardLink
+from tactiled.boards.board import COMMANDS, BoardLink
+from tactiled.boards.events import Sampled
+from tactiled.boards.line import SerialLine
+from tactiled.reader import Inbox, Wake
 
 TICKS = st.integers(0, 2**32 - 1)
 

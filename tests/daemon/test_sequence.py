@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tactiled.links.sequence import HISTORY, SequenceTracker, Verdict
+from tactiled.boards.board import HISTORY, SequenceTracker, Verdict
 
 
 def take_all(numbers: list[int]) -> tuple[SequenceTracker, list[Verdict]]:

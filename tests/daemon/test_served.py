@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from tactile_bus.messages import codec
-from tactile_bus.services import ServiceError
-from tactile_bus.streams import latest
-from tactile_bus.topics import FORCES
+from tactile_core.bus.messages import codec
+from tactile_core.bus.services import ServiceError
+from tactile_core.bus.streams import latest
+from tactile_core.bus.topics import FORCES
 
 SLOW = 60.0
 """s that anything may take on a busy machine before a test gives it up."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tactile_bus.calibration import nominal, save
+from tactile_core.calibration import nominal, save
 from tactiled.arguments import make_parser
 from tactiled.cli import main
 from tactiled.settings import Settings, SettingsError, make_settings

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from sensor_proto.packets import Descriptor
-from tactile_bus.calibration import load, nominal, nominal_from_descriptor, save, saves
-from tactile_bus.geometry import anyskin_jaws
-from tactile_bus.recorder import Recorder
-from tactiled.links.events import Identity, Refusal
-from tactiled.shelf import Choice, Shelf
+from tactile_core.calibration import load, nominal, nominal_from_descriptor, save, saves
+from tactile_core.geometry import anyskin_jaws
+from tactile_core.log.recorder import Recorder
+from tactiled.boards.events import Identity, Refusal
+from tactiled.calibration_store import Choice, Shelf
 
 
 def pad(descriptor: Descriptor, serial: str = "00000000000000aa") -> Identity:

@@ -17,13 +17,13 @@ from typing import Any
 
 import pytest
 
-from tactile_bus import supervision
-from tactile_bus.disk_watch import DiskWatch
-from tactile_bus.instant import NS_PER_S, Instant, monotonic_now
-from tactile_tools import health
-from tactiled.alarms import DRIFT_N, WINDOW_S, WINDOWS, DriftWatch
+from tactile_core import supervision
+from tactile_core.log.retention import DiskWatch
+from tactile_core.types import NS_PER_S, Instant, monotonic_now
+from tactile_tools.operate import health
 from tactiled.arguments import make_parser
 from tactiled.daemon import Daemon
+from tactiled.diagnostics import DRIFT_N, WINDOW_S, WINDOWS, DriftWatch
 from tactiled.settings import make_settings
 
 

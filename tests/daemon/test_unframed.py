@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sensor_proto.layout import Layout
+from sensor_proto.layouts import Layout
 from sensor_proto.packets import FloatSamples
-from tactile_bus.calibration import nominal
-from tactile_bus.instant import Instant
+from tactile_core.calibration import nominal
+from tactile_core.types import Instant
 from tactiled.blocks import Chunk, SampleBlock
-from tactiled.links.events import Diagnosed, Identified, Identity, Refusal, Sampled
-from tactiled.links.line import SerialLine
+from tactiled.boards.events import Diagnosed, Identified, Identity, Refusal, Sampled
+from tactiled.boards.line import SerialLine
 from tactiled.sensing.pipeline import BoardPipeline
 
 At = Callable[[float], Instant]

@@ -143,7 +143,7 @@ def test_a_scene_that_cannot_be_made_is_a_row(
 
 KILLER = """
 import os
-from reachd.seam import Twist
+from reachd.interfaces import Twist
 
 class Killer:
     activity = "killing"

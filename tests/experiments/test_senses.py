@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from sim_device.world.base import FingerContact
-from tactile_bus.geometry import Side
-from tactile_bus.instant import Instant, after
+from tactile_core.geometry import Side
+from tactile_core.types import Instant, after
 from tactile_tools.experiments.conditions import parameters_of, scene_of, sense_of, world_of
-from tactile_tools.experiments.senses import (
+from tactile_tools.experiments.degraded_touch import (
     DegradedContacts,
     DegradedTaxels,
     Unstretched,
@@ -136,7 +136,7 @@ def test_objects_meet_the_finger_at_its_width(width: float, engine: str) -> None
     from dataclasses import replace
 
     from sim_device.world.scenes import Pose, SceneObject, Shape
-    from tactile_bus.arm_types import Twist
+    from tactile_core.types import Twist
 
     wide = replace(spec(finger_width=width), engine=engine)
     box = SceneObject(Shape.BOX, 0.04, 0.04, 0.07, 0.3, 0.05, width / 2 + 0.02 + 0.002, 0.0)

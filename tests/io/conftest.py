@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from sensor_proto.canseg import CanFrame
+from sensor_proto.can_transfers import CanFrame
 from sim_device.ports import PtyPort, SlcanPort
-from tactile_bus.instant import monotonic_now
+from tactile_core.types import monotonic_now
 from tactiled.blocks import Chunk
 from tactiled.transports.base import Transport
 

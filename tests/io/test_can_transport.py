@@ -11,13 +11,12 @@ from typing import Any
 import can
 import pytest
 
-from sensor_proto.can_errors import BusState
-from sensor_proto.canseg import CanDecoder, CanEncoder, CanFrame
+from sensor_proto.can_transfers import BusState, CanDecoder, CanEncoder, CanFrame
 from sensor_proto.packets import ClockReply
+from sim_device.board.slcan_adapter import DIALECTS
 from sim_device.ports import PtyPort, VirtualCanPort
-from sim_device.slcan import DIALECTS
-from tactile_bus.can_bus import CanSpec, can_links
-from tactile_bus.instant import monotonic_now
+from tactile_core.can_bus import CanSpec, can_links
+from tactile_core.types import monotonic_now
 from tactiled.transports import PortBusy, PortClosed, PortGone, PortMissing, PortUnsuitable
 from tactiled.transports.can_bus import CanTransport, PythonCanLink
 

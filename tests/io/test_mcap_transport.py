@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from sensor_proto.canseg import CanFrame
-from tactile_bus.instant import Instant, WallClock
-from tactile_bus.messages import DecodeError, codec
-from tactile_bus.topics import RAW
+from sensor_proto.can_transfers import CanFrame
+from tactile_core.bus.messages import DecodeError, codec
+from tactile_core.bus.topics import RAW
+from tactile_core.types import Instant, WallClock
 from tactiled.blocks import Chunk
 from tactiled.transports import (
     EndOfLog,
@@ -22,8 +22,7 @@ from tactiled.transports import (
     PortMissing,
     PortUnsuitable,
 )
-from tactiled.transports.mcap_file import McapTransport
-from tactiled.transports.raw_chunk import from_raw, to_raw
+from tactiled.transports.recorded_log import McapTransport, from_raw, to_raw
 
 WALL = WallClock(10**18)
 SERIAL_CHUNKS = [Chunk(Instant(5_000_000_000 + k * 20_000_000), bytes([k] * 40)) for k in range(50)]

@@ -14,8 +14,8 @@ import pytest
 
 from sensor_proto.anyskin import AnySkinDecoder
 from sensor_proto.packets import FloatSamples
-from sim_device.replay import BAIT, TEMPERATURE_C, RecordingError, ReplayBoard, load
-from tactile_bus.instant import Instant, after
+from sim_device.board.recorded import BAIT, TEMPERATURE_C, RecordingError, ReplayBoard, load
+from tactile_core.types import Instant, after
 from tactiled.transports import PortGone
 from tactiled.transports.serial_port import SerialTransport
 

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from sensor_proto.canseg import CanFrame
+from sensor_proto.can_transfers import CanFrame
 from sensor_proto.framing import SerialDecoder
 from sim_device.ports import PTY_ROOM, PtyPort
-from tactile_bus.instant import monotonic_now
+from tactile_core.types import monotonic_now
 from tactiled.transports import (
     PortBusy,
     PortClosed,

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from sensor_proto.anyskin import AnySkinDecoder
-from sensor_proto.canseg import CanDecoder, CanEncoder
+from sensor_proto.can_transfers import CanDecoder, CanEncoder
 from sensor_proto.framing import SerialDecoder, encode_serial
 from sensor_proto.packets import Descriptor, FloatSamples, Identify, Message, Samples, Start
 from sim_device.cli import main
-from tactile_bus.calibration import load
+from tactile_core.calibration import load
 from tactiled.transports import PortGone, Transport
 from tactiled.transports.can_bus import CanTransport
 from tactiled.transports.serial_port import SerialTransport

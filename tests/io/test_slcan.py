@@ -8,12 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sensor_proto import can_errors, slcan
-from sensor_proto.can_errors import BusState
-from sensor_proto.canseg import CanFrame
-from sim_device.bus_timing import MAX_QUEUED, TimedBus, frame_seconds
-from sim_device.slcan import MAX_OUTPUT, SlcanAdapter
-from tactile_bus.instant import Instant
+from sensor_proto import can_transfers, slcan
+from sensor_proto.can_transfers import BusState, CanFrame
+from sim_device.board.slcan_adapter import MAX_OUTPUT, SlcanAdapter
+from sim_device.board.wire import MAX_QUEUED, TimedBus, frame_seconds
+from tactile_core.types import Instant
 
 FRAME = CanFrame(0x1ABCDEF0, b"\x01\x23\xfe")
 LINE = b"T1ABCDEF030123FE"  # T, 8 digits of identifier, length, data
@@ -93,10 +92,10 @@ def test_any_chunking_of_the_adapters_bytes_gives_the_same(cuts: list[int]) -> N
     for start, end in pairwise(edges):
         frames += decoder.feed(STREAM[start:end])
     assert frames[:2] == [FRAME, FD_FRAME]
-    assert can_errors.told_state(frames[2]) is BusState.WARNING
-    assert can_errors.names(frames[3]) == ("bus-error",)
-    assert can_errors.told_state(frames[4]) is BusState.BUS_OFF
-    assert can_errors.names(frames[5]) == (
+    assert can_transfers.told_state(frames[2]) is BusState.WARNING
+    assert can_transfers.names(frames[3]) == ("bus-error",)
+    assert can_transfers.told_state(frames[4]) is BusState.BUS_OFF
+    assert can_transfers.names(frames[5]) == (
         "protocol-violation",
         "no-acknowledgement",
         "bus-error",
@@ -169,19 +168,19 @@ def test_state_and_error_lines_become_named_error_frames(
 ) -> None:
     (frame,) = slcan.SlcanDecoder().feed(line + b"\r")
     assert frame.error
-    assert can_errors.names(frame) == names
-    assert can_errors.told_state(frame) is state
+    assert can_transfers.names(frame) == names
+    assert can_transfers.told_state(frame) is state
 
 
 def test_socketcan_error_frames_have_their_kernel_names() -> None:
     # Classes and controller bits of linux/can/error.h.
-    assert can_errors.names(CanFrame(0x040, bytes(8), error=True)) == ("bus-off",)
-    assert can_errors.told_state(CanFrame(0x100, bytes(8), error=True)) is BusState.ACTIVE
+    assert can_transfers.names(CanFrame(0x040, bytes(8), error=True)) == ("bus-off",)
+    assert can_transfers.told_state(CanFrame(0x100, bytes(8), error=True)) is BusState.ACTIVE
     passive = CanFrame(0x004, b"\0\x20\0\0\0\0\0\0", error=True)
-    assert can_errors.names(passive) == ("error-passive",)
-    assert can_errors.told_state(passive) is BusState.PASSIVE
-    assert can_errors.told_state(CanFrame(0x020, b"", error=True)) is None
-    assert can_errors.names(CanFrame(0, b"", error=True)) == ("unspecified",)
+    assert can_transfers.names(passive) == ("error-passive",)
+    assert can_transfers.told_state(passive) is BusState.PASSIVE
+    assert can_transfers.told_state(CanFrame(0x020, b"", error=True)) is None
+    assert can_transfers.names(CanFrame(0, b"", error=True)) == ("unspecified",)
 
 
 @pytest.mark.parametrize(
@@ -353,9 +352,9 @@ def test_flags_are_read_as_bus_errors(
     flags: bytes, names: tuple[str, ...], state: BusState | None
 ) -> None:
     state_frame, errors = slcan.SlcanDecoder().feed(flags + b"\r")
-    assert can_errors.told_state(state_frame) is (state or BusState.ACTIVE)
-    assert can_errors.names(errors) == names
-    assert can_errors.told_state(errors) is None
+    assert can_transfers.told_state(state_frame) is (state or BusState.ACTIVE)
+    assert can_transfers.names(errors) == names
+    assert can_transfers.told_state(errors) is None
 
 
 def test_a_flag_that_stays_is_told_once() -> None:
@@ -377,8 +376,8 @@ def test_error_reports_of_newer_firmware(
     line: bytes, state: BusState, names: tuple[str, ...]
 ) -> None:
     first, *rest = slcan.SlcanDecoder().feed(line + b"\r")
-    assert can_errors.told_state(first) is state
-    assert [can_errors.names(f) for f in rest] == ([names] if names else [])
+    assert can_transfers.told_state(first) is state
+    assert [can_transfers.names(f) for f in rest] == ([names] if names else [])
 
 
 def test_every_bit_rate_has_a_command() -> None:

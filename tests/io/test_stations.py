@@ -10,18 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sensor_proto.can_errors import BusState
-from sensor_proto.canseg import CanDecoder, CanEncoder
+from sensor_proto.can_transfers import BusState, CanDecoder, CanEncoder
 from sensor_proto.packets import Samples, Start
 from sensor_proto.slcan import SlcanDecoder, encode_frame
-from sim_device.catalogue import identity
+from sim_device.board.catalogue import identity
 from sim_device.faults import Window
-from sim_device.indenter import load_script
+from sim_device.ports_plan import BoardsRequest, Planned, parse_serial, parse_window, plan_boards
 from sim_device.runner import CanStation, Runner, SerialStation
-from sim_device.stations import BoardsRequest, Planned, parse_serial, parse_window, plan_boards
+from sim_device.skin.indenter import load_script
 from sim_device.status import StatusLine
-from tactile_bus.can_bus import CanSpec
-from tactile_bus.instant import Instant, after
+from tactile_core.can_bus import CanSpec
+from tactile_core.types import Instant, after
 from tactiled.transports.serial_port import SerialTransport
 
 PRESS = """

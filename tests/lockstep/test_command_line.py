@@ -84,7 +84,7 @@ def test_the_exit_code_says_whether_the_target_was_reached(
     assert code_of(["reach", "--scene", "free.json", "--strategy", "straight"]) == 0
     assert "straight: reached within" in capsys.readouterr().out
     Path("lazy.py").write_text(
-        "from reachd.seam import ZERO\n"
+        "from reachd.interfaces import ZERO\n"
         "class Lazy:\n"
         "    activity = 'rest'\n"
         "    def __init__(self, parameters, rng):\n"
@@ -103,7 +103,7 @@ def test_a_strategy_of_ones_own_lies_in_the_folder_and_may_fail(
 ) -> None:
     """Row 18: what it raises ends the reach with the zero twist, and is told."""
     Path("own_strategy.py").write_text(
-        "from reachd.seam import Twist\n"
+        "from reachd.interfaces import Twist\n"
         "class Own:\n"
         "    activity = 'own'\n"
         "    def __init__(self, parameters, rng):\n"

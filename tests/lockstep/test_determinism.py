@@ -11,6 +11,9 @@ from types import ModuleType
 
 import pytest
 
+from reachd.strategies.parameters import parameters
+from tactile_tools.reach.lockstep import run_trial
+
 DEPTHS = ("contacts", "taxels")
 
 
@@ -66,3 +69,14 @@ def test_trials_one_after_another_leave_nothing_behind(trace: ModuleType) -> Non
     alone = trace.traced(scene, "hybrid_event", 3, "taxels", seconds=1.5)[1]
     trace.traced(trace.crowded(4), "straight", 9, "taxels", seconds=1.0)
     assert trace.traced(scene, "hybrid_event", 3, "taxels", seconds=1.5)[1] == alone
+
+
+def test_a_trial_runs_at_the_period_of_its_settings(trace: ModuleType) -> None:
+    scene = trace.crowded(4)
+    fast = parameters(scene.parameters)
+    slow = replace(fast, safety=replace(fast.safety, period=2 * fast.safety.period))
+    results = [
+        run_trial(scene, "straight", replace(p, time_limit=0.5), seed=0) for p in (fast, slow)
+    ]
+    assert results[0].cycles > 1.8 * results[1].cycles
+    assert results[0].simulated_s == pytest.approx(results[1].simulated_s, abs=0.05)

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 from matplotlib.image import imread
 
-from tactile_bus.topics import ARM_STATE, COMMAND, FEATURES
-from tactile_tools.benches.stop import SpoiltTrialError, rest_after, zero_after
+from tactile_core.bus.topics import ARM_STATE, COMMAND, FEATURES
 from tactile_tools.cli import main
-from tactile_tools.live_reach import LiveReach
-from tactile_tools.plots.reach_series import read_reach
+from tactile_tools.dev.benches.stop import SpoiltTrialError, rest_after, zero_after
+from tactile_tools.plot.reach_series import read_reach
+from tactile_tools.reach.process_rig import LiveReach
 
 MS = 1_000_000
 

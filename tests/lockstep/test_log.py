@@ -13,7 +13,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from tactile_tools.plots.reach_series import read_reach
+from tactile_tools.plot.reach_series import read_reach
 
 Recorded = Callable[..., tuple[int, Path]]
 

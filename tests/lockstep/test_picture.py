@@ -13,12 +13,12 @@ from matplotlib import colors
 from matplotlib.image import imread
 
 from tactile_tools.cli import main
-from tactile_tools.plots import reach as plot_reach
-from tactile_tools.plots.gaps import holes
-from tactile_tools.plots.look import LOOKS, drawn
-from tactile_tools.plots.reach import draw_reach
-from tactile_tools.plots.reach_series import read_reach
-from tactile_tools.plots.series import LogUnreadableError
+from tactile_tools.plot import reach as plot_reach
+from tactile_tools.plot.curves import holes
+from tactile_tools.plot.look import LOOKS, drawn
+from tactile_tools.plot.reach import draw_reach
+from tactile_tools.plot.reach_series import read_reach
+from tactile_tools.plot.series import LogUnreadableError
 
 Recorded = Callable[..., tuple[int, Path]]
 
@@ -166,8 +166,8 @@ def test_what_a_hole_hides_is_not_drawn(recorded: Recorded, rewrite: Any, tmp_pa
 
 
 def test_a_log_without_a_reach_is_refused(tmp_path: Path) -> None:
-    from tactile_bus.instant import WallClock
-    from tactile_bus.recorder import Recorder
+    from tactile_core.log.recorder import Recorder
+    from tactile_core.types import WallClock
 
     path = tmp_path / "empty.mcap"
     Recorder(path, clock=WallClock(0)).close(10.0)

@@ -20,14 +20,14 @@ import numpy as np
 import pytest
 import zenoh
 
-from tactile_bus.messages import MSG, codec, header
-from tactile_bus.runtime import RUNTIME_VARIABLE
-from tactile_bus.services import ServiceError, call
-from tactile_bus.session import BusConfig, close_session, open_session
-from tactile_bus.streams import ATTACHMENT, Tap
-from tactile_bus.topics import ARM_STATE, COMMAND, FEATURES, service_key
+from tactile_core.bus.messages import MSG, codec, header
+from tactile_core.bus.runtime import RUNTIME_VARIABLE
+from tactile_core.bus.services import ServiceError, call
+from tactile_core.bus.session import BusConfig, close_session, open_session
+from tactile_core.bus.streams import ATTACHMENT, Tap
+from tactile_core.bus.topics import ARM_STATE, COMMAND, FEATURES, service_key
 from tactile_tools.cli import main
-from tactile_tools.live_reach import is_moving
+from tactile_tools.reach.process_rig import is_moving
 
 PATIENCE_S = 60.0
 

@@ -9,10 +9,10 @@ import sys
 from dataclasses import asdict, replace
 from typing import Any
 
-from reachd.parameters import parameters
-from sim_device.world.generate import generate
+from reachd.strategies.parameters import parameters
+from sim_device.world.scene_generation import generate
 from sim_device.world.scenes import Scene
-from tactile_tools.lockstep import Result, Step, run_trial
+from tactile_tools.reach.lockstep import Result, Step, run_trial
 
 SECONDS = 3.0
 """Of a trial: long enough for contacts with several objects."""
@@ -37,7 +37,7 @@ def traced(
     digest = hashlib.sha256()
 
     def watch(step: Step) -> None:
-        arm, twist = step.arm, step.decision.twist
+        arm, twist = step.arm, step.control.decision.twist
         numbers = [arm.x, arm.y, arm.heading, arm.fx, arm.fy, arm.mz]
         numbers += [twist.vx, twist.vy, twist.omega]
         if step.touch is not None:
@@ -46,7 +46,7 @@ def traced(
             digest.update(struct.pack("<qq", touch.captured, touch.received))
         digest.update(struct.pack(f"<q{len(numbers)}d", step.now, *numbers))
         digest.update(step.world.poses().tobytes())
-        digest.update(step.status.activity.encode())
+        digest.update(step.control.status.activity.encode())
 
     limited = replace(parameters(scene.parameters), time_limit=seconds)
     result = run_trial(

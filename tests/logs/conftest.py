@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import zstandard
 
-from tactile_bus import topics
-from tactile_bus.log_info import info
-from tactile_bus.mcap_file import ChunkBuffer, DiskStorage, McapFile
-from tactile_bus.messages import MSG, codec, header
-from tactile_bus.recorder import Recorder, RecorderSettings
+from tactile_core.bus import topics
+from tactile_core.bus.messages import MSG, codec, header
+from tactile_core.log.info import info
+from tactile_core.log.mcap_file import ChunkBuffer, DiskStorage, McapFile
+from tactile_core.log.recorder import Recorder, RecorderSettings
 from tactile_tools.cli import main
 
 BASE_NS = 1_700_000_000_000_000_000

@@ -13,8 +13,8 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from tactile_bus import topics
-from tactile_bus.recorder import RecorderSettings
+from tactile_core.bus import topics
+from tactile_core.log.recorder import RecorderSettings
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -108,8 +108,8 @@ def test_exports_hold_what_the_log_holds(
 
 
 def test_lists_of_numbers_are_columns_lists_or_matrices(log_tool: Any, tmp_path: Path) -> None:
-    from tactile_bus.messages import MSG, codec, header
-    from tactile_bus.recorder import Recorder
+    from tactile_core.bus.messages import MSG, codec, header
+    from tactile_core.log.recorder import Recorder
 
     path = tmp_path / "run.mcap"
     recorder = Recorder(path, RecorderSettings(min_free_bytes=0))

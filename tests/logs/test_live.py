@@ -21,12 +21,12 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tactile_bus.log_info import info
-from tactile_bus.messages import codec
-from tactile_bus.services import ServiceError, call
-from tactile_bus.session import BusConfig, close_session, open_session
-from tactile_bus.streams import Tap
-from tactile_bus.topics import service_key
+from tactile_core.bus.messages import codec
+from tactile_core.bus.services import ServiceError, call
+from tactile_core.bus.session import BusConfig, close_session, open_session
+from tactile_core.bus.streams import Tap
+from tactile_core.bus.topics import service_key
+from tactile_core.log.info import info
 from tactile_tools.processes import command, free_port, running, wait_for
 
 pytestmark = pytest.mark.timeout(600)

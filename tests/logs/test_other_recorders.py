@@ -14,10 +14,10 @@ import pyarrow.parquet
 import pytest
 from mcap.writer import CompressionType, IndexType, Writer
 
-from tactile_bus import topics
-from tactile_bus.log_info import info
-from tactile_bus.log_reader import read_messages
-from tactile_bus.recorder import Recorder, RecorderSettings
+from tactile_core.bus import topics
+from tactile_core.log.info import info
+from tactile_core.log.reader import read_messages
+from tactile_core.log.recorder import Recorder, RecorderSettings
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -120,9 +120,9 @@ def test_a_merged_log_is_in_order_however_far_back_times_go(
     log_tool: Any, tmp_path: Path, held: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With little memory the messages that wait go to files, which are made one now and then."""
-    monkeypatch.setattr("tactile_tools.logs.ordering.HELD_BYTES", held)
-    monkeypatch.setattr("tactile_tools.logs.ordering.MAX_RUNS", 3)
-    monkeypatch.setattr("tactile_tools.logs.ordering.STRETCH_MESSAGES", 50)
+    monkeypatch.setattr("tactile_tools.log.ordering.HELD_BYTES", held)
+    monkeypatch.setattr("tactile_tools.log.ordering.MAX_RUNS", 3)
+    monkeypatch.setattr("tactile_tools.log.ordering.STRETCH_MESSAGES", 50)
     rng = np.random.default_rng(1)
     rows = [
         (0, k, BASE_NS + int(at), float(at))

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tactile_tools.plots import curves, skin
-from tactile_tools.plots.gaps import broken, holes, presses
-from tactile_tools.plots.look import LOOKS, Sheet, drawn
-from tactile_tools.plots.series import BoardSeries, Track, read_boards
+from tactile_tools.plot import curves, skin
+from tactile_tools.plot.curves import broken, holes, presses
+from tactile_tools.plot.look import LOOKS, Sheet, drawn
+from tactile_tools.plot.series import BoardSeries, Track, read_boards
 
 SHEETS: dict[str, Callable[..., Sheet]] = {
     "overview": skin.overview_sheet,

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tactile_tools.cli import main
-from tactile_tools.plots.series import BoardSeries, Spread, Track, read_boards
+from tactile_tools.plot.series import BoardSeries, Spread, Track, read_boards
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -103,7 +103,7 @@ def test_of_two_boards_it_is_said_which_is_drawn(
 
 
 def test_the_strongest_moment_is_that_of_the_press(skin_log: Path) -> None:
-    from tactile_tools.plots.skin import strongest
+    from tactile_tools.plot.skin import strongest
 
     board = read_boards(skin_log)["finger"]
     (moment,) = strongest(board, 1)
@@ -161,8 +161,8 @@ def test_percentiles_are_right_to_six_per_cent() -> None:
 
 
 def test_a_board_without_compensation_or_clock_is_drawn(skin_log: Path, tmp_path: Path) -> None:
-    from tactile_tools.plots.curves import draw_field, draw_timing
-    from tactile_tools.plots.skin import draw
+    from tactile_tools.plot.curves import draw_field, draw_timing
+    from tactile_tools.plot.skin import draw
 
     board = read_boards(skin_log)["finger"]
     bare = BoardSeries(

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tactile_bus.mcap_file import DiskStorage
+from tactile_core.log.mcap_file import DiskStorage
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -82,7 +82,7 @@ def test_a_file_that_the_system_refuses_is_told(
     def refuse(*_: Any, **__: Any) -> Any:
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr("tactile_bus.log_bytes.open", refuse, raising=False)
+    monkeypatch.setattr("tactile_core.log.records.open", refuse, raising=False)
     for command in ("info", "cat", "doctor"):
         outcome = log_tool(command, path)
         assert outcome.code == 3

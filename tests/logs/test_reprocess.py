@@ -12,15 +12,15 @@ from typing import Any
 
 import pytest
 
-from sim_device.board_clock import ClockParameters
+from sim_device.board.firmware import ClockParameters
 from sim_device.faults import FaultPlan
-from tactile_bus.calibration import save
-from tactile_bus.log_info import info
-from tactile_bus.log_reader import read_messages
-from tactile_bus.messages import codec
-from tactile_bus.recorder import RecorderSettings
-from tactile_bus.topics import FEATURES
-from tactiled.sensing.pipeline_settings import PipelineSettings
+from tactile_core.bus.messages import codec
+from tactile_core.bus.topics import FEATURES
+from tactile_core.calibration import save
+from tactile_core.log.info import info
+from tactile_core.log.reader import read_messages
+from tactile_core.log.recorder import RecorderSettings
+from tactiled.sensing.settings import PipelineSettings
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -212,10 +212,10 @@ def test_a_log_whose_beginning_is_missing_is_only_listened_to(
 
 def without_state(part: Path, out: Path) -> None:
     """The part as versions before wrote it, which says less of its boards."""
-    from tactile_bus.log_records import MetadataRecord
-    from tactile_tools.logs.sources import find_series
-    from tactile_tools.logs.stream import Reading, Record, read_series
-    from tactile_tools.logs.writing import LogOutput
+    from tactile_core.log.records import MetadataRecord
+    from tactile_tools.log.sources import find_series
+    from tactile_tools.log.stream import Reading, Record, read_series
+    from tactile_tools.log.writing import LogOutput
 
     with LogOutput(out) as output:
         for item in read_series(find_series([part])[0], Reading()):

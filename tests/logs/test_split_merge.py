@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tactile_bus import topics
-from tactile_bus.arm_types import Twist
-from tactile_bus.commanding import command_message
-from tactile_bus.log_info import info
-from tactile_bus.log_reader import read_messages
-from tactile_bus.recorder import RecorderSettings
+from tactile_core.bus import topics
+from tactile_core.bus.commanding import command_message
+from tactile_core.log.info import info
+from tactile_core.log.reader import read_messages
+from tactile_core.log.recorder import RecorderSettings
+from tactile_core.types import Twist
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -62,8 +62,8 @@ def test_a_split_by_size_or_moment_keeps_everything(
 def test_values_that_hold_begin_every_part(
     log_tool: Any, recorded: Any, tmp_path: Path, counts: Any
 ) -> None:
-    from tactile_bus.messages import MSG, codec, header
-    from tactile_bus.recorder import Recorder
+    from tactile_core.bus.messages import MSG, codec, header
+    from tactile_core.log.recorder import Recorder
 
     none = np.zeros(0, np.float32)
     geometry = MSG.SkinGeometry(
@@ -118,8 +118,8 @@ def test_logs_whose_clocks_differ_are_put_together(
     log_tool: Any, recorded: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = recorded(tmp_path / "a.mcap", 0.2)
-    import tactile_bus.recorder as module
-    from tactile_bus.instant import WallClock
+    import tactile_core.log.recorder as module
+    from tactile_core.types import WallClock
 
     real = WallClock.take().offset_ns
     monkeypatch.setattr(module.WallClock, "take", lambda: WallClock(real + 3_600 * 10**9))

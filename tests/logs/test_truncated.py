@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from tactile_bus.log_records import LogError
-from tactile_bus.mcap_file import DiskStorage
-from tactile_tools.logs import cat, doctor, export, info, recover
-from tactile_tools.logs.terminal import ToolError, fail
+from tactile_core.log.mcap_file import DiskStorage
+from tactile_core.log.records import LogError
+from tactile_tools.log import cat, doctor, export, info, recover
+from tactile_tools.log.terminal import ToolError, fail
 
 pytestmark = pytest.mark.timeout(600)
 

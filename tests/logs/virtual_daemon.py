@@ -10,30 +10,29 @@ from typing import Any
 import numpy as np
 
 from sensor_proto.packets import SetRate
-from sim_device.catalogue import build_skin, factory_calibration, identity
-from sim_device.firmware import CanBoard, SerialBoard
-from sim_device.skin import Contact
-from tactile_bus.calibration import BoardCalibration
-from tactile_bus.instant import NS_PER_S, Instant, WallClock
-from tactile_bus.messages import codec
-from tactile_bus.recorder import Recorder, RecorderSettings
-from tactile_bus.topics import RAW, Topic
+from sim_device.board.catalogue import build_skin, factory_calibration, identity
+from sim_device.board.firmware import CanBoard, SerialBoard
+from sim_device.skin.skin import Contact
+from tactile_core.bus.messages import codec
+from tactile_core.bus.topics import RAW, Topic
+from tactile_core.calibration import BoardCalibration
+from tactile_core.log.recorder import Recorder, RecorderSettings
+from tactile_core.types import NS_PER_S, Instant, WallClock
+from tactiled import journal as kinds
 from tactiled.blocks import Chunk
-from tactiled.inbox import Inbox, PortLost, PortOpened, Wake
-from tactiled.links.events import Identity, Refusal
-from tactiled.links.lines import bus_names, make_line
-from tactiled.links.link import BoardLink
-from tactiled.outgoing import split
+from tactiled.board_session import Station
+from tactiled.boards.board import BoardLink
+from tactiled.boards.events import Identity, Refusal
+from tactiled.boards.line import bus_names, make_line
+from tactiled.calibration_store import Shelf
+from tactiled.journal import Journal
 from tactiled.port import Port
-from tactiled.replay import journal as kinds
-from tactiled.replay.journal import Journal
-from tactiled.replay.recorded import PIPELINE, PORT_PREFIX
-from tactiled.replay.rerun import RecordedSource
-from tactiled.sensing.pipeline_settings import PipelineSettings
-from tactiled.shelf import Shelf
-from tactiled.station import Station
+from tactiled.publisher import split
+from tactiled.reader import Inbox, PortLost, PortOpened, Wake
+from tactiled.rerun import PIPELINE, PORT_PREFIX, RecordedSource
+from tactiled.sensing.settings import PipelineSettings
 from tactiled.transports.base import Medium
-from tactiled.transports.raw_chunk import to_raw
+from tactiled.transports.recorded_log import to_raw
 
 SEED = 7
 STEP_NS = NS_PER_S // 500
@@ -50,7 +49,7 @@ def press(seconds: float) -> list[Contact]:
 
 
 class LogSink:
-    """`tactiled.outlet.Outlet` without a bus."""
+    """`tactiled.publisher.Outlet` without a bus."""
 
     def __init__(self, recorder: Recorder) -> None:
         self.wall = WALL

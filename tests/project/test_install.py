@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = ("tactiled", "reachd", "simdevice", "tactile")
-TOP_LEVEL = {"sensor_proto", "sim_device", "tactile_bus", "tactiled", "reachd", "tactile_tools"}
+TOP_LEVEL = {"sensor_proto", "sim_device", "tactile_core", "tactiled", "reachd", "tactile_tools"}
 
 
 def run(*words: str | Path, **kwargs: object) -> subprocess.CompletedProcess[str]:
@@ -43,7 +43,7 @@ def test_the_wheel_holds_our_packages_and_nothing_generic(wheel: Path) -> None:
     tops = {name.split("/")[0] for name in names}
     assert {t for t in tops if not t.endswith(".dist-info")} == TOP_LEVEL
     assert "sensor_proto/PROTOCOL.md" in names
-    assert "tactile_bus/msg/ContactFeatures.msg" in names
+    assert "tactile_core/bus/msg/ContactFeatures.msg" in names
 
 
 @pytest.mark.timeout(300)

@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 from tactile_tools.cli import main
-from tactile_tools.fuzz import PIPELINE_KINDS, run_pipeline
-from tactile_tools.fuzzers import pipeline
+from tactile_tools.dev.fuzz import PIPELINE_KINDS, run_pipeline
+from tactile_tools.dev.fuzzers import pipeline
 
 
 def test_frames_with_right_crcs_that_say_anything_break_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("tactile_tools.fuzz.PIPELINE_BLOCK", 300)
+    monkeypatch.setattr("tactile_tools.dev.fuzz.PIPELINE_BLOCK", 300)
     done = run_pipeline(900, seed=11)
     assert done["failures"] == []
     assert done["mutated"] >= 900
@@ -24,7 +24,7 @@ def test_frames_with_right_crcs_that_say_anything_break_nothing(
 
 
 def test_a_block_repeats_by_its_number_and_a_run_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tactile_tools.fuzz.PIPELINE_BLOCK", 100)
+    monkeypatch.setattr("tactile_tools.dev.fuzz.PIPELINE_BLOCK", 100)
     whole = run_pipeline(300, seed=5)
     assert sorted(whole["media"]) == sorted(PIPELINE_KINDS)
     assert whole["failures"] == []

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from reachd.settings import ConfigFile as ReachConfig
-from tactile_bus.config import load_toml
+from tactile_core.config import load_toml
 from tactile_tools.cli import main
-from tactile_tools.service import UNITS
+from tactile_tools.operate.service import UNITS
 from tactiled.settings import ConfigFile as SkinConfig
 
 ALLOWED_EXPOSURE = 4.0

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reachd.parameters import SETS
-from reachd.safety import Decision, SafetyGate
-from reachd.safety_settings import Check, SafetySettings
-from reachd.seam import ZERO, ArmState, Goal, Strategy, Touch, Twist
-from tactile_bus.geometry import Side
-from tactile_bus.instant import Instant, after
+from reachd.gate.gate import Decision, SafetyGate
+from reachd.gate.settings import Check, SafetySettings
+from reachd.interfaces import ZERO, ArmState, Goal, Strategy, Touch, Twist
+from reachd.strategies.parameters import SETS
+from tactile_core.geometry import Side
+from tactile_core.types import Instant, after
 
 T0 = Instant(5_000_000_000)
 GOAL = Goal(0.358, 0.0, 0.0075, 40.0)

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from reachd.safety import Decision
-from reachd.safety_settings import Check
-from reachd.seam import ZERO, Twist
-from tactile_bus.instant import Instant, after
+from reachd.gate.gate import Decision
+from reachd.gate.settings import Check
+from reachd.interfaces import ZERO, Twist
+from tactile_core.types import Instant, after
 
 MS = 1_000_000
 T0 = Instant(5_000_000_000)

@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reachd.limits import (
+from reachd.gate.limits import (
     ROUNDING,
     Constraint,
     constrained,
     workspace_constraints,
     wrench_constraints,
 )
-from reachd.parameters import HARDWARE
-from reachd.seam import ZERO, ArmState, Twist
-from tactile_bus.instant import Instant
+from reachd.interfaces import ZERO, ArmState, Twist
+from reachd.strategies.parameters import HARDWARE
+from tactile_core.types import Instant
 
 T0 = Instant(5_000_000_000)
 L = 0.158

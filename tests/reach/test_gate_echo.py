@@ -7,10 +7,9 @@ from typing import Any
 
 import pytest
 
-from reachd.safety_settings import ALWAYS_ON, Check
-from reachd.seam import ZERO
-from tactile_bus.arm_types import Echo
-from tactile_bus.instant import Instant, after
+from reachd.gate.settings import ALWAYS_ON, Check
+from reachd.interfaces import ZERO
+from tactile_core.types import Echo, Instant, after
 
 MS = 1_000_000
 

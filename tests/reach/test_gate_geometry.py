@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from reachd.limits import Constraint, constrained, workspace_constraints
-from reachd.safety import SafetyGate
-from reachd.safety_settings import Check, SafetySettings
-from reachd.seam import Twist
-from tactile_bus.instant import Instant, after
+from reachd.gate.gate import SafetyGate
+from reachd.gate.limits import Constraint, constrained, workspace_constraints
+from reachd.gate.settings import Check, SafetySettings
+from reachd.interfaces import Twist
+from tactile_core.types import Instant, after
 
 T0 = Instant(5_000_000_000)
 PERIOD_S = 0.01

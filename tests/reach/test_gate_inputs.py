@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import pytest
 
-from reachd.safety_settings import Check
-from reachd.seam import ZERO, Twist
-from reachd.workspace import Region
-from tactile_bus.instant import Instant
+from reachd.gate.settings import Check
+from reachd.gate.workspace import Region
+from reachd.interfaces import ZERO, Twist
+from tactile_core.types import Instant
 
 MS = 1_000_000
 T0 = Instant(5_000_000_000)

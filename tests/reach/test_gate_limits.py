@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import pytest
 
-from reachd.limits import within_acceleration, within_speed
-from reachd.safety import Decision
-from reachd.safety_settings import Check, SafetySettings
-from reachd.seam import ZERO, Goal, Twist
-from tactile_bus.instant import Instant
+from reachd.gate.gate import Decision
+from reachd.gate.limits import within_acceleration, within_speed
+from reachd.gate.settings import Check, SafetySettings
+from reachd.interfaces import ZERO, Goal, Twist
+from tactile_core.types import Instant
 
 T0 = Instant(5_000_000_000)
 SPEED, TURN, L = 0.045 + 0.158 * 0.1, 0.1, 0.158

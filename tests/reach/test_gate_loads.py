@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from reachd.limits import felt
-from reachd.safety import SKIN_LATCH
-from reachd.safety_settings import Check
-from reachd.seam import ZERO, Twist
-from tactile_bus.geometry import Side
-from tactile_bus.instant import after
+from reachd.gate.gate import SKIN_LATCH
+from reachd.gate.limits import felt
+from reachd.gate.settings import Check
+from reachd.interfaces import ZERO, Twist
+from tactile_core.geometry import Side
+from tactile_core.types import after
 
 AHEAD = Twist(0.04, 0.0, 0.0)
 OFF = (Check.ACCELERATION, Check.WORKSPACE, Check.ARM_FROZEN, Check.WRENCH)

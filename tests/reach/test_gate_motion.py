@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reachd.motion import DEAD, OFF_THE_WAY, TOO_FAST, MotionWatch
-from reachd.parameters import SETS
-from reachd.safety_settings import Check
-from reachd.seam import ZERO, Twist
-from tactile_bus.instant import Instant, after
+from reachd.gate.motion import DEAD, OFF_THE_WAY, TOO_FAST, MotionWatch
+from reachd.gate.settings import Check
+from reachd.interfaces import ZERO, Twist
+from reachd.strategies.parameters import SETS
+from tactile_core.types import Instant, after
 
 AHEAD = Twist(0.04, 0.0, 0.0)
 L = 0.158

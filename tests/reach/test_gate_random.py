@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reachd.limits import ROUNDING, approach_left, load, workspace_constraints
-from reachd.parameters import SETS
-from reachd.safety import SafetyGate
-from reachd.safety_settings import MOVING_MODES, Check, SafetySettings
-from reachd.seam import ZERO, ArmState, Goal, Touch, Twist
-from tactile_bus.geometry import Side
-from tactile_bus.instant import Instant
+from reachd.gate.gate import SafetyGate
+from reachd.gate.limits import ROUNDING, approach_left, load, workspace_constraints
+from reachd.gate.settings import MOVING_MODES, Check, SafetySettings
+from reachd.interfaces import ZERO, ArmState, Goal, Touch, Twist
+from reachd.strategies.parameters import SETS
+from tactile_core.geometry import Side
+from tactile_core.types import Instant
 
 INPUTS = int(os.environ.get("REACH_RANDOM_INPUTS", "100000"))
 REPORT = os.environ.get("REACH_RANDOM_JSON")
@@ -164,7 +164,7 @@ def test_random_commands_with_every_limit_off_are_finite(
 ) -> None:
     from dataclasses import replace
 
-    from reachd.safety_settings import ALWAYS_ON
+    from reachd.gate.settings import ALWAYS_ON
 
     off = replace(settings, disabled=frozenset(Check) - ALWAYS_ON)
     gate = make_gate(off)

@@ -7,12 +7,12 @@ from collections.abc import Callable
 
 import pytest
 
-from reachd.limits import ROUNDING
-from reachd.parameters import HARDWARE
-from reachd.safety import Decision
-from reachd.safety_settings import Check, SafetySettings
-from reachd.seam import ZERO, Twist
-from tactile_bus.instant import Instant
+from reachd.gate.gate import Decision
+from reachd.gate.limits import ROUNDING
+from reachd.gate.settings import Check, SafetySettings
+from reachd.interfaces import ZERO, Twist
+from reachd.strategies.parameters import HARDWARE
+from tactile_core.types import Instant
 
 T0 = Instant(5_000_000_000)
 L = 0.158

@@ -10,11 +10,11 @@ from collections.abc import Callable
 
 import pytest
 
-from reachd.limits import approach_left, load
-from reachd.safety import Decision
-from reachd.safety_settings import Check, SafetySettings
-from reachd.seam import ZERO, Twist
-from tactile_bus.instant import Instant
+from reachd.gate.gate import Decision
+from reachd.gate.limits import approach_left, load
+from reachd.gate.settings import Check, SafetySettings
+from reachd.interfaces import ZERO, Twist
+from tactile_core.types import Instant
 
 T0 = Instant(5_000_000_000)
 L = 0.158

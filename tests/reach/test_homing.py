@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import pytest
 
-from reachd.homing import Pose, home_twist
-from reachd.parameters import HARDWARE
-from reachd.seam import Twist
+from reachd.interfaces import Twist
+from reachd.strategies.parameters import HARDWARE
+from reachd.trial import Pose, home_twist
 
 HOME = Pose(-0.2, 0.0, 0.0)
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reachd.parameters import AUTHORS_SIM, parameters
-from reachd.primitives import aim, burrow, straight
-from reachd.seam import ZERO, Goal
+from reachd.interfaces import ZERO, Goal
 from reachd.strategies import load_strategy
-from tactile_bus.geometry import Side
-from tactile_bus.instant import Instant, after
+from reachd.strategies.parameters import AUTHORS_SIM, parameters
+from reachd.strategies.primitives import aim, burrow, straight
+from tactile_core.geometry import Side
+from tactile_core.types import Instant, after
 
 T0 = Instant(5_000_000_000)
 FAR = Goal(5.0, 0.0, 0.001, 20.0)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tactile_tools import mutation
+from tactile_tools.dev import mutation
 
 SOURCE = """
 LIMIT = 3
@@ -57,13 +57,15 @@ def test_every_mutant_is_a_program_that_differs() -> None:
 def test_a_noticed_mutant_is_killed_and_another_survives(tmp_path: Path) -> None:
     test = tmp_path / "test_it.py"
     test.write_text(
-        "from reachd.limits import approach_left\n"
+        "from reachd.gate.limits import approach_left\n"
         "def test_it(): assert approach_left(0.9, 0.8) < 0.6 and approach_left(0.5, 0.8) == 1.0\n",
         encoding="utf-8",
     )
-    source = (mutation.PACKAGE / "limits.py").read_text(encoding="utf-8")
-    made = [m for m in mutation.mutants("limits.py", source) if "part" in m.before]
+    source = (mutation.PACKAGE / "gate/limits.py").read_text(encoding="utf-8")
+    made = [m for m in mutation.mutants("gate/limits.py", source) if "part" in m.before]
     caught = next(m for m in made if m.after == "1.0 + part")
-    missed = next(m for m in mutation.mutants("limits.py", source) if m.before == "force > 0.0")
+    missed = next(
+        m for m in mutation.mutants("gate/limits.py", source) if m.before == "force > 0.0"
+    )
     assert mutation.judge(mutation.PACKAGE, caught, [str(test)], 60.0) == "killed"
     assert mutation.judge(mutation.PACKAGE, missed, [str(test)], 60.0) == "survived"

@@ -9,10 +9,10 @@ from dataclasses import replace
 import pytest
 
 from reachd.fields import Choice, Flag, Number, SettingError, described
-from reachd.goals import make_goal, parse_target
-from reachd.parameters import AUTHORS_SIM, HARDWARE, SETS, parameters
-from reachd.safety_settings import ALWAYS_ON, Check
-from reachd.workspace import Region, box, region
+from reachd.gate.settings import ALWAYS_ON, Check
+from reachd.gate.workspace import Region, box, region
+from reachd.services import make_goal, parse_target
+from reachd.strategies.parameters import AUTHORS_SIM, HARDWARE, SETS, parameters
 
 TABLES = {
     # Tables I and II of the paper.

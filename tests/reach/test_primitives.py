@@ -12,8 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad, solve_ivp
 
-from reachd.parameters import AUTHORS_SIM, HARDWARE, parameters
-from reachd.primitives import (
+from reachd.interfaces import Goal
+from reachd.strategies.builtin import Burrow, Straight
+from reachd.strategies.parameters import AUTHORS_SIM, HARDWARE, parameters
+from reachd.strategies.primitives import (
     Aim,
     aim,
     burrow,
@@ -24,8 +26,6 @@ from reachd.primitives import (
     turn_rate,
     wrapped,
 )
-from reachd.seam import Goal
-from reachd.strategies.isolated import Burrow, Straight
 
 L = 0.158
 RNG = np.random.default_rng(0)

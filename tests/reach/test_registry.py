@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reachd.parameters import HARDWARE
-from reachd.seam import Goal, Strategy, Twist
-from reachd.strategies import StrategyError, ask, available, begin, load_strategy, registry
-from tactile_bus.geometry import Side
-from tactile_bus.instant import Instant
+from reachd.interfaces import Goal, Strategy, Twist
+from reachd.strategies import StrategyError, ask, available, begin, load_strategy, runner
+from reachd.strategies.parameters import HARDWARE
+from tactile_core.geometry import Side
+from tactile_core.types import Instant
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "strategies.md"
 GOAL = Goal(0.358, 0.03, 0.0075, 40.0)
@@ -95,11 +95,11 @@ def test_a_package_offers_strategies_by_entry_point(
         """,
     )
     found = (
-        EntryPoint("straight", "offered:Mine", registry.GROUP),
-        EntryPoint("mine", "offered:Mine", registry.GROUP),
+        EntryPoint("straight", "offered:Mine", runner.GROUP),
+        EntryPoint("mine", "offered:Mine", runner.GROUP),
     )
-    monkeypatch.setattr(registry, "entry_points", lambda *, group: found)
-    assert available() == (*registry.BUILT_IN, "mine")
+    monkeypatch.setattr(runner, "entry_points", lambda *, group: found)
+    assert available() == (*runner.BUILT_IN, "mine")
     strategy: Any = load("mine")
     assert strategy.activity == "mine"
     assert strategy.given[0] is HARDWARE

@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reachd.finite import usable
-from reachd.parameters import AUTHORS_SIM, HARDWARE, parameters
-from reachd.seam import ZERO, ArmState, Goal, Twist
+from reachd.gate.limits import usable
+from reachd.interfaces import ZERO, ArmState, Goal, Twist
 from reachd.strategies import load_strategy
-from reachd.strategies.base import MAX_EVENTS, Moment, ReachingStrategy
-from tactile_bus.geometry import Side
-from tactile_bus.instant import Instant, after
+from reachd.strategies.builtin import MAX_EVENTS, Moment, ReachingStrategy
+from reachd.strategies.parameters import AUTHORS_SIM, HARDWARE, parameters
+from tactile_core.geometry import Side
+from tactile_core.types import Instant, after
 
 T0 = Instant(5_000_000_000)
 FAR = Goal(5.0, 0.0, 0.001, 20.0)

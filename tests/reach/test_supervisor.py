@@ -9,18 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reachd.goals import make_goal
-from reachd.homing import Pose
-from reachd.outcome import Onsets, Outcome, Reason
-from reachd.parameter_fields import Parameters
-from reachd.parameters import AUTHORS_SIM, HARDWARE, parameters
-from reachd.safety import Intervention, SafetyGate
-from reachd.safety_settings import Check
-from reachd.seam import ZERO, ArmState, Goal, Strategy, Touch, Twist
+from reachd.gate.gate import Intervention, SafetyGate
+from reachd.gate.settings import Check
+from reachd.interfaces import ZERO, ArmState, Goal, Strategy, Touch, Twist
+from reachd.services import make_goal
 from reachd.strategies import load_strategy
-from reachd.supervisor import HOMING_LIMIT, State, Supervisor
-from tactile_bus.geometry import Side
-from tactile_bus.instant import Instant, after
+from reachd.strategies.parameter_fields import Parameters
+from reachd.strategies.parameters import AUTHORS_SIM, HARDWARE, parameters
+from reachd.trial import HOMING_LIMIT, Onsets, Outcome, Pose, Reason, State, Supervisor
+from tactile_core.geometry import Side
+from tactile_core.types import Instant, after
 
 T0 = Instant(5_000_000_000)
 HOME = Pose(-0.2, 0.0, 0.0)

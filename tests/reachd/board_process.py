@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 import time
 
-from tactile_bus.instant import WallClock, monotonic_now
-from tactile_bus.messages import MSG, codec, header
-from tactile_bus.session import BusConfig, open_session
-from tactile_bus.streams import declare_alive, declare_publisher
-from tactile_bus.topics import FEATURES
+from tactile_core.bus.messages import MSG, codec, header
+from tactile_core.bus.session import BusConfig, open_session
+from tactile_core.bus.streams import declare_alive, declare_publisher
+from tactile_core.bus.topics import FEATURES
+from tactile_core.types import WallClock, monotonic_now
 
 
 def main(endpoint: str, board: str, ahead: float, prefix: str) -> None:

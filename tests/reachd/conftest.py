@@ -20,22 +20,21 @@ from typing import Any
 import pytest
 import zenoh
 
-from reachd.parameters import SETS
-from tactile_bus.arm_services import serve_desk
-from tactile_bus.arm_types import ArmLimits
-from tactile_bus.commanding import (
+from reachd.strategies.parameters import SETS
+from tactile_core.bus.commanding import (
     CommandDesk,
     LimitsRequest,
     NotGrantedError,
     Order,
     limits_fields,
+    serve_desk,
 )
-from tactile_bus.instant import WallClock, monotonic_now
-from tactile_bus.messages import MSG, codec, header
-from tactile_bus.services import ServiceError, call, declare_service
-from tactile_bus.session import BusConfig, close_session, open_session
-from tactile_bus.streams import declare_publisher
-from tactile_bus.topics import ARM_STATE, COMMAND, REACH_EVENT, REACH_STATE, service_key
+from tactile_core.bus.messages import MSG, codec, header
+from tactile_core.bus.services import ServiceError, call, declare_service
+from tactile_core.bus.session import BusConfig, close_session, open_session
+from tactile_core.bus.streams import declare_publisher
+from tactile_core.bus.topics import ARM_STATE, COMMAND, REACH_EVENT, REACH_STATE, service_key
+from tactile_core.types import ArmLimits, WallClock, monotonic_now
 
 SLOW = 60.0
 """s that anything may take on a busy machine before a test gives it up."""

@@ -7,17 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reachd.cycle import Controller, Cycle, Inputs
-from reachd.goals import make_goal
-from reachd.outcome import Reason
-from reachd.parameters import HARDWARE
-from reachd.safety import SafetyGate
-from reachd.safety_settings import Check
-from reachd.seam import ZERO, ArmState, Touch
+from reachd.control import Controller, Cycle, Inputs
+from reachd.gate.gate import SafetyGate
+from reachd.gate.settings import Check
+from reachd.interfaces import ZERO, ArmState, Touch
+from reachd.services import make_goal
 from reachd.strategies import load_strategy
-from reachd.supervisor import Supervisor
-from tactile_bus.geometry import Side
-from tactile_bus.instant import NS_PER_S, Instant, after
+from reachd.strategies.parameters import HARDWARE
+from reachd.trial import Reason, Supervisor
+from tactile_core.geometry import Side
+from tactile_core.types import NS_PER_S, Instant, after
 
 SAFETY = HARDWARE.safety
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
-from tactile_bus.messages import codec
-from tactile_bus.topics import REACH_EVENT
+from tactile_core.bus.messages import codec
+from tactile_core.bus.topics import REACH_EVENT
 
 NEAR = ("--strategy", "straight", "--target", "0.04,0.0", "--seed", "1")
 FAR = ("--strategy", "straight", "--target", "0.36,0.0", "--seed", "1")

@@ -10,14 +10,13 @@ from typing import Any
 
 import pytest
 
-from reachd.snapshot import Input, make_arm_state, make_touch
-from reachd.touch_input import FEATURES
-from tactile_bus.instant import NS_PER_S, Instant
-from tactile_bus.log_info import info
-from tactile_bus.messages import MSG, codec, header
-from tactile_bus.services import ServiceError
-from tactile_bus.streams import ATTACHMENT, BusSample
-from tactile_bus.topics import ARM_STATE, TF
+from reachd.inputs import FEATURES, Input, make_arm_state, make_touch
+from tactile_core.bus.messages import MSG, codec, header
+from tactile_core.bus.services import ServiceError
+from tactile_core.bus.streams import ATTACHMENT, BusSample
+from tactile_core.bus.topics import ARM_STATE, TF
+from tactile_core.log.info import info
+from tactile_core.types import NS_PER_S, Instant
 
 NEAR = ("--strategy", "straight", "--target", "0.04,0.0", "--seed", "1")
 

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reachd.cycle import Controller, Cycle, Inputs
-from reachd.loop import LAST_ZEROS, ControlLoop, Lateness, Schedule
-from reachd.parameters import HARDWARE
-from reachd.safety import SafetyGate
-from reachd.seam import ZERO, Twist
+from reachd.control import LAST_ZEROS, Controller, ControlLoop, Cycle, Inputs, Lateness, Schedule
+from reachd.gate.gate import SafetyGate
+from reachd.interfaces import ZERO, Twist
 from reachd.strategies import load_strategy
-from reachd.supervisor import Supervisor
-from tactile_bus.instant import NS_PER_S, Instant, after
+from reachd.strategies.parameters import HARDWARE
+from reachd.trial import Supervisor
+from tactile_core.types import NS_PER_S, Instant, after
 
 START = Instant(7 * NS_PER_S)
 

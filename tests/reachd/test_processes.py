@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from tactile_bus.arm_types import ArmLimits
-from tactile_bus.log_info import info
-from tactile_bus.messages import codec
-from tactile_bus.recovery import recover
-from tactile_bus.services import ServiceError, declare_service
-from tactile_bus.streams import declare_publisher
-from tactile_bus.topics import FEATURES, service_key
+from tactile_core.bus.messages import codec
+from tactile_core.bus.services import ServiceError, declare_service
+from tactile_core.bus.streams import declare_publisher
+from tactile_core.bus.topics import FEATURES, service_key
+from tactile_core.log.info import info
+from tactile_core.log.recovery import recover
+from tactile_core.types import ArmLimits
 
 NEAR = ("--strategy", "straight", "--target", "0.04,0.0", "--seed", "1")
 FAR = ("--strategy", "straight", "--target", "0.36,0.0", "--seed", "1")
@@ -269,7 +269,7 @@ def test_a_strategy_that_fails_or_hangs_ends_in_standing_still(lab: Any, wait_un
     """Row 18, and a strategy that never returns."""
     (lab.folder / "own.py").write_text(
         "import time\n"
-        "from reachd.seam import Twist\n"
+        "from reachd.interfaces import Twist\n"
         "class Own:\n"
         "    activity = 'own'\n"
         "    def __init__(self, parameters, rng):\n"
@@ -324,7 +324,7 @@ def test_forged_bytes_never_take_the_daemon_down(lab: Any, wait_until: Until) ->
 
 
 def _none() -> Any:
-    from tactile_bus.messages import MSG, header
+    from tactile_core.bus.messages import MSG, header
 
     zero = MSG.Vector3(0.0, 0.0, 0.0)
     return MSG.ContactFeatures(

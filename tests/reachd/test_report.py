@@ -8,9 +8,9 @@ import math
 
 from rich.console import Console
 
-from reachd.outcome import Excavation, Outcome, Reason
-from reachd.report import as_json, last_line, show
-from reachd.seam import Goal
+from reachd.interfaces import Goal
+from reachd.publish import as_json, last_line, show
+from reachd.trial import Excavation, Outcome, Reason
 
 GOAL = Goal(0.358, 0.03, 0.0075, 40.0)
 ABOUT = {"strategy": "hybrid_event", "set": "hardware", "seed": 7}

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reachd.snapshot import DUPLICATE_FOR, Input, RemoteClock, SourcePin, Verdict, make_touch
-from tactile_bus.geometry import Side
-from tactile_bus.instant import NS_PER_S, Instant, after
-from tactile_bus.messages import MSG, codec, header
-from tactile_bus.streams import BusSample
-from tactile_bus.topics import FEATURES
+from reachd.inputs import DUPLICATE_FOR, Input, RemoteClock, SourcePin, Verdict, make_touch
+from tactile_core.bus.messages import MSG, codec, header
+from tactile_core.bus.streams import BusSample
+from tactile_core.bus.topics import FEATURES
+from tactile_core.geometry import Side
+from tactile_core.types import NS_PER_S, Instant, after
 
 A, B = b"a" * 16, b"b" * 16
 TAKEOVER = 0.2

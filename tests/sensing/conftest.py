@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactile_bus.calibration import ArrayCalibration, BoardCalibration
-from tactile_bus.geometry import Side, grid_on_plane
-from tactile_bus.instant import Instant
+from tactile_core.calibration import ArrayCalibration, BoardCalibration
+from tactile_core.geometry import Side, grid_on_plane
+from tactile_core.types import Instant
 from tactiled.blocks import Cycle, SampleBlock
 from tactiled.sensing.pipeline import BoardPipeline
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_bus.calibration import nominal
-from tactile_bus.instant import Instant
-from tactile_tools.benches.sensing import bench_consensus, bench_pipeline, bench_rotation
+from tactile_core.calibration import nominal
+from tactile_core.types import Instant
+from tactile_tools.dev.benches.sensing import bench_consensus, bench_pipeline, bench_rotation
 from tactiled.blocks import SampleBlock
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sensor_proto.packets import ArrayDescriptor, ChipType, Descriptor
-from tactile_bus import calibration
-from tactile_bus.calibration import CalibrationError, CalibrationMismatch, nominal
-from tactile_bus.geometry import finger
+from tactile_core import calibration
+from tactile_core.calibration import CalibrationError, CalibrationMismatch, nominal
+from tactile_core.geometry import finger
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tactile_bus.calibration import nominal
+from tactile_core.calibration import nominal
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 
 AMBIENT = np.array([20.0, 10.0, -40.0])

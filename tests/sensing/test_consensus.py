@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tactile_bus.calibration import nominal
-from tactiled.sensing.candidates import design_candidates
-from tactiled.sensing.consensus import Consensus, Prior
-from tactiled.sensing.force_model import ForceModel
+from tactile_core.calibration import nominal
+from tactiled.sensing.consensus import Consensus, Prior, design_candidates
+from tactiled.sensing.forces import ForceModel
 from tactiled.sensing.layout import Layout
 
 

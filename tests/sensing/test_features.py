@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tactile_bus.calibration import nominal
-from tactile_bus.geometry import Side, finger
-from tactile_bus.instant import Instant
-from tactiled.sensing.features import FeatureExtractor
-from tactiled.sensing.patches import Adjacency
+from tactile_core.calibration import nominal
+from tactile_core.geometry import Side, finger
+from tactile_core.types import Instant
+from tactiled.sensing.features import Adjacency, FeatureExtractor
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 
 GEOMETRY = finger()

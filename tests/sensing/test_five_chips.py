@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_device.environment import Environment, EnvironmentParameters, rotation_about
 from sim_device.faults import FaultPlan
-from sim_device.parameters import anyskin_parameters
-from sim_device.sampler import Sampler
-from sim_device.skin import Contact, SkinModel
-from tactile_bus.calibration import nominal
-from tactile_bus.geometry import anyskin
-from tactile_bus.instant import Instant
-from tactile_tools.benches.skin5 import TURN_AXIS, Board
+from sim_device.skin.environment import Environment, EnvironmentParameters, rotation_about
+from sim_device.skin.parameters import anyskin_parameters
+from sim_device.skin.sampler import Sampler
+from sim_device.skin.skin import Contact, SkinModel
+from tactile_core.calibration import nominal
+from tactile_core.geometry import anyskin
+from tactile_core.types import Instant
+from tactile_tools.dev.benches.skin5 import TURN_AXIS, Board
 from tactiled.blocks import Cycle, SampleBlock
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings, RestState
 from tactiled.sensing.reasons import REPLUGGED

@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_device.anyskin_board import AnySkinBoard
-from sim_device.catalogue import build_skin
-from sim_device.environment import Environment
+from sim_device.board.anyskin import AnySkinBoard
+from sim_device.board.catalogue import build_skin
+from sim_device.board.recorded import ReplayBoard, load
 from sim_device.faults import FaultPlan
-from sim_device.replay import ReplayBoard, load
-from sim_device.skin import Contact
-from tactile_bus.instant import Instant
-from tactile_bus.nominal import nominal
+from sim_device.skin.environment import Environment
+from sim_device.skin.skin import Contact
+from tactile_core.calibration.nominal import nominal
+from tactile_core.types import Instant
 from tactiled.blocks import Chunk, Cycle
-from tactiled.links.events import Sampled
-from tactiled.links.line import SerialLine
+from tactiled.boards.events import Sampled
+from tactiled.boards.line import SerialLine
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
-from tactiled.sensing.readings import Fault
+from tactiled.sensing.reasons import Fault
 
 RECORDINGS = Path(__file__).parents[2].parent / "shared" / "data" / "eflesh"
 TICK_NS = 4_000_000

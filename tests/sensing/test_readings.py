@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactile_bus.instant import Instant
-from tactile_bus.nominal import nominal
+from tactile_core.calibration.nominal import nominal
+from tactile_core.types import Instant
 from tactiled.blocks import Cycle, SampleBlock, TaxelHealth
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
-from tactiled.sensing.readings import Fault
+from tactiled.sensing.reasons import Fault
 
 Float = NDArray[np.float64]
 

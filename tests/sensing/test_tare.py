@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bus.calibration import nominal
+from tactile_core.calibration import nominal
 from tactiled.blocks import TaxelHealth
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 

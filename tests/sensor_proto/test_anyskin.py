@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sensor_proto.anyskin import MAX_BUFFER, AnySkinDecoder, encode_anyskin
-from sensor_proto.decoder import Decoder
-from sensor_proto.packets import FloatSamples, Received, TaxelStatus
+from sensor_proto.packets import Decoder, FloatSamples, Received, TaxelStatus
 
 RELOCK = 3  # frames that are held back until the boundary is certain again
 

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sensor_proto.canseg import BROADCAST, MARK, CanDecoder, CanEncoder, CanFrame
-from sensor_proto.decoder import Decoder
+from sensor_proto.can_transfers import BROADCAST, MARK, CanDecoder, CanEncoder, CanFrame
 from sensor_proto.packets import (
     Ack,
     AckResult,
     ClockPoll,
+    Decoder,
     MessageType,
     Received,
     Samples,

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from sensor_proto import packet
-from tactile_tools import fuzz
-from tactile_tools.fuzzers.can import KINDS as CAN_KINDS
-from tactile_tools.fuzzers.messages import random_messages
-from tactile_tools.fuzzers.serial import KINDS as SERIAL_KINDS
+from sensor_proto import packets
+from tactile_tools.dev import fuzz
+from tactile_tools.dev.fuzzers.can import KINDS as CAN_KINDS
+from tactile_tools.dev.fuzzers.messages import random_messages
+from tactile_tools.dev.fuzzers.serial import KINDS as SERIAL_KINDS
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_the_number_of_processes_changes_nothing() -> None:
 
 @pytest.mark.usefixtures("small_blocks")
 def test_a_decoder_without_a_crc_would_be_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(packet, "intact", lambda packets: [True] * len(packets))
+    monkeypatch.setattr(packets, "intact", lambda packets: [True] * len(packets))
     result = fuzz.run_fuzz(6000, seed=1)
     assert result["media"]["serial"]["wrong"] > 50
     assert result["media"]["can"]["wrong"] > 20

@@ -11,11 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sensor_proto.anyskin import AnySkinDecoder
-from sensor_proto.layout import Layout
-from sensor_proto.layout_decoder import LayoutDecoder
+from sensor_proto.layouts import Layout, LayoutDecoder, TextDecoder
 from sensor_proto.packets import FloatSamples, Received, TaxelStatus
 from sensor_proto.survey import Finding, Survey
-from sensor_proto.text_frames import TextDecoder
 
 Rows = list[tuple[float, float, float, float]]
 """(t, x, y, z) of each chip."""

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sensor_proto.canseg import CanDecoder, CanEncoder
+from sensor_proto.can_transfers import CanDecoder, CanEncoder
 from sensor_proto.framing import SerialDecoder, encode_serial
 from sensor_proto.packets import (
     Ack,

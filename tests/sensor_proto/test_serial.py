@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sensor_proto.decoder import Decoder
 from sensor_proto.framing import MAX_FRAME, SerialDecoder, encode_serial
-from sensor_proto.packets import ClockPoll, Log, Received, Samples, Start
+from sensor_proto.packets import ClockPoll, Decoder, Log, Received, Samples, Start
 
 MakeSamples = Callable[..., Samples]
 

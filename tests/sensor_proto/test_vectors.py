@@ -12,7 +12,7 @@ import pytest
 
 import sensor_proto
 from sensor_proto.anyskin import encode_anyskin
-from sensor_proto.canseg import CanDecoder, CanEncoder, CanFrame
+from sensor_proto.can_transfers import CanDecoder, CanEncoder, CanFrame
 from sensor_proto.framing import SerialDecoder, encode_serial
 from sensor_proto.packets import (
     Ack,

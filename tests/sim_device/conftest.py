@@ -8,16 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sensor_proto.canseg import CanDecoder, CanEncoder
+from sensor_proto.can_transfers import CanDecoder, CanEncoder
 from sensor_proto.framing import SerialDecoder, encode_serial
 from sensor_proto.packets import Message, Received, Samples
-from sim_device.controller import Identity
-from sim_device.environment import Environment, EnvironmentParameters
-from sim_device.firmware import CanBoard, SerialBoard
-from sim_device.parameters import SkinParameters
-from sim_device.skin import SkinModel
-from tactile_bus.geometry import Side, SkinGeometry, grid_on_plane
-from tactile_bus.instant import Instant
+from sim_device.board.firmware import CanBoard, Identity, SerialBoard
+from sim_device.skin.environment import Environment, EnvironmentParameters
+from sim_device.skin.parameters import SkinParameters
+from sim_device.skin.skin import SkinModel
+from tactile_core.geometry import Side, SkinGeometry, grid_on_plane
+from tactile_core.types import Instant
 
 MS = 1_000_000
 

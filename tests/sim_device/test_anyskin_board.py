@@ -9,13 +9,13 @@ import pytest
 
 from sensor_proto.anyskin import AnySkinDecoder
 from sensor_proto.packets import FloatSamples, TaxelStatus
-from sim_device.anyskin_board import AnySkinBoard
-from sim_device.catalogue import build_skin
-from sim_device.elastomer import Contact
+from sim_device.board.anyskin import AnySkinBoard
+from sim_device.board.catalogue import build_skin
 from sim_device.faults import FaultPlan
-from sim_device.parameters import anyskin_parameters
-from sim_device.skin import SkinModel
-from tactile_bus.instant import Instant
+from sim_device.skin.elastomer import Contact
+from sim_device.skin.parameters import anyskin_parameters
+from sim_device.skin.skin import SkinModel
+from tactile_core.types import Instant
 
 MS = 1_000_000
 

@@ -7,8 +7,8 @@ from itertools import pairwise
 import pytest
 
 from sensor_proto.packets import ClockPoll, Samples, Start, Status, TaxelStatus
+from sim_device.board.firmware import CanBoard, SerialBoard
 from sim_device.faults import FaultPlan
-from sim_device.firmware import CanBoard, SerialBoard
 
 
 def test_planned_reset_is_a_watchdogs(serial) -> None:

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from sensor_proto.packets import TaxelStatus
-from sim_device.broken_taxels import BrokenTaxels
-from sim_device.chips import Reading
 from sim_device.faults import FaultPlan
+from sim_device.skin.chips import Reading
+from sim_device.skin.damage import BrokenTaxels
 
 TAXELS = {"left": 2, "skin": 3}
 COUNTS = np.array([[100, 200, 300], [9, 8, 7], [-5, 40, 9000], [1, 2, -8000], [7, 7, 7]], np.int16)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sensor_proto.packets import TaxelStatus
-from sim_device.chips import Magnetometers, temperature_of_raw
-from sim_device.parameters import ChipParameters, ChipSetting, SkinParameters
+from sim_device.skin.chips import Magnetometers, temperature_of_raw
+from sim_device.skin.parameters import ChipParameters, ChipSetting, SkinParameters
 
 IDEAL = SkinParameters().ideal()
 

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_device.elastomer import Contact, Elastomer, Spreader
-from sim_device.parameters import ElastomerParameters
-from sim_device.skin import SkinModel
-from tactile_bus.geometry import finger
+from sim_device.skin.elastomer import Contact, Elastomer, Spreader
+from sim_device.skin.parameters import ElastomerParameters
+from sim_device.skin.skin import SkinModel
+from tactile_core.geometry import finger
 
 PARAMETERS = ElastomerParameters()
 PLAIN = replace(PARAMETERS, creep=0.0, hysteresis_normal=0.0, hysteresis_shear=0.0)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_device.environment import (
+from sim_device.skin.environment import (
     Environment,
     EnvironmentParameters,
     parse_rotation,

@@ -6,12 +6,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sensor_proto.can_errors import BusState, told_state
-from sensor_proto.canseg import CanDecoder, CanEncoder, CanFrame
+from sensor_proto.can_transfers import BusState, CanDecoder, CanEncoder, CanFrame, told_state
 from sensor_proto.framing import SerialDecoder, encode_serial
 from sensor_proto.packets import Log
+from sim_device.board.wire import CanWire, SerialWire
 from sim_device.faults import FaultPlan, Window
-from sim_device.faulty_wire import CanWire, SerialWire
 
 
 def frames(n: int) -> list[bytes]:

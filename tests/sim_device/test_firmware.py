@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sensor_proto import packet
-from sensor_proto.canseg import BROADCAST, CanDecoder, CanEncoder, segment
+from sensor_proto.can_transfers import BROADCAST, CanDecoder, CanEncoder, segment
 from sensor_proto.cobs import encode as cobs_encode
 from sensor_proto.crc import crc32c
 from sensor_proto.framing import encode_serial
 from sensor_proto.packets import (
+    OVERHEAD,
     Ack,
     AckResult,
     ClockPoll,
@@ -26,12 +26,11 @@ from sensor_proto.packets import (
     Status,
     Stop,
 )
-from sim_device.board_clock import ClockParameters
-from sim_device.elastomer import Contact
-from sim_device.environment import rotation_about
-from sim_device.firmware import CanBoard, SerialBoard, frame_bits
-from sim_device.indenter import load_script
-from tactile_bus.instant import Instant
+from sim_device.board.firmware import CanBoard, ClockParameters, SerialBoard, frame_bits
+from sim_device.skin.elastomer import Contact
+from sim_device.skin.environment import rotation_about
+from sim_device.skin.indenter import load_script
+from tactile_core.types import Instant
 
 MS = 1_000_000
 
@@ -301,7 +300,7 @@ def test_frame_times_on_the_bus() -> None:
     assert len(classic.data) == 8
     # 131 bits without stuffing, at most a quarter more with it.
     assert 131 <= frame_bits(classic) <= 131 * 1.25
-    assert packet.OVERHEAD == 8
+    assert OVERHEAD == 8
 
 
 def test_unread_can_frames_of_other_traffic_do_no_harm(real_skin, identity) -> None:

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from sensor_proto.anyskin import AnySkinDecoder
+from sensor_proto.layouts import TextDecoder
 from sensor_proto.survey import Survey
-from sensor_proto.text_frames import TextDecoder
-from sim_device.anyskin_board import AnySkinBoard
-from sim_device.catalogue import build_skin, factory_calibration
-from sim_device.formats import SKETCHES, writer_of
-from sim_device.stations import BoardsRequest, plan_boards
-from tactile_bus.geometry import Side
-from tactile_bus.instant import Instant
+from sim_device.board.anyskin import SKETCHES, AnySkinBoard, writer_of
+from sim_device.board.catalogue import build_skin, factory_calibration
+from sim_device.ports_plan import BoardsRequest, plan_boards
+from tactile_core.geometry import Side
+from tactile_core.types import Instant
 
 MS = 1_000_000
 

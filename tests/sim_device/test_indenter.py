@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_device.indenter import ScriptError, load_script
-from tactile_bus.geometry import anyskin, finger
+from sim_device.skin.indenter import ScriptError, load_script
+from tactile_core.geometry import anyskin, finger
 
 PRESS = """
 [[press]]

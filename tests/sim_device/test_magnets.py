@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_device.environment import rotation_about
-from sim_device.magnets import MagnetArray, dipole_field_ut
+from sim_device.skin.environment import rotation_about
+from sim_device.skin.magnets import MagnetArray, dipole_field_ut
 
 MOMENT = np.array([0, 0, 3.25e-3])
 PRESS = 0.1e-3  # m; the published gradients and crosstalk are for a press of 0.1 mm

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sensor_proto.canseg import CanDecoder, CanEncoder, CanFrame
+from sensor_proto.can_transfers import CanDecoder, CanEncoder, CanFrame
 from sensor_proto.packets import (
     Ack,
     AckResult,
@@ -17,14 +17,13 @@ from sensor_proto.packets import (
     Start,
     Status,
 )
-from sim_device.board_clock import ClockParameters
-from sim_device.catalogue import build_skin, identity
-from sim_device.controller import Controller
-from sim_device.elastomer import Contact
-from sim_device.environment import Environment
+from sim_device.board.catalogue import build_skin, identity
+from sim_device.board.firmware import ClockParameters, Controller
 from sim_device.faults import FaultPlan
-from sim_device.sampler import Sampler
-from tactile_bus.instant import Instant
+from sim_device.skin.elastomer import Contact
+from sim_device.skin.environment import Environment
+from sim_device.skin.sampler import Sampler
+from tactile_core.types import Instant
 
 MS = 1_000_000
 

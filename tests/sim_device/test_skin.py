@@ -7,13 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim_device.catalogue import build_skin, factory_calibration, identity
-from sim_device.elastomer import Contact
-from sim_device.environment import Environment, EnvironmentParameters, Surroundings, parse_rotation
-from sim_device.parameters import SkinParameters
-from sim_device.skin import SkinModel, nominal_calibration
-from tactile_bus.geometry import finger
-from tactile_bus.instant import Instant
+from sim_device.board.catalogue import build_skin, factory_calibration, identity
+from sim_device.skin.elastomer import Contact
+from sim_device.skin.environment import (
+    Environment,
+    EnvironmentParameters,
+    Surroundings,
+    parse_rotation,
+)
+from sim_device.skin.parameters import SkinParameters
+from sim_device.skin.skin import SkinModel, nominal_calibration
+from tactile_core.geometry import finger
+from tactile_core.types import Instant
 
 MS = 1_000_000
 

@@ -12,10 +12,10 @@ import pytest
 
 from sim_device.world.base import World
 from sim_device.world.engines import ENGINES, EngineMissing, world_maker
+from sim_device.world.scene_loading import RECORDED_SCENES, find_recorded
 from sim_device.world.scenes import Pose, Scene, SceneError, SceneObject, Shape
-from sim_device.world.sources import RECORDED_SCENES, find_recorded
-from tactile_bus.arm_types import Twist
-from tactile_bus.geometry import TIP_X
+from tactile_core.geometry import TIP_X
+from tactile_core.types import Twist
 
 RECORDED = Path(__file__).parents[1] / "data" / "recorded_scenes"
 

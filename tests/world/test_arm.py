@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_device.world.arm import (
+from sim_device.arm.arm import (
     DEFAULT_EXPIRY,
     FACTORY_LIMITS,
     MAX_EXPIRY,
@@ -23,9 +23,18 @@ from sim_device.world.arm import (
 )
 from sim_device.world.mujoco_world import MujocoWorld
 from sim_device.world.scenes import Pose, Scene
-from tactile_bus.arm_types import ARM_LIMITS, ZERO, ArmLimits, ArmState, Echo, Twist
-from tactile_bus.geometry import FINGER_OUTLINE
-from tactile_bus.instant import Instant, after, seconds_between
+from tactile_core.geometry import FINGER_OUTLINE
+from tactile_core.types import (
+    ARM_LIMITS,
+    ZERO,
+    ArmLimits,
+    ArmState,
+    Echo,
+    Instant,
+    Twist,
+    after,
+    seconds_between,
+)
 
 START = Instant(1_000_000_000)
 LIMITS = ARM_LIMITS["authors_sim"]

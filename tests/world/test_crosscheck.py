@@ -9,7 +9,7 @@ import pytest
 
 from sim_device.world.mujoco_world import MujocoWorld
 from sim_device.world.scenes import Pose
-from tactile_bus.arm_types import Twist
+from tactile_core.types import Twist
 
 pytest.importorskip("pymunk", reason="the extra `crosscheck` is not installed")
 

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from sim_device.world.generate import authors_sim, gap, generate, hardware
+from sim_device.world.scene_generation import authors_sim, gap, generate, hardware
 from sim_device.world.scenes import Scene, Shape
 
 SEEDS = range(1, 25)

@@ -12,7 +12,7 @@ from sim_device.world.mujoco_world import MujocoWorld
 from sim_device.world.parameters import world_parameters
 from sim_device.world.scene_markers import scene_markers
 from sim_device.world.scenes import Pose
-from tactile_bus.geometry import FINGER_OUTLINE
+from tactile_core.geometry import FINGER_OUTLINE
 
 BACK, FRONT = FINGER_OUTLINE[0][0], FINGER_OUTLINE[3][0]
 

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from sim_device.world.base import WALL, World, WorldError
-from sim_device.world.generate import authors_sim
 from sim_device.world.mujoco_model import mean_lever
 from sim_device.world.mujoco_world import MujocoWorld
 from sim_device.world.parameters import WORLD_PARAMETERS, world_parameters
-from sim_device.world.plates import settled
+from sim_device.world.scene_generation import authors_sim
+from sim_device.world.scene_squeeze import settled
 from sim_device.world.scenes import Pose
-from tactile_bus.arm_types import ZERO, Twist
-from tactile_bus.geometry import FINGER_OUTLINE
+from tactile_core.geometry import FINGER_OUTLINE
+from tactile_core.types import ZERO, Twist
 
 INERTIA = world_parameters("authors_sim").inertia_scale
 G = 9.81

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_device.world.generate import generate
 from sim_device.world.mujoco_world import MujocoWorld
-from sim_device.world.recorded import RECORDED, load_outcomes, load_recorded
+from sim_device.world.recorded_scenes import RECORDED, load_outcomes, load_recorded
+from sim_device.world.scene_generation import generate
 from sim_device.world.scenes import Pose, SceneError, Shape
 
 

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_device.elastomer import Contact
-from sim_device.parameters import SkinParameters
-from sim_device.skin import SkinModel
+from sim_device.skin.elastomer import Contact
+from sim_device.skin.parameters import SkinParameters
+from sim_device.skin.skin import SkinModel
 from sim_device.world.base import WALL, FingerContact, merge_touches
 from sim_device.world.mujoco_world import MujocoWorld
 from sim_device.world.scenes import Pose
 from sim_device.world.touch import on_skin
-from tactile_bus.arm_types import Twist
-from tactile_bus.geometry import FINGER_HEIGHT, finger
+from tactile_core.geometry import FINGER_HEIGHT, finger
+from tactile_core.types import Twist
 
 
 def left_touch(body: int, force: float = -2.0) -> FingerContact:

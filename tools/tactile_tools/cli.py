@@ -5,36 +5,36 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from importlib.metadata import version
 
-from tactile_bus.arguments import Parser
+from tactile_core.arguments import Parser
 
-TOOLS = (
-    "log",
-    "plot",
-    "status",
-    "tare",
-    "calibrate",
-    "reach",
-    "demo",
-    "demo_skin",
-    "bench",
-    "fidelity",
-    "experiment",
-    "fuzz",
-    "crash",
-    "mutation",
-    "bus",
-    "health",
-    "service",
-    "soak",
-)
-"""Modules of this package that add a subcommand; each defines ``add_parser(subparsers)``."""
+TOOLS = {
+    "log": "log.cli",
+    "plot": "plot.cli",
+    "status": "operate.status",
+    "tare": "operate.tare",
+    "calibrate": "calibrate.cli",
+    "reach": "reach.cli",
+    "demo": "demo",
+    "demo-skin": "demo_skin",
+    "bench": "dev.bench",
+    "fidelity": "dev.fidelity",
+    "experiment": "experiments.cli",
+    "fuzz": "dev.fuzz",
+    "crash": "dev.crash",
+    "mutation": "dev.mutation",
+    "bus": "operate.bus",
+    "health": "operate.health",
+    "service": "operate.service",
+    "soak": "dev.soak",
+}
+"""Subcommand to the module of this package that adds it with ``add_parser(subparsers)``."""
 
 
-def build_parser(tools: Sequence[str] = TOOLS) -> argparse.ArgumentParser:
+def build_parser(tools: Iterable[str] = TOOLS) -> argparse.ArgumentParser:
     """Return the parser with the subcommands of ``tools``."""
     parser = Parser(
         prog="tactile",
@@ -46,7 +46,7 @@ def build_parser(tools: Sequence[str] = TOOLS) -> argparse.ArgumentParser:
     )
     subparsers = parser.add_subparsers(dest="tool", metavar="TOOL", required=True)
     for tool in tools:
-        import_module(f"tactile_tools.{tool}").add_parser(subparsers)
+        import_module(f"tactile_tools.{TOOLS[tool]}").add_parser(subparsers)
     return parser
 
 
@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # busy with trials they wait for one another far longer than they work. Read at numpy's import.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Only the tool that was named is imported, so that `tactile log` does not wait for matplotlib.
-    named = tuple(tool for tool in TOOLS if words and words[0] == tool.replace("_", "-"))
+    named = tuple(words[:1]) if words and words[0] in TOOLS else None
     options = build_parser(named or TOOLS).parse_args(words)
     run: Callable[[argparse.Namespace], int] = options.func
     try:

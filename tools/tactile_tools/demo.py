@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_tools.plots.series import LogUnreadableError
+from tactile_tools.plot.series import LogUnreadableError
 from tactile_tools.processes import command, running, socket_at, wait_for
 
 BOARD = "finger"
@@ -61,9 +61,9 @@ def run(options: argparse.Namespace) -> int:
                 file=sys.stderr,
             )
             return 2
-    from reachd.parameters import parameters
     from reachd.strategies import StrategyError, load_strategy
-    from tactile_tools.plots.reach import draw_reach
+    from reachd.strategies.parameters import parameters
+    from tactile_tools.plot.reach import draw_reach
 
     try:
         # Before three processes are started in vain.

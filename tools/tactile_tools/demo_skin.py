@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_device.indenter import load_script
-from tactile_bus.geometry import finger
-from tactile_bus.instant import monotonic_now
-from tactile_tools.plots.series import BoardSeries, LogUnreadableError, read_boards
+from sim_device.skin.indenter import load_script
+from tactile_core.geometry import finger
+from tactile_core.types import monotonic_now
+from tactile_tools.plot.series import BoardSeries, LogUnreadableError, read_boards
 from tactile_tools.processes import command, running, socket_at, wait_for
 
 SEED = 1
@@ -137,7 +137,7 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
     time = np.asarray(board.feature_time)
     applied = _applied(press, time + (board.start_ns - power_on) * 1e-9)
     _summarise(board, applied)
-    from tactile_tools.plots.skin import draw
+    from tactile_tools.plot.skin import draw
 
     draw(board, options.png, applied=(time, applied.sum(axis=1)))
     print(f"wrote {options.out} and {options.png}")

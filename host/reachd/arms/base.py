@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from tactile_bus.arm_types import ArmLimits, ArmState, Twist
-from tactile_bus.instant import Instant
+from tactile_core.types import ArmLimits, ArmState, Instant, Twist
 
 
 class ArmError(Exception):

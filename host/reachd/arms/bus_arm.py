@@ -1,7 +1,7 @@
 """An arm behind the topics ``arm/<name>/...``: the simulated one, or any driver that speaks them.
 
 Commands are ``ArmCommand`` at ``cmd_vel``, each with its instant, number, expiry and the proof that
-it comes from the one to whom the arm granted its command (`tactile_bus.commanding`).
+it comes from the one to whom the arm granted its command (`tactile_core.bus.commanding`).
 """
 
 from __future__ import annotations
@@ -17,12 +17,10 @@ import msgspec
 import zenoh
 
 from reachd.arms.base import ArmError
-from reachd.snapshot import Input, SourcePin, make_arm_state
-from tactile_bus.arm_types import ArmLimits, ArmState, Twist
-from tactile_bus.commanding import ClaimRequest, Grant, Signer, clock_domain, limits_fields
-from tactile_bus.instant import Instant, WallClock, monotonic_now, seconds_between
-from tactile_bus.services import NoAnswerError, ServiceError, call
-from tactile_bus.streams import (
+from reachd.inputs import Input, SourcePin, make_arm_state
+from tactile_core.bus.commanding import ClaimRequest, Grant, Signer, clock_domain, limits_fields
+from tactile_core.bus.services import NoAnswerError, ServiceError, call
+from tactile_core.bus.streams import (
     BusSample,
     Latest,
     Publisher,
@@ -30,7 +28,16 @@ from tactile_bus.streams import (
     declare_publisher,
     latest,
 )
-from tactile_bus.topics import ARM_STATE, COMMAND, service_key
+from tactile_core.bus.topics import ARM_STATE, COMMAND, service_key
+from tactile_core.types import (
+    ArmLimits,
+    ArmState,
+    Instant,
+    Twist,
+    WallClock,
+    monotonic_now,
+    seconds_between,
+)
 
 log = logging.getLogger(__name__)
 

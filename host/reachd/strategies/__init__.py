@@ -1,7 +1,7 @@
 """Reaching strategies: the paper's five, and the door for others."""
 
-from reachd.strategies.base import ReachingStrategy, ReportsEvents, StrategyEvent
-from reachd.strategies.registry import Answer, StrategyError, ask, available, begin, load_strategy
+from reachd.strategies.builtin import ReachingStrategy, ReportsEvents, StrategyEvent
+from reachd.strategies.runner import Answer, StrategyError, ask, available, begin, load_strategy
 
 __all__ = [
     "Answer",

@@ -13,9 +13,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from tactiled.sensing.candidates import PLANE_TAXELS
-from tactiled.sensing.compensate import Estimate
-from tactiled.sensing.force_model import ForceModel
+from tactiled.sensing.compensation import Estimate
+from tactiled.sensing.consensus import PLANE_TAXELS
+from tactiled.sensing.forces import ForceModel
 from tactiled.sensing.layout import Layout
 
 Float = NDArray[np.float64]

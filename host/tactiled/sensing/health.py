@@ -9,22 +9,604 @@ wrap is undone where continuity proves it.
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bus.instant import NS_PER_S, Instant
-from tactiled.blocks import TaxelHealth
-from tactiled.sensing.activity import Activity
-from tactiled.sensing.copies import Copies, Twins
-from tactiled.sensing.jumps import Jumps
+from tactile_core.geometry import SkinGeometry
+from tactile_core.types import NS_PER_S, Instant
+from tactiled.blocks import Reason, TaxelHealth
+from tactiled.sensing import reasons as why
+from tactiled.sensing.consensus import PLANE_TAXELS
+from tactiled.sensing.features import Adjacency
 from tactiled.sensing.layout import Layout
-from tactiled.sensing.readings import BITS, Fault
+from tactiled.sensing.reasons import BITS, Fault
 from tactiled.sensing.scale import Scale, Scales
-from tactiled.sensing.thermometers import Thermometers
+
+# How much each chip's reading varies: a dead chip is given away by having too little noise.
+#
+# Over blocks of a quarter of a second the smallest and largest reading of every component are kept.
+# A live chip spans three to five sigma of its noise in a block; one that is dead but for a last bit
+# that toggles spans a count.
+
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+
+BLOCK_S = 0.25
+BLOCK_CYCLES = 16
+"""A block lasts at least this long and has at least so many cycles."""
+LEARNT_BLOCKS = 4
+"""Blocks of its own after which a chip's least span is known."""
+DEAD_RATIO = 12.0
+"""A span this many times smaller than a live one is dead. Noise alone varies the span of sixteen
+samples by a factor of two."""
+MUTE_RATIO = 16.0
+"""The same where the other chips have gone just as still: a motion that ends does that too."""
+STEPS = 6.0
+"""Counts that a live axis spans at least, if one that repeats a value is to be called stuck: noise
+below half a count makes axes of coarse chips repeat for seconds."""
+
+
+class Activity:
+    """Spans of a board's chips; memory of two readings and a few numbers a taxel."""
+
+    def __init__(self, shape: tuple[int, int, int], real: Bool) -> None:
+        self._real = real
+        self._shape = shape
+        middle = real.sum(axis=1) // 2
+        self._middle = np.broadcast_to(middle[:, None, None], (shape[0], 3, 1))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all that was seen."""
+        arrays, _, width = self._shape
+        self.least = np.full(self._shape, np.inf)
+        """(A, 3, n) µT, smallest span of a block in which the chip was alive."""
+        self.dead: Bool = np.zeros((arrays, width), bool)
+        self.stuck: Bool = np.zeros((arrays, width), bool)
+        self._blocks = np.zeros((arrays, width), np.int64)
+        self._low = np.full(self._shape, np.inf)
+        self._high = np.full(self._shape, -np.inf)
+        self._start: Instant | None = None
+        self._cycles = 0
+
+    def add(self, raw: Float, captured: Instant) -> bool:
+        """Take finite (A, 3, n) µT of one cycle; True when it ended a block, see `judge`."""
+        np.minimum(self._low, raw, out=self._low)
+        np.maximum(self._high, raw, out=self._high)
+        self._cycles += 1
+        if self._start is None or captured < self._start:
+            self._start = captured
+        return self._cycles >= BLOCK_CYCLES and captured - self._start >= BLOCK_S * NS_PER_S
+
+    def forgive(self, moved: Bool) -> None:
+        """Chips of (A, n) ``moved`` by more than the last bits: they are alive."""
+        self.dead &= ~moved
+        self.stuck &= ~moved
+
+    def judge(self, steps: Float) -> None:
+        """End a block: find who is ``dead`` or has an axis ``stuck``.
+
+        ``steps``: (A, 3, 1) µT a count, NaN where it is not known.
+        """
+        span = self._high - self._low
+        self._low = np.full(self._shape, np.inf)
+        self._high = np.full(self._shape, -np.inf)
+        self._start, self._cycles = None, 0
+        own = np.where((self._blocks >= LEARNT_BLOCKS)[:, None], self.least, np.inf)
+        shown = np.where(self._real[:, None], span, np.inf)
+        usual = np.take_along_axis(np.sort(shown, axis=2), self._middle, axis=2)
+        # Quieter than it ever was, and than the others are just now; or, where many have died at
+        # once, so quiet that no more than a bit toggles.
+        mute = (span * DEAD_RATIO <= own).all(axis=1)
+        beside = (span * DEAD_RATIO <= usual).all(axis=1) & (usual > 0).all(axis=1)
+        known = np.isfinite(own).all(axis=1)
+        bit = (span <= 1.01 * steps).all(axis=1) | (span * MUTE_RATIO <= own).all(axis=1)
+        still = (span == 0).all(axis=1)  # that is frozen, which the monitor times by itself
+        dead = np.where(known, mute & (beside | bit), beside) & self._real & ~still
+        axis = (span == 0) & np.isfinite(own) & (own >= STEPS * steps)
+        self.stuck = axis.any(axis=1) & ~still & self._real
+        self.dead = dead
+        alive = self._real & ~dead & ~self.stuck & ~still
+        self._blocks[alive] += 1
+        self.least = np.where(alive[:, None], np.minimum(self.least, span), self.least)
+
+
+# Readings that came before, and chips that say the same: what noise never does.
+
+
+KEPT = 128
+"""Frames that a frame is compared with. A recording that is played in a loop is longer."""
+NOISY_FRAMES = 32
+"""Different frames that must have come first: a stream without noise repeats itself by right."""
+
+TWIN_CYCLES = 4
+"""Cycles with new readings in which two chips agree to the bit before they count as one."""
+
+
+class Copies:
+    """Frames of one array; knows one that is the very copy of an earlier one."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget every frame."""
+        self._places: dict[int, int] = {}
+        self._order: deque[tuple[int, int]] = deque()
+        self._last = 0
+        self._place = 0
+        self._before = (-2, -2)
+        self._fresh = 0
+        self._verdict = False
+
+    def add(self, frame: bytes) -> bool:
+        """Whether ``frame`` came before, other than just before.
+
+        A motion that goes back through the very same frames, as only one without noise can, is
+        not a copy.
+        """
+        digest = hash(frame)
+        if digest == self._last:
+            return self._verdict
+        self._last = digest
+        found = self._places.get(digest)
+        self._place += 1
+        place = self._place
+        self._places[digest] = place
+        self._order.append((place, digest))
+        if len(self._order) > KEPT:
+            oldest, key = self._order.popleft()
+            if self._places.get(key) == oldest:
+                del self._places[key]
+        before = self._before
+        if found is None:
+            self._fresh += 1
+            self._before = (place, place)
+            self._verdict = False
+            return False
+        self._before = (found, place)
+        self._verdict = self._fresh >= NOISY_FRAMES and found + 1 not in before
+        return self._verdict
+
+
+class Twins:
+    """Chips whose three components are the same bits, cycle after cycle.
+
+    ``rest_ut``: (A, 3, n) µT in chip axes that the calibration says of the untouched chips; those
+    that read the same at rest may read the same. None: unknown.
+    """
+
+    def __init__(self, real: Bool, rest_ut: Float | None) -> None:
+        self._real = real
+        self._places = np.flatnonzero(real)
+        self._whole = bool(real.all())
+        self._rest = None if rest_ut is None else _columns(rest_ut)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget who was the same."""
+        self._run: NDArray[np.int64] | None = None
+
+    def check(self, raw: Float, trusted: Float, unchanged: Bool, near: Float) -> Bool | None:
+        """(A, n) taxels that are found to send another chip's bits; None: none is.
+
+        ``raw``: (A, 3, n) µT. A chip that left what it last read, ``trusted``, by more than
+        ``near`` (3, 1) µT is found at once, others after `TWIN_CYCLES` readings; those that are
+        ``unchanged`` (A, n) do not count as readings.
+        """
+        # not by a matrix product: its sums may be rounded differently from taxel to taxel
+        key = raw[:, 0] + raw[:, 1] * np.pi + raw[:, 2] * np.e
+        flat: list[float] = key.ravel().tolist() if self._whole else key[self._real].tolist()
+        if len(set(flat)) == len(flat):
+            self._run = None
+            return None
+        columns, still = _columns(raw), unchanged.ravel()
+        before = np.zeros(still.size, np.int64) if self._run is None else self._run
+        run = np.zeros(still.size, np.int64)
+        guilty = np.zeros(still.size, bool)
+        for i, j in self._pairs(key.ravel()):
+            if not columns[i].any() or (columns[i] != columns[j]).any():
+                continue
+            if not self._differ(i, j, near):
+                continue
+            for one in (i, j):
+                run[one] = before[one] + (0 if still[one] else 1)
+                left = np.abs(columns[one] - _columns(trusted)[one]) > near[:, 0]
+                guilty[one] = run[one] >= TWIN_CYCLES or bool(left.any())
+        self._run = run
+        return guilty.reshape(unchanged.shape) if guilty.any() else None
+
+    def _pairs(self, key: Float) -> list[list[int]]:
+        """Flat indices of taxels with the same key."""
+        values = key[self._places]
+        order = np.argsort(values, kind="stable")
+        same = np.flatnonzero(np.diff(values[order]) == 0)
+        pairs = np.column_stack([self._places[order[same]], self._places[order[same + 1]]])
+        out: list[list[int]] = pairs.tolist()
+        return out
+
+    def _differ(self, i: int, j: int, near: Float) -> bool:
+        """Whether two taxels at rest read different fields, however their chips are turned."""
+        if self._rest is None:
+            return True
+        one, other = self._rest[i], self._rest[j]
+        z = abs(one[2] - other[2])
+        xy = abs(np.hypot(one[0], one[1]) - np.hypot(other[0], other[1]))
+        return bool(z > near[2, 0] or xy > near[0, 0])
+
+
+def _columns(vectors: Float) -> Float:
+    """(A, 3, n) as (A n, 3)."""
+    return vectors.swapaxes(1, 2).reshape(-1, 3)
+
+
+# Jumps from one reading to the next: 16-bit wraps, undone where that is certain, and faults.
+
+
+WRAP_RATIO = 1 / 6
+"""Share of the counts' range that may be left of a jump of a whole range: a wrap for certain."""
+SETTLED_S = 0.5
+SETTLED_CYCLES = 5
+"""A chip that jumped and then goes on from there so long has a new level; its rest is unknown."""
+REST_UT = 1000.0
+"""A reading that comes back to within this of the rest field after a jump is at rest, but for the
+creep of the rubber: 89 to 178 µT after 3.9 mT in eFlesh recordings."""
+
+ALONE_UT = 1500.0
+"""Jump of one chip that another must feel on a board of a few chips: the one that feels it most
+moves by 28 % and more in eFlesh recordings."""
+ALONE_RATIO = 0.02
+"""Share of it, besides noise, that counts as not moved: a dipole 10 mm away feels 0.8 to 3.5 % at
+the usual gaps, and rubber passes on more."""
+ALONE_CHIPS = (3, 8)
+"""Numbers of chips of an array that all feel every contact."""
+ALONE_CYCLES = 2
+"""Readings in which such a chip is not believed; one that stays where it went has been hit at the
+very edge of the skin."""
+ALONE_S = 0.05
+"""Seconds between readings beyond which nobody knows how fast it went."""
+
+
+class Jumps:
+    """What each chip of a board jumped by, and how many ranges it is beyond its own.
+
+    After `check`: ``settled`` (A, n) bool, chips that have just been given another level, and
+    ``restored``, such chips that read again what they did at rest.
+    """
+
+    def __init__(self, real: Bool, counts: NDArray[np.int64], scales: Scales) -> None:
+        self._real = real
+        self._scales = scales
+        self._small: Bool = (counts >= ALONE_CHIPS[0]) & (counts <= ALONE_CHIPS[1])
+        self._any_small = bool(self._small.any())
+        self.never: Bool = np.zeros(real.shape, bool)
+        self._none = np.zeros(real.shape, np.int64)
+        self.rest: Float | None = None
+        """(A, 3, n) µT in chip axes that the untouched chips read; None: unknown."""
+        self.near: Float = np.zeros((3, 1))
+        """µT that noise alone may make."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget every jump and wrap."""
+        shape = self._real.shape
+        self.turns = np.zeros((shape[0], 3, shape[1]))
+        self.wrapped = False
+        self.offset = self.turns
+        """(A, 3, n) µT to add to what comes, where ``wrapped``."""
+        self._jumping: Bool = self.never
+        self._since = np.zeros(shape, np.int64)
+        self._cycles = np.zeros(shape, np.int64)
+        self._lonely = self._none
+        self._displaced: Bool = self.never
+        self.settled: Bool = self.never
+        self.restored: Bool = self.never
+
+    @property
+    def least(self) -> float:
+        """µT below which no step is a jump."""
+        largest = float(self._scales.jump.min())
+        return min(largest, ALONE_UT) if self._any_small else largest
+
+    def accept_rest(self, rest_ut: Float) -> None:
+        """A tare has found what the untouched chips read."""
+        self.rest = rest_ut
+        self._displaced = self.never
+
+    def forget_wraps(self, array: int) -> None:
+        """The counts of ``array`` have another size."""
+        turns = self.turns.copy()
+        turns[array] = 0.0
+        self._turn(turns)
+
+    def check(
+        self,
+        raw: Float,
+        trusted: Float,
+        last: Float,
+        open_: Bool,
+        before: Bool,
+        captured: Instant,
+        previous: Instant,
+    ) -> tuple[Bool, Bool]:
+        """Undo wraps in ``raw`` (A, 3, n) µT, in place.
+
+        ``trusted``: what each chip read when it was last believed, ``last``: what it read in the
+        cycle of ``previous``. ``open_``: (A, n) chips with no other fault; ``before``: those that
+        had none then. Returns (A, n) chips that jumped, and that wrapped by who knows how much.
+        """
+        self.settled = self.restored = self.never
+        away = raw - trusted
+        if self._lonely is self._none and self._displaced is self.never:
+            size = np.abs(away).max(axis=1)
+            if not np.count_nonzero(open_ & (size > self.least)):
+                self._jumping = self.never
+                return self.never, self.never
+        base = away
+        if self._lonely is not self._none:
+            # a chip that is not believed yet goes on from where it was last, or goes back
+            step = raw - np.where(np.isnan(last), trusted, last)
+            nearer = (self._lonely > 0) & ~self._jumping
+            nearer &= np.abs(step).max(axis=1) < np.abs(away).max(axis=1)
+            base = np.where(nearer[:, None], step, away)
+        large = (np.abs(base) > self._scales.jump) & open_[:, None]
+        jumped = wrapped = self.never
+        if np.count_nonzero(large):
+            span = self._scales.span
+            turns = np.where(large, np.rint(base / span), 0.0)
+            sure = (turns != 0) & (np.abs(base - turns * span) <= WRAP_RATIO * span)
+            jumped = (large & ~sure).any(axis=1)
+            wrapped = (large & ~sure & (turns != 0)).any(axis=1)
+            self._undo(raw, np.where(sure & ~jumped[:, None], turns, 0.0))
+        if self._displaced is not self.never:
+            self._find_again(raw)
+        at_rest = self._at_rest(raw)
+        if self._displaced is not self.never:
+            self.restored = self._displaced & at_rest & open_
+            left = self._displaced & ~self.restored
+            self._displaced = left if np.count_nonzero(left) else self.never
+        distance = np.abs(raw - trusted)
+        step = np.abs(raw - last)
+        alone = self._alone(distance, step, open_, before, captured - previous) & ~at_rest
+        jumped = jumped & ~at_rest
+        if np.count_nonzero(jumped):
+            jumped = self._settle(jumped, step, captured)
+        self._jumping = jumped
+        return jumped | alone, jumped & wrapped
+
+    def _settle(self, jumped: Bool, step: Float, captured: Instant) -> Bool:
+        """Those of ``jumped`` that have not gone on from there for long enough."""
+        on = jumped & self._jumping & (step <= self._scales.jump).all(axis=1)
+        fresh = jumped & ~on
+        self._since[fresh] = captured
+        self._cycles[fresh] = 0
+        self._cycles[on] += 1
+        settled = on & (self._cycles >= SETTLED_CYCLES)
+        settled &= captured - self._since >= SETTLED_S * NS_PER_S
+        if np.count_nonzero(settled):
+            jumped = jumped & ~settled
+            self.settled = settled
+            self._displaced = self._displaced | settled
+        return jumped
+
+    def _undo(self, raw: Float, turns: Float) -> None:
+        """Take ``turns`` (A, 3, n) whole ranges off ``raw``, now and from now on."""
+        if np.count_nonzero(turns):
+            raw -= np.where(turns == 0, 0.0, turns * self._scales.span)
+            self._turn(self.turns - turns)
+
+    def _turn(self, turns: Float) -> None:
+        self.turns = turns
+        self.wrapped = bool(np.count_nonzero(turns))
+        self.offset = np.where(turns == 0, 0.0, turns * self._scales.span)
+
+    def _at_rest(self, raw: Float) -> Bool:
+        """(A, n) taxels that read about what they do untouched, where that is known."""
+        if self.rest is None:
+            return self.never
+        return np.asarray((np.abs(raw - self.rest) <= REST_UT).all(axis=1))
+
+    def _find_again(self, raw: Float) -> None:
+        """A chip whose wraps were lost count of, and that reads its rest but for whole ranges, is
+        at rest: correct it in ``raw``, in place.
+        """
+        if self.rest is None:
+            return
+        span = self._scales.span
+        over = raw - self.rest
+        turns = np.where(np.isnan(span), 0.0, np.rint(over / span))
+        apart = np.where(turns == 0, over, over - turns * span)
+        here = self._displaced & (np.abs(apart) <= REST_UT).all(axis=1)
+        self._undo(raw, np.where(here[:, None], turns, 0.0))
+
+    def _alone(
+        self, distance: Float, step: Float, open_: Bool, before: Bool, elapsed_ns: int
+    ) -> Bool:
+        """(A, n): a chip of a small array jumped, no other moved, and it is not yet certain."""
+        if not self._any_small or not 0 <= elapsed_ns <= ALONE_S * NS_PER_S:
+            self._lonely = self._none
+            return self.never
+        usable = self._real & open_ & (before | (self._lonely > 0))
+        far = np.where(usable, np.nan_to_num(distance.max(axis=1)), 0.0)
+        if not float(far.max()) > ALONE_UT:
+            self._lonely = self._none
+            return self.never
+        ordered = np.sort(far, axis=1)
+        most, next_most = ordered[:, -1], ordered[:, -2]
+        lonely = self._small & (most > ALONE_UT)
+        lonely &= next_most < ALONE_RATIO * most + float(self.near.max())
+        lonely &= usable.sum(axis=1) >= ALONE_CHIPS[0]
+        out = (lonely[:, None] & (far == most[:, None])) | ((self._lonely > 0) & (far > ALONE_UT))
+        steady = step.max(axis=1) <= far / 2
+        count = np.where(steady, self._lonely, 0) + 1
+        out &= count <= ALONE_CYCLES
+        self._lonely = np.where(out, count, 0) if np.count_nonzero(out) else self._none
+        return np.asarray(out)
+
+
+# The chips' thermometers: what they cannot say, and when they have stopped.
+
+
+LIMITS_C = (-45.0, 130.0)
+"""A magnetometer outside its datasheet's −40 to 125 °C (and some tolerance) did not answer."""
+_MIDDLE_C = sum(LIMITS_C) / 2
+_HALF_RANGE_C = (LIMITS_C[1] - LIMITS_C[0]) / 2
+STEP_C = 15.0
+"""K from one reading to the next that no chip warms by, at the rates that boards have."""
+THERMOMETER_SETTLED_S = 1.0
+"""A temperature that goes on from where it jumped for so long is taken: a firmware that does not
+read it any more, say."""
+MOVED_C = 5.0
+"""K that the other chips must have gone since a chip's thermometer last changed before it counts
+as stuck: all are warmed by the same room, board and hand."""
+FEWEST = 3
+"""Chips of an array whose thermometers can be compared."""
+ROOM_C = 25.0
+"""°C taken where a chip has never told one."""
+
+
+class Thermometers:
+    """Memory of each chip's last good temperature.
+
+    ``stuck``: (A, n) bool, None where none is. ``uneasy``: one has jumped just now.
+    """
+
+    def __init__(self, real: Bool) -> None:
+        self._real = real
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget every temperature."""
+        shape = self._real.shape
+        self.last: Float = np.full(shape, np.nan)
+        """(A, n) °C of the last cycle."""
+        self._good = np.full(shape, np.nan)
+        self._since = np.zeros(shape, np.int64)
+        self._changed_at = np.full(shape, np.nan)
+        self._middle_then = np.full(shape, np.nan)
+        self.stuck: Bool | None = None
+        self.uneasy = False
+
+    def plain(self, temperature_c: Float) -> bool:
+        """Whether (A, n) °C need no closer look: near those of the cycle before."""
+        return float(np.abs(temperature_c - self.last).max()) < STEP_C
+
+    def accept(self, temperature_c: Float) -> None:
+        """Take (A, n) °C that need no closer look."""
+        self._good = temperature_c
+
+    def check(self, temperature_c: Float, read: Bool, captured: Instant) -> tuple[Bool, Bool]:
+        """(A, n) temperatures that are impossible, and that jumped; the former are replaced.
+
+        ``read``: (A, n) chips that were read; what others show is not kept.
+        """
+        impossible: Bool = ~(np.abs(temperature_c - _MIDDLE_C) <= _HALF_RANGE_C)
+        if np.count_nonzero(impossible):
+            np.copyto(temperature_c, np.nan_to_num(self._good, nan=ROOM_C), where=impossible)
+        # a buffer that no reading has ever filled shows naught
+        jumped: Bool = (np.abs(temperature_c - self._good) > STEP_C) & (self._good != 0.0)
+        if np.count_nonzero(jumped):
+            on = jumped & (np.abs(temperature_c - self.last) <= STEP_C)
+            self._since[jumped & ~on] = captured
+            jumped = jumped & ~(on & (captured - self._since >= THERMOMETER_SETTLED_S * NS_PER_S))
+        self._good = np.where(read & ~(impossible | jumped), temperature_c, self._good)
+        self.uneasy = bool(np.count_nonzero(jumped))
+        return impossible, jumped
+
+    def judge(self, alive: Bool) -> None:
+        """Find those that stand still while their array goes on; ``alive``: chips with noise."""
+        self.stuck = None
+        now = self._good
+        if self._real.shape[1] < FEWEST:
+            return
+        middle = np.median(now, axis=1, keepdims=True)
+        changed = now != self._changed_at
+        np.copyto(self._middle_then, np.broadcast_to(middle, now.shape), where=changed)
+        np.copyto(self._changed_at, now, where=changed)
+        stuck = (np.abs(middle - self._middle_then) > MOVED_C) & self._real & alive
+        if np.count_nonzero(stuck):
+            self.stuck = stuck
+
+
+# Whether what is left of an array says enough once some of its taxels are masked.
+#
+# A masked taxel under a contact hides it, one beside a contact hides part of it. On an array of
+# sixteen and more that matters where the contact is: where the taxel was in contact when it went,
+# or has a neighbour that is. On a board of a few chips every contact is felt by all (the one that
+# feels it most but one by 28 % and more in eFlesh recordings), and each bears a large share of it:
+# there anything that is felt anywhere makes the array's forces unknown, and so does a chip that
+# went because its field left its range.
+
+
 UInt8 = NDArray[np.uint8]
+
+_LEFT_RANGE = np.array(
+    [Fault.SATURATED, Fault.RAIL, Fault.WRAPPED, Fault.JUMPED, Fault.BEYOND_RANGE], np.uint8
+)
+"""Faults that a strong field may be behind."""
+
+
+class Masking:
+    """Remembers which taxels went while in contact. N taxels, one array after another."""
+
+    def __init__(self, geometry: SkinGeometry) -> None:
+        self._names = tuple(a.name for a in geometry.arrays)
+        self._slices = geometry.slices
+        self._small = tuple(a.taxels < PLANE_TAXELS for a in geometry.arrays)
+        self._neighbours = Adjacency(geometry).neighbours
+        self.reset()
+
+    def reset(self) -> None:
+        """A tare or a new beginning: nothing is in contact."""
+        taxels = self._slices[-1].stop
+        self._sick = False
+        self._masked = np.zeros(taxels, bool)
+        self._hidden = np.zeros(taxels, bool)
+        self.touched = np.zeros(taxels, bool)
+        """(N,) taxels in contact in the last cycle; for the owner to set."""
+
+    def well(self, touched: Bool) -> None:
+        """No taxel was masked in a cycle in which (N,) taxels were in contact."""
+        self.touched = touched
+        if self._sick:
+            self._sick = False
+            self._masked = np.zeros_like(self._masked)
+            self._hidden = self._masked
+
+    def judge(self, fault: UInt8, felt: Bool) -> tuple[list[Reason], bool]:
+        """Reasons for which the forces of one cycle are incomplete, and whether too much so.
+
+        ``fault``: (N,) of `Fault`. ``felt``: (N,) healthy taxels that something presses or pulls.
+        """
+        self._sick = True
+        masked = fault != 0
+        self._hidden = masked & (self._hidden | (self.touched & ~self._masked))
+        self._masked = masked
+        reasons: list[Reason] = []
+        enough = True
+        for name, part, small in zip(self._names, self._slices, self._small, strict=True):
+            gone = np.flatnonzero(masked[part])
+            if not 0 < len(gone) < part.stop - part.start:
+                continue  # of an array that is gone altogether others tell
+            if small:
+                bad = self._hidden[part] | np.isin(fault[part], _LEFT_RANGE)
+                if felt[part].any():
+                    bad = masked[part]
+                first = int(gone[0])
+                reasons.append(why.chip_masked(name, first, Fault(int(fault[part][first]))))
+            else:
+                bad = self._hidden[part].copy()
+                for taxel in gone.tolist():
+                    around = self._neighbours[part.start + taxel]
+                    bad[taxel] |= any(felt[one] for one in around)
+            if bad.any():
+                reasons.append(why.masked_contact(name, np.flatnonzero(bad).tolist()))
+                enough = False
+        return reasons, enough
+
 
 FROZEN_CYCLES = 3
 """Unchanged readings in a row before a taxel can be frozen, so that at low rates two equal

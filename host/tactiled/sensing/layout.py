@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bus.geometry import SkinGeometry
+from tactile_core.geometry import SkinGeometry
 
 Float = NDArray[np.float64]
 Scalar = TypeVar("Scalar", bound=np.generic)

@@ -5,17 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bus.instant import NS_PER_S, Instant
+from tactile_core.types import NS_PER_S, Instant
 from tactiled.blocks import Ambient
-from tactiled.sensing.candidates import PLANE_TAXELS
-from tactiled.sensing.compensate import Compensator, Estimate, Off, outside_plane
-from tactiled.sensing.consensus import Consensus
-from tactiled.sensing.force_model import ForceModel
+from tactiled.sensing.compensation import Compensator, Estimate, Off, outside_plane
+from tactiled.sensing.consensus import PLANE_TAXELS, Consensus, FieldTracker
+from tactiled.sensing.forces import ForceModel
 from tactiled.sensing.layout import Layout
-from tactiled.sensing.pipeline_settings import PipelineSettings
 from tactiled.sensing.ransac import RansacCompensator
+from tactiled.sensing.settings import PipelineSettings
 from tactiled.sensing.small_array import SmallArray
-from tactiled.sensing.tracking import FieldTracker
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

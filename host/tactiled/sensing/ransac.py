@@ -11,11 +11,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bus.instant import NS_PER_S, Instant
-from tactiled.sensing.compensate import Estimate
-from tactiled.sensing.consensus import Consensus
+from tactile_core.types import NS_PER_S, Instant
+from tactiled.sensing.compensation import Estimate
+from tactiled.sensing.consensus import Consensus, FieldTracker
 from tactiled.sensing.layout import Layout
-from tactiled.sensing.tracking import FieldTracker
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sensor_proto.can_errors import BusState
+from sensor_proto.can_transfers import BusState
 from tactiled.transports.base import (
     EndOfLog,
     Medium,
@@ -44,7 +44,7 @@ def make_transport(spec: str, baud: int = 115_200, speed: float = 1.0) -> Transp
     CAN; a name that ends in ``.mcap``: replay at ``speed`` times real time. ValueError otherwise.
     """
     if spec.endswith(".mcap"):
-        from tactiled.transports.mcap_file import McapTransport
+        from tactiled.transports.recorded_log import McapTransport
 
         return McapTransport(spec, speed=speed)
     head, colon, _ = spec.partition(":")

@@ -7,8 +7,7 @@ from collections import Counter
 from enum import StrEnum
 from typing import Protocol
 
-from sensor_proto.can_errors import BusState
-from sensor_proto.canseg import CanFrame
+from sensor_proto.can_transfers import BusState, CanFrame
 from tactiled.blocks import Chunk
 
 

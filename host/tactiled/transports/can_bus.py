@@ -8,11 +8,17 @@ import threading
 import time
 from typing import TYPE_CHECKING, Protocol
 
-from sensor_proto import can_errors
-from sensor_proto.can_errors import BusState
-from sensor_proto.canseg import CanFrame
-from tactile_bus.can_bus import CanSpec, CanUnavailable, Trouble, from_message, open_bus, to_message
-from tactile_bus.instant import Instant, after, monotonic_now
+from sensor_proto import can_transfers
+from sensor_proto.can_transfers import BusState, CanFrame
+from tactile_core.can_bus import (
+    CanSpec,
+    CanUnavailable,
+    Trouble,
+    from_message,
+    open_bus,
+    to_message,
+)
+from tactile_core.types import Instant, after, monotonic_now
 from tactiled.blocks import Chunk
 from tactiled.transports.base import (
     WRITE_TIMEOUT,
@@ -83,7 +89,7 @@ class CanTransport:
         self.spec = CanSpec.parse(spec)
         self._link: CanLink
         if self.spec.interface == "slcan":
-            from tactiled.transports.slcan_link import SlcanLink
+            from tactiled.transports.slcan import SlcanLink
 
             self._link = SlcanLink(self.spec)
         else:
@@ -145,9 +151,9 @@ class CanTransport:
         self._link.close()
 
     def _note(self, frame: CanFrame) -> None:
-        for told in can_errors.names(frame):
+        for told in can_transfers.names(frame):
             self._losses.add(f"can_{told}")
-        state = can_errors.told_state(frame)
+        state = can_transfers.told_state(frame)
         if state is not None:
             self._enter(state)
 

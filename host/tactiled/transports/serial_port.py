@@ -14,9 +14,8 @@ from fcntl import ioctl
 
 import serial
 
-from sensor_proto.can_errors import BusState
-from sensor_proto.canseg import CanFrame
-from tactile_bus.instant import monotonic_now
+from sensor_proto.can_transfers import BusState, CanFrame
+from tactile_core.types import monotonic_now
 from tactiled.blocks import Chunk
 from tactiled.transports import listing
 from tactiled.transports.base import (

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from tactile_bus.calibration import (
+from tactile_core.calibration import (
     BoardCalibration,
     CalibrationError,
     load,
     nominal,
     save,
 )
-from tactile_bus.calibration_file import SUFFIX
+from tactile_core.calibration.file import SUFFIX
 
 if TYPE_CHECKING:
     from tactile_tools.calibrate.evaluate import Judged

@@ -9,8 +9,8 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bus.calibration import BoardCalibration
-from tactile_bus.net_types import TARGET_UNITS, Figure, NetModel
+from tactile_core.calibration import BoardCalibration
+from tactile_core.calibration.force_model import TARGET_UNITS, Figure, NetModel
 from tactile_tools.calibrate.evaluate import Judged, leave_one_out, tail20
 from tactile_tools.calibrate.fit import Choice, Progress, choose, fit, quiet
 from tactile_tools.calibrate.recording import Recording

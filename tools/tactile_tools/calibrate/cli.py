@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from tactile_bus.options import add_bus, finite_above_zero
+from tactile_core.options import add_bus, finite_above_zero
 from tactile_tools.calibrate import actions
 
 

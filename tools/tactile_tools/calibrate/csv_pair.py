@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bus.geometry import SkinGeometry
-from tactile_bus.nominal import MAX_ANYSKIN_MAGNETOMETERS, nominal
+from tactile_core.calibration.nominal import MAX_ANYSKIN_MAGNETOMETERS, nominal
+from tactile_core.geometry import SkinGeometry
 from tactile_tools.calibrate.recording import Recording, RecordingError, check, with_clock
 
 Float = NDArray[np.float64]

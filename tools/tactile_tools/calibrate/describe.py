@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from tactile_bus.calibration import BoardCalibration
-from tactile_bus.net_types import TARGET_UNITS
+from tactile_core.calibration import BoardCalibration
+from tactile_core.calibration.force_model import TARGET_UNITS
 
 
 def as_dict(calibration: BoardCalibration) -> dict[str, Any]:

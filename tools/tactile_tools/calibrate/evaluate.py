@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bus.net_types import NetModel
+from tactile_core.calibration.force_model import NetModel
 from tactile_tools.calibrate.fit import Choice, Progress, choose, fit, quiet
 from tactile_tools.calibrate.recipes import Recipe
 from tactile_tools.calibrate.recording import Recording
 from tactile_tools.calibrate.rows import causal
 from tactile_tools.calibrate.splits import TAIL_SHARE
-from tactiled.sensing.net_force import batch_features, readout
+from tactiled.sensing.forces import batch_features, readout
 
 Float = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bus.net_types import NetModel
+from tactile_core.calibration.force_model import NetModel
 from tactile_tools.calibrate.readouts import export, pipeline
 from tactile_tools.calibrate.recipes import (
     FORCE_RECIPES,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tactile_tools.calibrate.evaluate import Judged
 from tactile_tools.calibrate.recording import TARE_S, UNTOUCHED_SHARE
-from tactiled.sensing.net_force import batch_features, readout
+from tactiled.sensing.forces import batch_features, readout
 
 Float = NDArray[np.float64]
 

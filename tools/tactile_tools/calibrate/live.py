@@ -10,15 +10,15 @@ from typing import Any
 
 import zenoh
 
-from tactile_bus.calibration import BoardCalibration, load, nominal, saves
-from tactile_bus.calibration_file import SUFFIX
-from tactile_bus.instant import WallClock, monotonic_now
-from tactile_bus.messages import MSG, DecodeError, codec, header, stamp_ns
-from tactile_bus.nominal import NOMINAL_MODELS
-from tactile_bus.recorder import Recorder
-from tactile_bus.services import ServiceError, call
-from tactile_bus.streams import BusSample, Tap, list_alive
-from tactile_bus.topics import FIELD, REFERENCE, service_key
+from tactile_core.bus.messages import MSG, DecodeError, codec, header, stamp_ns
+from tactile_core.bus.services import ServiceError, call
+from tactile_core.bus.streams import BusSample, Tap, list_alive
+from tactile_core.bus.topics import FIELD, REFERENCE, service_key
+from tactile_core.calibration import BoardCalibration, load, nominal, saves
+from tactile_core.calibration.file import SUFFIX
+from tactile_core.calibration.nominal import NOMINAL_MODELS
+from tactile_core.log.recorder import Recorder
+from tactile_core.types import WallClock, monotonic_now
 from tactile_tools.calibrate.wizard import Stamps, TareRefusedError, WizardError
 
 FIRST_FRAME_S = 10.0

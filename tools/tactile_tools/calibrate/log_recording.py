@@ -1,7 +1,7 @@
 """Reader of a log (MCAP) that holds a board's field and what a reference said of the force on it.
 
 Field: ``tactile/<name>/field``, µT over the rest field at the time, in taxel axes. Reference:
-``reference/<name>/wrench``, see `tactile_bus.topics.REFERENCE`; a row with a value that is not
+``reference/<name>/wrench``, see `tactile_core.bus.topics.REFERENCE`; a row with a value that is not
 finite is no reading.
 """
 
@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bus.calibration import BoardCalibration, CalibrationError, loads
-from tactile_bus.calibration_file import SUFFIX
-from tactile_bus.instant import NS_PER_S
-from tactile_bus.log_reader import LogReader
-from tactile_bus.log_records import AttachmentRecord, Block, LogError
-from tactile_bus.messages import DecodeError, codec, stamp_ns
-from tactile_bus.topics import FIELD, REFERENCE, find_topic
+from tactile_core.bus.messages import DecodeError, codec, stamp_ns
+from tactile_core.bus.topics import FIELD, REFERENCE, find_topic
+from tactile_core.calibration import BoardCalibration, CalibrationError, loads
+from tactile_core.calibration.file import SUFFIX
+from tactile_core.log.reader import LogReader
+from tactile_core.log.records import AttachmentRecord, Block, LogError
+from tactile_core.types import NS_PER_S
 from tactile_tools.calibrate.recording import (
     MIN_FRAMES,
     Recording,

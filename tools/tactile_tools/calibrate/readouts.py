@@ -13,7 +13,7 @@ from sklearn.neural_network import MLPRegressor
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from tactile_bus.net_types import Layer
+from tactile_core.calibration.force_model import Layer
 from tactile_tools.calibrate.recipes import Recipe
 
 Float = NDArray[np.float64]

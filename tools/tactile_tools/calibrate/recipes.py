@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bus.net_types import FeatureMap, RestTracker
+from tactile_core.calibration.force_model import FeatureMap, RestTracker
 from tactile_tools.calibrate.recording import Recording
 
 Float = NDArray[np.float64]

@@ -10,9 +10,9 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from tactile_bus.options import BusTable, bus_config
-from tactile_bus.recorder import Recorder, RecorderError, RecorderSettings
-from tactile_bus.session import BusConfig, BusError, close_session, open_session
+from tactile_core.bus.session import BusConfig, BusError, close_session, open_session
+from tactile_core.log.recorder import Recorder, RecorderError, RecorderSettings
+from tactile_core.options import BusTable, bus_config
 from tactile_tools.calibrate.actions import REFUSED, ActionError
 from tactile_tools.calibrate.live import LiveBoard, refuse_existing
 from tactile_tools.calibrate.wizard import Timing, Wizard, WizardError

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bus.calibration import BoardCalibration
-from tactile_bus.geometry import SkinGeometry
+from tactile_core.calibration import BoardCalibration
+from tactile_core.geometry import SkinGeometry
 from tactile_tools.calibrate.label_clock import LabelClock, find_clock
 
 Float = NDArray[np.float64]

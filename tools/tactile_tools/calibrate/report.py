@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from tactile_bus.net_types import TARGET_UNITS
+from tactile_core.calibration.force_model import TARGET_UNITS
 from tactile_tools.calibrate.evaluate import Judged, predict
 from tactile_tools.calibrate.fit import Choice, fit
 from tactile_tools.calibrate.limits import limits

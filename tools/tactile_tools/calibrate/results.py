@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from tactile_bus.net_types import TARGET_UNITS
+from tactile_core.calibration.force_model import TARGET_UNITS
 from tactile_tools.calibrate.evaluate import Judged, predict
 from tactile_tools.calibrate.limits import limits
 

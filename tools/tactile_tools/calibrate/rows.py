@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bus.net_types import FeatureMap
+from tactile_core.calibration.force_model import FeatureMap
 from tactile_tools.calibrate.recording import TARE_S, UNTOUCHED_SHARE, Recording
-from tactiled.sensing.net_force import batch_features
+from tactiled.sensing.forces import batch_features
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
-from reachd.parameters import parameters
+from reachd.strategies.parameters import parameters
 from sim_device.world.parameters import FINGER_WIDTH, world_parameters
 from tactile_tools.experiments.spec import Conditions
 

@@ -180,7 +180,7 @@ def _say(console: Console, summary: dict[str, Any], told: _Told, directory: Path
 
 
 def _trial(options: argparse.Namespace) -> int:
-    from tactile_tools.experiments.again import run_again
+    from tactile_tools.experiments.rerun_trial import run_again
 
     return run_again(options)
 

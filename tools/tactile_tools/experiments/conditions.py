@@ -6,16 +6,16 @@ from dataclasses import replace
 from functools import lru_cache
 
 from reachd.fields import SettingError
-from reachd.parameter_fields import Parameters
+from reachd.strategies.parameter_fields import Parameters
 from sim_device.world.base import World
 from sim_device.world.engines import make_world
-from sim_device.world.generate import GENERATORS, generate
 from sim_device.world.parameters import Friction, WorldParameters, world_parameters
+from sim_device.world.scene_generation import GENERATORS, generate
+from sim_device.world.scene_loading import load_scene
 from sim_device.world.scenes import Scene
-from sim_device.world.sources import load_scene
-from tactile_tools.experiments.senses import DegradedContacts, DegradedTaxels
+from tactile_tools.experiments.degraded_touch import DegradedContacts, DegradedTaxels
 from tactile_tools.experiments.spec import Conditions, TrialSpec
-from tactile_tools.touch_senses import Sense
+from tactile_tools.reach.touch_senses import Sense
 
 CACHED_SCENES = 8
 """Scenes kept by a worker: trials come scene by scene, and a few scenes may be under way at once

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
 
 from reachd.fields import SettingError, check_known
-from reachd.parameter_fields import Parameters
-from reachd.parameters import parameters
+from reachd.strategies.parameter_fields import Parameters
+from reachd.strategies.parameters import parameters
 
 Depth = Literal["contacts", "taxels"]
 

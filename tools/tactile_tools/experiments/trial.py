@@ -18,7 +18,7 @@ from sim_device.world.scenes import Scene
 from tactile_tools.experiments.conditions import parameters_of, scene_of, sense_of, world_of
 from tactile_tools.experiments.rows import DIRECTIONS, NAMES, TRIGGERS, Row
 from tactile_tools.experiments.spec import IDENTITY, TrialSpec, canonical
-from tactile_tools.lockstep import PERIOD, Result, Step, run_trial
+from tactile_tools.reach.lockstep import Result, Step, run_trial
 
 _run_here: Counter[str] = Counter()
 """Trials by worker, of this process: for the memory's course over them."""
@@ -108,7 +108,7 @@ def _outcome(scene: Scene, spec: TrialSpec, result: Result) -> Row:
         "ejected": result.ejected,
         "interventions": sum(o.interventions.values()),
         "interventions_by_code": canonical({str(k): v for k, v in o.interventions.items()}),
-        "simulated_s": round(result.cycles * PERIOD, 6),
+        "simulated_s": round(result.simulated_s, 6),
     }
 
 

@@ -1,0 +1,1 @@
+"""The safety gate: the last check on every command."""

@@ -1,0 +1,364 @@
+"""Compares what an arm does with what it was told: the gate's judgement of the arm itself.
+
+Commands are integrated to the path that the arm was told to go; states tell the path it went. A
+command acts at once or up to its expiry later, and may have died on the way, so the arm may be
+anywhere between standing still and the whole of any such path, but nowhere beside it, before it or
+behind it. Translation of the pivot and turning are judged apart: either may fail alone.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+
+from reachd.gate.settings import Check, SafetySettings
+from reachd.interfaces import ArmState, Twist
+from tactile_core.types import NS_PER_S, Instant
+
+TOO_FAST = 1.5
+"""Times the limit that the arm confirmed. Impacts make simulated fingers 1.3 times as fast."""
+
+SPEED_OVER_NS = 30_000_000
+"""Time over which the pose alone tells the speed: three states at 100 a second."""
+
+TRACK_NS = 100_000_000
+"""Window over which the arm must not leave the way it was told to go."""
+
+OFF_THE_WAY = 0.001
+"""m by which it may leave it in such a window: simulated arms do by 0.3 mm in free motion, and by
+up to 0.6 mm when they are hit. An arm at its own limit of force gives way: there it may be pushed
+as fast as it may move."""
+
+AT_ITS_LIMIT = 0.8
+"""Part of the arm's own limit of force or torque from which it is taken to give way."""
+
+POSE_NOISE = 0.0003
+"""m by which a pose may err."""
+
+COMMANDED = 0.002
+"""m/s at pivot, and by turning at the tip: slower commands are not watched, for arms do not follow
+them well."""
+
+STEADY = 0.7
+"""Part of a commanded path that its ends must lie apart, or it turns back and says little."""
+
+DISAGREES = 0.5
+"""Part of the commanded path by which the moved one may differ unless a load explains it."""
+
+ASTRAY = 0.002
+"""m by which it differs at least before an arm that goes far enough, or too far, is said to go
+astray: an impact turns a finger by a millimetre at its tip."""
+
+DEAD = 0.1
+"""Part of the commanded path below which the arm is said not to move at all."""
+
+REPORTED = 0.25
+"""Part of the told motion that the twist reports while the pose stays: then the state is frozen,
+for a jammed arm reports none."""
+
+CREEP = 0.001
+"""m/s, rad/s of reported motion that contradicts a pose that does not change at all."""
+
+SAME = 1e-5
+"""m, rad within which a pose does not change: jammed arms tremble by more."""
+
+DELAYS_NS = tuple(range(10_000_000, 60_000_001, 10_000_000))
+"""Ages at which a command may take effect, beside at once."""
+
+LONGEST_GAP_NS = 150_000_000
+"""Between two states; after a longer one nothing is said until a window is full again."""
+
+JUMP = 0.05
+"""m between two states, which no arm goes: the pose was taken anew, and says nothing of motion."""
+
+KEPT = 512
+
+Finding = tuple[Check, str]
+Path = tuple[float, float, float, float, float]
+"""x, y m; heading rad; lengths of the way m and rad: integrals of commands."""
+
+
+class MotionWatch:
+    """Of one arm. `told` every command that is sent, `judge` every state."""
+
+    def __init__(self, settings: SafetySettings) -> None:
+        self._s = settings
+        self._long_ns = round(settings.frozen_after * NS_PER_S)
+        self._longest_ns = round(settings.command_expiry * NS_PER_S)
+        self._told_at: list[Instant] = []
+        self._told: list[Twist] = []
+        self._path: list[Path] = []  # up to the instant of the same index
+        self._seen_at: list[Instant] = []
+        self._seen: list[ArmState] = []
+        self._found: tuple[Finding, ...] = ()
+
+    def told(self, twist: Twist, at: Instant) -> None:
+        """``twist`` was sent at ``at``."""
+        if self._told_at and at <= self._told_at[-1]:
+            self._told_at.clear()  # time went back: what was before says nothing
+        if not self._told_at:
+            self._told.clear()
+            self._path[:] = [(0.0, 0.0, 0.0, 0.0, 0.0)]
+        else:
+            self._path.append(self._gone(len(self._told_at) - 1, at))
+        self._told_at.append(at)
+        self._told.append(twist)
+        if len(self._told_at) > 2 * KEPT:
+            del self._told_at[:KEPT], self._told[:KEPT], self._path[:KEPT]
+
+    def restart(self) -> None:
+        """Judge what comes from now on."""
+        self._seen_at.clear()
+        self._seen.clear()
+        self._found = ()
+
+    def first_after(self, decided: Instant) -> Instant | None:
+        """When the first command after that of ``decided`` was sent; None when none was."""
+        index = bisect_right(self._told_at, decided)
+        return self._told_at[index] if index < len(self._told_at) else None
+
+    def judge(self, arm: ArmState) -> tuple[Finding, ...]:
+        """What is wrong with the arm's motion up to ``arm``, whose numbers are finite."""
+        at = arm.captured
+        if self._seen_at:
+            since = at - self._seen_at[-1]
+            if since == 0:
+                return self._found
+            if not 0 < since <= LONGEST_GAP_NS or self._jumped(arm):
+                self._seen_at.clear()
+                self._seen.clear()
+        self._seen_at.append(at)
+        self._seen.append(arm)
+        if len(self._seen) > 2 * KEPT:
+            del self._seen_at[:KEPT], self._seen[:KEPT]
+        found = [self._speed(arm), self._tracking(arm), self._disagreement(arm)]
+        self._found = tuple(one for one in found if one is not None)
+        return self._found
+
+    def _jumped(self, arm: ArmState) -> bool:
+        """Whether the pose is another one altogether, as after a reset of a simulated world."""
+        dx, dy, dh = self._moved(-1, arm)
+        return math.hypot(dx, dy) > JUMP or abs(dh) > JUMP / self._s.tip_length
+
+    def _gone(self, index: int, at: Instant) -> Path:
+        """Path up to ``at``, the newest command before it being that of ``index``."""
+        x, y, h, length, turned = self._path[index]
+        twist = self._told[index]
+        dt = min(at - self._told_at[index], self._longest_ns) / NS_PER_S
+        return (
+            x + twist.vx * dt,
+            y + twist.vy * dt,
+            h + twist.omega * dt,
+            length + math.hypot(twist.vx, twist.vy) * dt,
+            turned + abs(twist.omega) * dt,
+        )
+
+    def _way(self, begin: Instant, end: Instant) -> Path:
+        """Path told between two instants; none before the first command."""
+        ends = []
+        for at in (begin, end):
+            index = bisect_right(self._told_at, at) - 1
+            ends.append(self._gone(index, at) if index >= 0 else self._path[0])
+        (x0, y0, h0, l0, t0), (x1, y1, h1, l1, t1) = ends
+        return x1 - x0, y1 - y0, h1 - h0, l1 - l0, t1 - t0
+
+    def _before(self, at: Instant, window_ns: int) -> int | None:
+        """Index of the newest state at least ``window_ns`` before ``at``; None when none is."""
+        index = bisect_right(self._seen_at, at - window_ns) - 1
+        return index if index >= 0 else None
+
+    def _moved(self, index: int, arm: ArmState) -> tuple[float, float, float]:
+        old = self._seen[index]
+        return arm.x - old.x, arm.y - old.y, math.remainder(arm.heading - old.heading, math.tau)
+
+    def _stays(self, index: int) -> bool:
+        """Whether no pose from ``index`` on differs from the newest by more than `SAME`."""
+        last = self._seen[-1]
+        return all(
+            abs(a.x - last.x) <= SAME
+            and abs(a.y - last.y) <= SAME
+            and abs(a.heading - last.heading) <= SAME
+            for a in self._seen[index:]
+        )
+
+    def _speed(self, arm: ArmState) -> Finding | None:
+        """Faster than the limit that the arm confirmed, by its twist or by its pose."""
+        s, twist = self._s, arm.twist
+        speed, turn = math.hypot(twist.vx, twist.vy), abs(twist.omega)
+        index = self._before(arm.captured, SPEED_OVER_NS)
+        if index is not None:
+            seconds = (arm.captured - self._seen_at[index]) / NS_PER_S
+            dx, dy, dh = self._moved(index, arm)
+            speed = max(speed, (math.hypot(dx, dy) - POSE_NOISE) / seconds)
+            turn = max(turn, (abs(dh) - POSE_NOISE / s.tip_length) / seconds)
+        if speed > TOO_FAST * s.arm_v_max:
+            return (
+                Check.ARM_SPEED,
+                f"the arm moves at {speed:.3f} m/s, its limit is {s.arm_v_max:g}",
+            )
+        if turn > TOO_FAST * s.arm_omega_max:
+            return (
+                Check.ARM_SPEED,
+                f"the arm turns at {turn:.3f} rad/s, its limit is {s.arm_omega_max:g}",
+            )
+        return None
+
+    def _tracking(self, arm: ArmState) -> Finding | None:
+        """Against, across or beyond what was told, over `TRACK_NS`."""
+        index = self._before(arm.captured, TRACK_NS)
+        if index is None or not self._told_at:
+            return None
+        s = self._s
+        begin, end = self._seen_at[index], arm.captured
+        moved = self._moved(index, arm)
+        slack, twist_slack = OFF_THE_WAY, OFF_THE_WAY / s.tip_length
+        off, off_turn = _off(moved, self._way(begin, end))
+        if off <= slack and off_turn <= twist_slack:
+            return None
+        for delay in DELAYS_NS:
+            way = self._way(Instant(begin - delay), Instant(end - delay))
+            aside, turned = _off(moved, way)
+            off, off_turn = min(off, aside), min(off_turn, turned)
+        if self._gives_way(index):
+            seconds = (end - begin) / NS_PER_S
+            slack, twist_slack = s.arm_v_max * seconds, s.arm_omega_max * seconds
+        if off <= slack and off_turn <= twist_slack:
+            return None
+        return (
+            Check.ARM_TRACKING,
+            f"the arm went {off * 1e3:.1f} mm and {math.degrees(off_turn):.1f}° away from what it "
+            f"was told within {TRACK_NS / NS_PER_S:g} s",
+        )
+
+    def _gives_way(self, index: int) -> bool:
+        """Whether the arm was at its own limits at a state from ``index`` on."""
+        s = self._s
+        force, torque = AT_ITS_LIMIT * s.arm_f_max, AT_ITS_LIMIT * s.arm_m_max
+        return any(
+            abs(a.fx) >= force or abs(a.fy) >= force or abs(a.mz) >= torque
+            for a in self._seen[index:]
+        )
+
+    def _disagreement(self, arm: ArmState) -> Finding | None:
+        """Another path than was told, over a longer window, although no load explains it."""
+        index = self._before(arm.captured, self._long_ns)
+        if index is None or not self._told_at:
+            return None
+        begin, end = self._seen_at[index], arm.captured
+        moved = self._moved(index, arm)
+        way = self._way(begin, end)
+        for differs in (self._translation_differs, self._turning_differs):
+            told = differs(moved, way, end - begin)
+            if told is None:
+                continue
+            for delay in DELAYS_NS:
+                late = self._way(Instant(begin - delay), Instant(end - delay))
+                if differs(moved, late, end - begin) is None:
+                    break
+            else:
+                finding = self._unexplained(index, moved, told, end - begin)
+                if finding is not None:
+                    return finding
+        return None
+
+    def _translation_differs(
+        self, moved: tuple[float, float, float], way: Path, window_ns: int
+    ) -> tuple[float, float, float] | None:
+        """Unit vector and length (m) of a told translation that ``moved`` contradicts."""
+        x, y, _, length, _ = way
+        apart = math.hypot(x, y)
+        if apart < COMMANDED * window_ns / NS_PER_S or apart < STEADY * length:
+            return None
+        off = math.hypot(moved[0] - x, moved[1] - y)
+        short = moved[0] * x + moved[1] * y < (1.0 - DISAGREES) * apart * apart
+        if off <= max(DISAGREES * apart, POSE_NOISE if short else ASTRAY):
+            return None
+        return x / apart, y / apart, apart
+
+    def _turning_differs(
+        self, moved: tuple[float, float, float], way: Path, window_ns: int
+    ) -> tuple[float, float, float] | None:
+        """(0, 0) and the told angle (rad) that ``moved`` contradicts."""
+        _, _, angle, _, turned = way
+        lever = self._s.tip_length
+        if abs(angle) * lever < COMMANDED * window_ns / NS_PER_S or abs(angle) < STEADY * turned:
+            return None
+        short = moved[2] * angle < (1.0 - DISAGREES) * angle * angle
+        slack = (POSE_NOISE if short else ASTRAY) / lever
+        if abs(moved[2] - angle) <= max(DISAGREES * abs(angle), slack):
+            return None
+        return 0.0, 0.0, angle
+
+    def _unexplained(
+        self,
+        index: int,
+        moved: tuple[float, float, float],
+        told: tuple[float, float, float],
+        window_ns: int,
+    ) -> Finding | None:
+        """Say so, unless the environment pushed the arm that way and the arm's twist agrees."""
+        s, states = self._s, self._seen[index:]
+        ux, uy, length = told
+        n, seconds = len(states), window_ns / NS_PER_S
+        since = self._before(states[-1].captured, TRACK_NS) or 0
+        lately, last = self._seen[since:], states[-1]
+        mx, my, mh = self._moved(since, last)
+        if ux or uy:
+            dx, dy = moved[0] - ux * length, moved[1] - uy * length
+            pushed = sum(a.fx * dx + a.fy * dy for a in states) / (n * math.hypot(dx, dy))
+            aside = pushed >= s.free_air_force
+            went, moves = moved[0] * ux + moved[1] * uy, mx * ux + my * uy
+            reported = sum(a.twist.vx * ux + a.twist.vy * uy for a in lately) / len(lately)
+            words = f"{length * 1e3:.1f} mm", f"{went * 1e3:.1f}"
+        else:
+            sign = math.copysign(1.0, length)
+            pushed = math.copysign(1.0, moved[2] - length) * sum(a.mz for a in states) / n
+            aside = pushed >= s.free_air_torque
+            went, moves, length = moved[2] * sign, mh * sign, abs(length)
+            reported = sign * sum(a.twist.omega for a in lately) / len(lately)
+            words = f"{math.degrees(length):.2f}°", f"{math.degrees(went):.2f}"
+        pace = length / seconds
+        dead = abs(moves) < DEAD * pace * TRACK_NS / NS_PER_S
+        if 0.0 <= went < (1.0 - DISAGREES) * length:
+            # Held back: by whatever presses on the finger, for it may be wedged any way; or it was
+            # for a part of the window, and has come free.
+            explained = any(
+                sum(math.hypot(a.fx, a.fy) for a in some) >= s.free_air_force * len(some)
+                or sum(abs(a.mz) for a in some) >= s.free_air_torque * len(some)
+                for some in (states, lately)
+            )
+        else:
+            explained = aside or self._gives_way(index)
+        lies = reported >= REPORTED * pace or (_moving(lately) and self._stays(index))
+        if explained and not (dead and lies):
+            return None
+        if dead:
+            return (
+                Check.ARM_FROZEN,
+                "the arm's state does not change although the arm is told to move and no load "
+                "holds it",
+            )
+        return (
+            Check.ARM_PATH,
+            f"the arm was told to go {words[0]} and went {words[1]} that way within {seconds:.1f} "
+            "s, and no load explains it",
+        )
+
+
+def _moving(states: list[ArmState]) -> bool:
+    """Whether their mean twist says that the arm moves: jammed arms creep slower."""
+    n = len(states)
+    vx = math.fsum(a.twist.vx for a in states) / n
+    vy = math.fsum(a.twist.vy for a in states) / n
+    omega = math.fsum(a.twist.omega for a in states) / n
+    return max(math.hypot(vx, vy), abs(omega)) > CREEP
+
+
+def _off(moved: tuple[float, float, float], way: Path) -> tuple[float, float]:
+    """Distance (m), angle (rad) of ``moved`` from the nearest part of ``way`` seen as straight."""
+    mx, my, mh = moved
+    x, y, h, _, _ = way
+    square = x * x + y * y
+    part = min(1.0, max(0.0, (mx * x + my * y) / square)) if square > 0.0 else 0.0
+    low, high = min(0.0, h), max(0.0, h)
+    return math.hypot(mx - part * x, my - part * y), max(low - mh, mh - high, 0.0)

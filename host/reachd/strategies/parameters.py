@@ -1,0 +1,291 @@
+"""The two named parameter sets, and every disagreement between the sources decided once.
+
+``hardware`` is Tables I and II of the paper; ``authors_sim`` is what the authors' published
+simulator (clutter-jamming) does, brought from its lengths × 10 to metres. Where the paper is
+silent or cannot have run as it is printed, the reason for our reading stands beside the value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
+
+from reachd.fields import SettingError, check_known, replaced
+from reachd.gate.settings import Check, SafetySettings
+from reachd.gate.workspace import box, region
+from reachd.strategies.parameter_fields import Parameters, names_of
+from tactile_core.geometry import TIP_X
+
+# Ages and periods are ours, the same for every arm: rows 4, 15, 16 and 24 of the fault table.
+_COMMON_SAFETY: dict[str, Any] = {
+    "features_age": 0.2,
+    "features_latch": 1.0,
+    "arm_age": 0.05,
+    "arm_latch": 1.0,  # an arm that was away for so long shall not start off by itself
+    "echo_age": 0.05,
+    "frozen_after": 0.3,  # by then the slowest watched command has gone 0.6 mm
+    "future": 0.01,  # the board clock's mapping errs by a few ms; more is a fault
+    "lateness": 0.05,
+    "period": 0.01,
+    "command_expiry": 0.06,  # leaves 40 ms of the 100 ms until the arm rests for its braking
+    "request_age": 2.0,
+    "free_air_force": 1.0,
+    "free_air_torque": TIP_X,  # 1 N at the tip
+    "soft_fraction": 0.8,
+    "overload_within": 5.0,
+    "tip_length": TIP_X,
+}
+
+_HARDWARE_V, _HARDWARE_OMEGA = 0.045, 0.1
+_HARDWARE_SPEED = _HARDWARE_V + TIP_X * _HARDWARE_OMEGA
+
+HARDWARE = Parameters(
+    name="hardware",
+    v_max=_HARDWARE_V,
+    omega_max=_HARDWARE_OMEGA,
+    # Not stated. At 20 s a burrowing tip (mean forward part .385 at A = .83) cannot cross 38 cm at
+    # 4.5 cm/s; at 40 s the prototype's success rates came close to the paper's.
+    time_limit=40.0,
+    goal_radius=0.0075,
+    # "when the end-effector enters the goal region": no exception is made for an excavation.
+    success_during_excavation=True,
+    tip_length=TIP_X,
+    # d̂ points from the tip to the target and "commanded tip velocity" is the paper's word.
+    commanded_point="tip",
+    # "For each strategy, the maximum velocity magnitudes are decreased when approaching the goal":
+    # by how much is only in the simulator, half within 1 cm.
+    slow_radius=0.01,
+    slow_fraction=0.5,
+    slow_for="every",
+    # sign(φ − θ) chatters about zero; the simulator's taper is the only figure there is.
+    turn_tolerance=0.05,
+    straight_turn_within=0.01,
+    burrow_turn_within=0.0,
+    burrow_amplitude=0.83,
+    # The simulator runs its nominal "1 Hz" as .004 π rad a step, which is sin(π t) at 250 Hz; with
+    # π rad/s the prototype came close to the paper's rates. 1 and 2π rad/s are the other readings.
+    burrow_frequency=math.pi,
+    # As printed, a velocity is added to a number and the straight part all but vanishes (v_max is
+    # .045): no burrow would arrive.
+    burrow_law="unit",
+    excavate_duration=5.0,
+    trigger_interval=5.0,
+    excavate_omega_max=_HARDWARE_OMEGA,
+    spiral_growth=2.0,
+    # As printed, L·ω is subtracted from a number inside K·v_max and all but vanishes. The paper
+    # says that the commanded *tip* velocity grows from v_max/s to v_max, which holds when the tip
+    # traces the spiral, as in the simulator.
+    excavate_law="tip_spiral",
+    # "according to the end-effector's current orientation"
+    excavate_heading="current",
+    # "at regular intervals", without exception. The interval counts from the end of the last
+    # excavation as in the simulator; else 5 s every 5 s would excavate without end.
+    excavate_needs_time=False,
+    ccw_chance=0.5,
+    # "the magnitude and location of the peak contact force" is what mattered.
+    force_measure="peak",
+    burrow_force=5.0,
+    excavate_force=10.0,
+    push_force_min=0.5,
+    push_force_max=7.5,
+    push_time=2.0,
+    # Features come at 15 Hz: one that misses is overlooked, two are not.
+    push_dropout=0.1,
+    progress_time=3.0,
+    # Not stated; counting anew from where the excavation ended is what "progress" means.
+    progress_reference="excavation_end",
+    # "on the left or right side of the end-effector … CCW or CW", without exception.
+    direction_from="side",
+    direction_obedience=1.0,
+    safety=SafetySettings(
+        # The tip moves at v_max while the finger turns at ω_max: the pivot must be that much
+        # faster, or every excavation would be cut short.
+        speed=_HARDWARE_SPEED,
+        turn_rate=_HARDWARE_OMEGA,
+        acceleration=0.5,  # full speed in about 0.1 s; the paper gives none
+        turn_acceleration=1.0,
+        slow_radius=0.01,
+        slow_fraction=0.5,
+        # Table I bounds each axis; the magnitude bounds both, whatever the heading.
+        force=15.0,
+        torque=4.5,
+        overload=1.5,
+        overload_passes=30.0,  # ordinary jams: up to 27
+        skin_force=20.0,
+        # Slower against whatever is touched bounds impacts further (0.03: half of the reaches peak
+        # below 16.5 N) and costs the time in which burrow and hybrid_clock arrive.
+        touch_light=0.5,
+        touch_speed=_HARDWARE_V,
+        touch_soft=6.0,
+        touch_hard=15.0,
+        touch_lead=0.01,
+        arm_v_max=_HARDWARE_SPEED,
+        arm_omega_max=_HARDWARE_OMEGA,
+        # On each axis: both at once are the 15 N, whatever the direction. With 15 on each the arm
+        # pushes with up to 21, and goes on to while the gate holds it still.
+        arm_f_max=15.0 / math.sqrt(2.0),
+        arm_m_max=4.5,
+        # 38 × 53 cm; the tip keeps off the walls and may come out in front to start and to reset.
+        tip_region=box(-0.30, 0.378, -0.255, 0.255),
+        pivot_region=box(-0.45, 0.30, -0.40, 0.40),
+        **_COMMON_SAFETY,
+    ),
+)
+
+_SIM_V, _SIM_OMEGA = 0.05, 0.35
+_SIM_SPEED = _SIM_V + TIP_X * _SIM_OMEGA
+_SIM_FORCE, _SIM_TORQUE = 10.0, 1.5  # per world axis; ±15 at a lever × 10
+
+AUTHORS_SIM = Parameters(
+    name="authors_sim",
+    v_max=_SIM_V,
+    omega_max=_SIM_OMEGA,
+    time_limit=20.0,
+    goal_radius=0.001,
+    success_during_excavation=False,
+    tip_length=TIP_X,
+    commanded_point="pivot",
+    slow_radius=0.01,
+    slow_fraction=0.5,
+    slow_for="straight",
+    turn_tolerance=0.05,
+    straight_turn_within=0.01,
+    burrow_turn_within=0.0,
+    burrow_amplitude=2.0 / 3.0,  # its ratio A/(1 − A) is 2.0
+    burrow_frequency=0.004 * math.pi * 240.0,  # rad a step × steps a second: 3.02 rad/s
+    burrow_law="unit",
+    excavate_duration=5.0,
+    trigger_interval=5.0,
+    # Its .5 is divided by s_excv once more than equation (7) does.
+    excavate_omega_max=0.25,
+    spiral_growth=2.0,
+    excavate_law="tip_spiral",
+    excavate_heading="start",
+    # With 5 s, 5 s and 20 s exactly one excavation a trial.
+    excavate_needs_time=True,
+    ccw_chance=0.5,
+    force_measure="sum",
+    burrow_force=1.5,
+    excavate_force=7.5,
+    push_force_min=0.05,
+    push_force_max=5.0,
+    push_time=500 / 240,
+    push_dropout=6 / 240,
+    progress_time=750 / 240,
+    # Its distance is not updated while it excavates, so the next stall counts from before.
+    progress_reference="excavation_start",
+    direction_from="cupboard_y",
+    direction_obedience=0.75,
+    safety=SafetySettings(
+        speed=_SIM_SPEED,
+        turn_rate=_SIM_OMEGA,
+        # No harder than its motors could drive its arm: 10 N on 1 kg, 15 on .237.
+        acceleration=10.0,
+        turn_acceleration=15.0 / 0.237,
+        slow_radius=0.01,
+        slow_fraction=0.5,
+        # Its motors end at ±10 N an axis and keep pushing there. The gate stands above them, so
+        # that it slows nothing before both axes are at their limit.
+        force=_SIM_FORCE * math.sqrt(2.0) / 0.8,
+        torque=_SIM_TORQUE / 0.8,
+        # Impacts of what is ten times as hard to accelerate: up to 2.3 times the gate's limit, and
+        # 64 N on the skin, in 300 trials.
+        overload=4.0,
+        overload_passes=30.0,
+        skin_force=120.0,
+        touch_light=0.5,
+        touch_speed=_SIM_V,
+        touch_soft=6.0,
+        touch_hard=15.0,
+        touch_lead=0.01,
+        arm_v_max=_SIM_SPEED,
+        arm_omega_max=_SIM_OMEGA,
+        arm_f_max=_SIM_FORCE,
+        arm_m_max=_SIM_TORQUE,
+        # 37.5 × 55 cm. Its cupboard's walls alone bound its arm: the regions lie just outside.
+        tip_region=box(-0.35, 0.40, -0.30, 0.30),
+        pivot_region=box(-0.50, 0.40, -0.45, 0.45),
+        # Only its straight line is slowed, and by the strategy: burrow arrives at full speed.
+        disabled=frozenset({Check.SLOW_DOWN, Check.OVERLOAD_REPEATED, Check.TOUCH_RISING}),
+        **_COMMON_SAFETY,
+    ),
+)
+
+AUTHORS_SIM = replace(
+    AUTHORS_SIM,
+    note=(
+        f"the arm's own limit is {_SIM_FORCE:g} N on each axis, confirmed by it; the gate's is "
+        f"{AUTHORS_SIM.safety.force:.1f} N in any direction, above both at once, and impacts go "
+        "beyond it for some ms: peaks of 25 N are not a fault of this set"
+    ),
+)
+
+SETS: Mapping[str, Parameters] = MappingProxyType({s.name: s for s in (HARDWARE, AUTHORS_SIM)})
+"""The parameter sets by name."""
+
+_SAFETY_NAMES = names_of(SafetySettings)
+_NAMES = tuple(name for name in names_of(Parameters) if name not in ("name", "safety", "note"))
+_ALL_NAMES = (*_NAMES, *(f"safety.{name}" for name in _SAFETY_NAMES))
+
+
+def parameters(name: str, overrides: Mapping[str, object] | None = None) -> Parameters:
+    """Parameter set ``name`` with single values overridden.
+
+    Keys are field names, those of the gate as ``safety.force`` or in a mapping under ``safety``;
+    regions are lists of corners [x, y] in m, ``safety.disabled`` a list of reason codes. Raises
+    SettingError for an unknown set or key and for a value out of its range.
+    """
+    if name not in SETS:
+        raise SettingError(f"unknown parameter set {name!r}; there are: {', '.join(SETS)}")
+    chosen = SETS[name]
+    given = _flat(overrides or {})
+    check_known(_ALL_NAMES, given, "parameter")
+    for_gate = {
+        key.removeprefix("safety."): _gate_value(key, value)
+        for key, value in given.items()
+        if key.startswith("safety.")
+    }
+    own = {key: value for key, value in given.items() if not key.startswith("safety.")}
+    try:
+        safety = replaced(chosen.safety, for_gate)
+    except SettingError as error:
+        raise SettingError(f"safety.{error}") from error
+    return replaced(chosen, {**own, "safety": safety})
+
+
+def _flat(given: Mapping[str, object]) -> dict[str, object]:
+    """Bring a table under ``safety`` to dotted keys."""
+    flat: dict[str, object] = {}
+    for key, value in given.items():
+        if key == "safety":
+            if not isinstance(value, Mapping):
+                raise SettingError(f"safety is a table of limits, not {value!r}")
+            flat.update({f"safety.{inner}": v for inner, v in value.items()})
+        else:
+            flat[key] = value
+    return flat
+
+
+def _gate_value(key: str, value: object) -> object:
+    """Read the values of the gate that are no numbers."""
+    if key.endswith("_region"):
+        if not isinstance(value, Iterable):
+            raise SettingError(f"{key} is a list of corners [x, y] in m, not {value!r}")
+        return region(value)
+    if key == "safety.disabled":
+        if isinstance(value, str) or not isinstance(value, Iterable):
+            raise SettingError(f"{key} is a list of reason codes, not {value!r}")
+        return frozenset(_check(code) for code in value)
+    return value
+
+
+def _check(code: object) -> Check:
+    try:
+        return Check(str(code))
+    except ValueError as error:
+        raise SettingError(
+            f"safety.disabled: no check is called {code!r}; there are: {', '.join(Check)}"
+        ) from error

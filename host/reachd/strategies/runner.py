@@ -1,0 +1,129 @@
+"""Finding a strategy by name, entry point or ``module:Class``, and asking it safely."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import cast
+
+import numpy as np
+
+from reachd.interfaces import ArmState, Goal, Strategy, Touch, Twist
+from reachd.strategies.builtin import (
+    Burrow,
+    Excavate,
+    HybridClock,
+    HybridEvent,
+    Straight,
+    StrategyEvent,
+)
+from reachd.strategies.parameter_fields import Parameters
+from tactile_core.types import Instant, record
+
+GROUP = "tactile_reach.strategies"
+"""Entry-point group in which an installed package offers strategies."""
+
+Factory = Callable[[Parameters, np.random.Generator], Strategy]
+
+BUILT_IN: dict[str, Factory] = {
+    "straight": Straight,
+    "burrow": Burrow,
+    "excavate": Excavate,
+    "hybrid_clock": HybridClock,
+    "hybrid_event": HybridEvent,
+}
+
+
+class StrategyError(ValueError):
+    """A strategy that cannot be had: says what was asked for, what exists and what to do."""
+
+
+def available() -> tuple[str, ...]:
+    """Names that ``load_strategy`` knows: the built-in ones, then those of installed packages."""
+    return (*BUILT_IN, *sorted(e.name for e in _offered() if e.name not in BUILT_IN))
+
+
+def load_strategy(spec: str, parameters: Parameters, rng: np.random.Generator) -> Strategy:
+    """Make the strategy ``spec``: a built-in name, an entry point's name, or ``module:Class``.
+
+    A class is called with (parameters, rng). Built-in names cannot be taken by a package. Raises
+    StrategyError.
+    """
+    strategy = _guarded(spec, lambda: _factory(spec)(parameters, rng))
+    missing = [name for name in ("start", "step", "activity") if not hasattr(strategy, name)]
+    if missing:
+        raise StrategyError(
+            f"strategy {spec!r} has no {' and no '.join(missing)}; docs/strategies.md shows one"
+        )
+    return strategy
+
+
+@record
+class Answer:
+    """What a strategy said: twist and activity, what it decided, or how it failed (``failure``)."""
+
+    twist: Twist | None
+    activity: str
+    events: tuple[StrategyEvent, ...] = ()
+    failure: str | None = None
+
+
+def begin(strategy: Strategy, goal: Goal, now: Instant) -> str | None:
+    """Start a reach; returns what went wrong, None when nothing did."""
+    try:
+        strategy.start(goal, now)
+    except Exception as error:  # noqa: BLE001 - a plug-in may raise anything
+        return f"{type(error).__name__}: {error}"
+    return None
+
+
+def ask(strategy: Strategy, touch: Touch, arm: ArmState, goal: Goal, now: Instant) -> Answer:
+    """One step of a strategy, whatever it does: it never raises."""
+    try:
+        said = strategy.step(touch, arm, goal, now)
+        if not isinstance(said, Twist):
+            raise TypeError(f"step() returned {type(said).__name__}, not a Twist")
+        twist = Twist(float(said.vx), float(said.vy), float(said.omega))
+        activity = str(strategy.activity)
+        # Not isinstance of a Protocol: in every cycle it costs as much as the strategy itself.
+        events = tuple(strategy.take_events()) if hasattr(strategy, "take_events") else ()
+    except Exception as error:  # noqa: BLE001 - a plug-in may raise anything
+        return Answer(None, "failed", failure=f"{type(error).__name__}: {error}")
+    return Answer(twist, activity, events)
+
+
+def _offered() -> tuple[EntryPoint, ...]:
+    return tuple(entry_points(group=GROUP))
+
+
+def _factory(spec: str) -> Factory:
+    """Class or function that makes the strategy ``spec``."""
+    if spec in BUILT_IN:
+        return BUILT_IN[spec]
+    for entry in _offered():
+        if entry.name == spec:
+            return cast(Factory, entry.load())
+    module, colon, name = spec.partition(":")
+    if not colon or not module or not name:
+        raise StrategyError(
+            f"unknown strategy {spec!r}; there are: {', '.join(available())}; one of your own is "
+            "named module:Class"
+        )
+    made = getattr(import_module(module), name, None)
+    if not callable(made):
+        raise StrategyError(f"strategy {spec!r}: module {module!r} has no class {name!r}")
+    return cast(Factory, made)
+
+
+def _guarded(spec: str, make: Callable[[], Strategy]) -> Strategy:
+    """Run the making of a strategy; whatever it raises becomes a StrategyError."""
+    try:
+        return make()
+    except StrategyError:
+        raise
+    except Exception as error:
+        raise StrategyError(
+            f"strategy {spec!r} cannot be loaded ({type(error).__name__}: {error}); there are: "
+            f"{', '.join(available())}"
+        ) from error

@@ -1,0 +1,1 @@
+"""The bus: topics, messages, sessions, who may do what, commands with proof."""

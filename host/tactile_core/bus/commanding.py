@@ -1,0 +1,397 @@
+"""Who commands an arm: granted by the arm, proved with every command, and for a short time only.
+
+The arm's side is `CommandDesk`, for the simulated arm and for every driver; the commander's side
+is `Signer`. The arm grants its command through a service, one commander at a time, and hands out a
+secret with it. Every command carries a keyed hash made with that secret, so that whoever reads the
+bus and repeats, forges or renumbers commands is not obeyed, and takes nothing from the owner. Pure.
+
+A command dies at its expiry, counted from the instant of its **decision**. That instant is of the
+commander's monotonic clock. Where both run on one machine (`clock_domain` tells) it is this
+machine's own; else it is mapped by the least delay seen, so that what every command was delayed by
+from the first is not seen by the arm, but by the commander, whose own instants the arm echoes.
+"""
+
+from __future__ import annotations
+
+import hmac
+import os
+import platform
+import secrets
+import threading
+from collections import Counter
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import msgspec
+import numpy as np
+import zenoh
+
+from tactile_core.bus.messages import MSG, DecodeError, codec, header
+from tactile_core.bus.services import Service, ServiceError, declare_service
+from tactile_core.bus.topics import COMMAND, NAME, service_key
+from tactile_core.types import (
+    NS_PER_S,
+    ArmLimits,
+    Instant,
+    RemoteClock,
+    Twist,
+    after,
+    monotonic_now,
+    record,
+)
+
+# The services through which every arm, simulated or real, grants its command.
+
+
+def serve_desk(session: zenoh.Session, arm: str, desk: CommandDesk) -> list[Service]:
+    """Serve ``claim`` and ``release`` of the arm called ``arm``."""
+
+    def claim(request: ClaimRequest) -> Grant:
+        try:
+            return desk.claim(request, monotonic_now())
+        except NotGrantedError as error:
+            raise ServiceError(
+                f"arm {arm!r} is not to be had: {error}; stop that one, or name another --arm"
+            ) from error
+
+    def release(request: Signed) -> dict[str, str]:
+        try:
+            desk.release(request)
+        except NotGrantedError as error:
+            raise ServiceError(str(error)) from error
+        return {"commander": desk.commander}
+
+    return [
+        declare_service(session, service_key(arm, "claim", "arm"), claim, ClaimRequest),
+        declare_service(session, service_key(arm, "release", "arm"), release, Signed),
+    ]
+
+
+FRAME: Final = "cupboard"
+
+TAKEOVER: Final = 0.5
+"""s of a commander's silence after which another may be granted; the arm rests long before."""
+
+FIRST_COMMAND: Final = 2.0
+"""s that a commander may take from the grant to the first command."""
+
+LONGEST_EXPIRY: Final = 0.1
+"""s after its decision for which any command may hold: what the arm may take to come to rest."""
+
+AHEAD: Final = 0.01
+"""s that a decision of this machine's own clock may seem to lie ahead of now."""
+
+PROOF_BYTES: Final = 16
+NO_PROOF: Final = np.zeros(PROOF_BYTES, np.uint8)
+
+Refusal = Literal[
+    "malformed",
+    "foreign",
+    "forged",
+    "repeated",
+    "late",
+    "future",
+    "bad_expiry",
+    "wrong_frame",
+    "not_planar",
+]
+
+REFUSALS: Final[tuple[Refusal, ...]] = (
+    "malformed",
+    "foreign",
+    "forged",
+    "repeated",
+    "late",
+    "future",
+    "bad_expiry",
+    "wrong_frame",
+    "not_planar",
+)
+"""Why a command is not obeyed. ``foreign``: from somebody who does not command the arm.
+``forged``: under the commander's name without his proof. ``repeated``: obeyed already, or older
+than one that was. ``late``: older than its expiry when it came. ``future``: decided after now."""
+
+
+class NotGrantedError(Exception):
+    """The arm's command, or what only its commander may ask for, is not granted; says why."""
+
+
+class ClaimRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``name``: of the reach. ``clock``: `clock_domain` of the commander."""
+
+    name: str
+    clock: str
+
+
+class Grant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``commander``: how the arm calls its new owner. ``key``: the secret, as hex digits.
+
+    ``clock``: "same" where the arm counts by the commander's own clock, else "remote".
+    """
+
+    commander: str
+    key: str
+    clock: str
+
+
+class Signed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the commander asks for, with the proof that it is him; see `Signer.sign`.
+
+    All empty from somebody who is not: granted only while nobody commands the arm.
+    """
+
+    commander: str = ""
+    number: int = 0
+    proof: str = ""
+
+
+class LimitsRequest(Signed, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """`ArmLimits`, signed. ValueError for limits that would not limit."""
+
+    v_max: float
+    omega_max: float
+    f_max: float
+    m_max: float
+
+    def __post_init__(self) -> None:
+        """Refuse them as `ArmLimits` does."""
+        _ = self.limits
+
+    @property
+    def limits(self) -> ArmLimits:
+        """The limits alone."""
+        return ArmLimits(self.v_max, self.omega_max, self.f_max, self.m_max)
+
+
+@record
+class Order:
+    """A command that may be obeyed until ``expires``, by the arm's clock.
+
+    ``decided`` is the instant by the commander's clock, to be echoed with ``sequence``.
+    """
+
+    twist: Twist
+    commander: str
+    sequence: int
+    decided: Instant
+    expires: Instant
+
+
+@cache
+def clock_domain() -> str:
+    """Names the monotonic clock of this process: equal where instants can be compared."""
+    parts = [platform.node()]
+    with suppress(OSError):  # not Linux: the machine's name alone
+        parts = [Path("/proc/sys/kernel/random/boot_id").read_text().strip()]
+        parts.append(os.readlink("/proc/self/ns/time"))  # containers may shift the clock
+    return " ".join(parts)
+
+
+def command_message(
+    twist: Twist,
+    decided: Instant,
+    expiry: float,
+    wall_ns: int,
+    *,
+    commander: str = "",
+    sequence: int = 0,
+) -> Any:
+    """``ArmCommand`` without a proof, decided at ``wall_ns``, which the header tells."""
+    linear, angular = MSG.Vector3(twist.vx, twist.vy, 0.0), MSG.Vector3(0.0, 0.0, twist.omega)
+    return MSG.ArmCommand(
+        header=header(wall_ns, FRAME),
+        twist=MSG.Twist(linear, angular),
+        decided_ns=decided,
+        sequence=sequence,
+        expiry=expiry,
+        commander=commander,
+        proof=NO_PROOF,
+    )
+
+
+class Signer:
+    """The commander's side of ``grant``: numbers commands and requests, and proves them."""
+
+    def __init__(self, grant: Grant) -> None:
+        self.commander = grant.commander
+        self._key = bytes.fromhex(grant.key)
+        self._sequence = 0
+        self._number = 0
+
+    def command(self, twist: Twist, decided: Instant, expiry: float, wall_ns: int) -> bytes:
+        """CDR bytes of the next command."""
+        self._sequence += 1
+        message = command_message(
+            twist, decided, expiry, wall_ns, commander=self.commander, sequence=self._sequence
+        )
+        data = codec().encode(COMMAND, message)[:-PROOF_BYTES]
+        return data + _proof(self._key, data)
+
+    def sign(self, service: str, **fields: object) -> dict[str, object]:
+        """A request to the arm's ``service``, to be sent as JSON."""
+        self._number += 1
+        about = _about(service, self.commander, self._number, fields)
+        signed = {"commander": self.commander, "number": self._number}
+        return fields | signed | {"proof": _proof(self._key, about).hex()}
+
+
+class CommandDesk:
+    """The arm's side: grants its command to one at a time, and tells whose words are obeyed.
+
+    Every command is judged as it comes, in any thread, so that no flood of others can hide the
+    commander's; `newest` then hands out the last that holds.
+    """
+
+    def __init__(self) -> None:
+        self._codec = codec()
+        self._lock = threading.Lock()
+        self._commander = ""
+        self._name = ""
+        self._key = b""
+        self._clock: RemoteClock | None = None  # None where it is our own
+        self._until = Instant(0)  # until when nobody else is granted
+        self._taken = 0  # sequence of the newest command that was believed
+        self._asked = 0  # number of the newest request that was granted
+        self._order: Order | None = None
+        self._counts: Counter[str] = Counter()
+
+    @property
+    def commander(self) -> str:
+        """Whose commands are obeyed; empty for nobody's."""
+        return self._commander
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Commands not obeyed so far, by reason; ``not_granted``: claims and requests."""
+        return {reason: self._counts[reason] for reason in (*REFUSALS, "not_granted")}
+
+    def claim(self, request: ClaimRequest, now: Instant) -> Grant:
+        """Grant the command; `NotGrantedError` while somebody else is heard."""
+        with self._lock:
+            if not NAME.fullmatch(request.name):
+                self._counts["not_granted"] += 1
+                raise NotGrantedError(f"{request.name[:80]!r} cannot be the name of a commander")
+            if self._commander and now < self._until:
+                self._counts["not_granted"] += 1
+                raise NotGrantedError(f"commanded by another reachd (reach {self._name!r})")
+            own = request.clock == clock_domain()
+            key = secrets.token_bytes(32)
+            self._commander = f"{request.name}-{secrets.token_hex(4)}"
+            self._name, self._key = request.name, key
+            self._clock = None if own else RemoteClock()
+            self._until = after(now, FIRST_COMMAND)
+            self._taken = self._asked = 0
+            self._order = None
+            return Grant(self._commander, key.hex(), "same" if own else "remote")
+
+    def release(self, request: Signed) -> None:
+        """The commander gives his grant back; `NotGrantedError` when it is not his."""
+        with self._lock:
+            if not self._commander:
+                return
+            self._prove("release", request, {})
+            self._forget()
+
+    def forget(self) -> None:
+        """Whoever commands the arm does so no longer: for the arm's own operator."""
+        with self._lock:
+            self._forget()
+
+    def _forget(self) -> None:
+        self._commander = self._name = ""
+        self._key = b""
+        self._order = None
+
+    def authorise(self, service: str, request: Signed, now: Instant, **fields: object) -> None:
+        """Let a request pass that only the commander may make; `NotGrantedError`.
+
+        While nobody commands the arm, or its commander has long been silent, anybody may.
+        """
+        with self._lock:
+            if self._commander and (request.commander or now < self._until):
+                self._prove(service, request, fields)
+
+    def hear(self, data: bytes, now: Instant) -> Refusal | None:
+        """Judge a command that came at ``now``; returns, and counts, why it is not obeyed."""
+        with self._lock:
+            found = self._judge(data, now)
+            if isinstance(found, Order):
+                self._order = found
+                return None
+            self._counts[found] += 1
+            return found
+
+    def newest(self, now: Instant) -> Order | None:
+        """The newest command that was not handed out before and still holds."""
+        with self._lock:
+            order, self._order = self._order, None
+            if order is not None and order.expires <= now:
+                self._counts["late"] += 1
+                return None
+            return order
+
+    def _judge(self, data: bytes, now: Instant) -> Order | Refusal:
+        try:
+            message = self._codec.decode(COMMAND, data)
+        except DecodeError:
+            return "malformed"
+        if not self._commander or message.commander != self._commander:
+            return "foreign"
+        head, proof = data[:-PROOF_BYTES], data[-PROOF_BYTES:]
+        if not hmac.compare_digest(_proof(self._key, head), proof):
+            return "forged"
+        # From here on it is the commander who speaks.
+        sequence = int(message.sequence)
+        if sequence <= self._taken:
+            return "repeated"
+        self._taken = sequence
+        self._until = max(self._until, after(now, TAKEOVER))
+        expiry = float(message.expiry)
+        if not 0.0 < expiry <= LONGEST_EXPIRY:
+            return "bad_expiry"
+        stamp = Instant(int(message.decided_ns))
+        decided = stamp if self._clock is None else self._clock.here(stamp, now)
+        if decided > now + AHEAD * NS_PER_S:
+            return "future"
+        expires = after(decided, expiry)
+        if expires <= now:
+            return "late"
+        if message.header.frame_id != FRAME:
+            return "wrong_frame"
+        linear, angular = message.twist.linear, message.twist.angular
+        if any(part != 0.0 for part in (linear.z, angular.x, angular.y)):
+            return "not_planar"
+        twist = Twist(float(linear.x), float(linear.y), float(angular.z))
+        return Order(twist, self._commander, sequence, stamp, expires)
+
+    def _prove(self, service: str, request: Signed, fields: dict[str, object]) -> None:
+        """NotGrantedError unless ``request`` is the commander's and new; the lock is held."""
+        about = _about(service, request.commander, request.number, fields)
+        good = hmac.compare_digest(_proof(self._key, about).hex().encode(), request.proof.encode())
+        if request.commander != self._commander or not good or request.number <= self._asked:
+            self._counts["not_granted"] += 1
+            raise NotGrantedError(
+                f"{service} is for the arm's commander (reach {self._name!r}) while it has one"
+            )
+        self._asked = request.number
+
+
+def _proof(key: bytes, data: bytes) -> bytes:
+    return hmac.digest(key, data, "sha256")[:PROOF_BYTES]
+
+
+def _about(service: str, commander: str, number: int, fields: dict[str, object]) -> bytes:
+    plain = {k: float(v) if isinstance(v, int | float) else v for k, v in fields.items()}
+    return msgspec.json.encode([service, commander, number, plain], order="sorted")
+
+
+def limits_fields(limits: ArmLimits) -> dict[str, object]:
+    """``limits`` as the fields of a `LimitsRequest`."""
+    return {
+        "v_max": limits.v_max,
+        "omega_max": limits.omega_max,
+        "f_max": limits.f_max,
+        "m_max": limits.m_max,
+    }

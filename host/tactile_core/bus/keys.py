@@ -1,0 +1,103 @@
+"""A folder of keys: what one party of a rig needs to join it over TLS.
+
+``ca.pem`` (the lab's own authority), ``cert.pem`` and ``key.pem`` (this party's), ``roles.toml``
+(which certificate names are let in, and as what). `tactile bus keys` makes them.
+"""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+
+import msgspec
+
+from tactile_core.bus.rights import CERTIFICATE_ROLES, CertificateRole
+from tactile_core.config import ConfigError, load_toml
+
+CA, CERTIFICATE, PRIVATE_KEY, ROLES = "ca.pem", "cert.pem", "key.pem", "roles.toml"
+
+
+class KeysError(Exception):
+    """The keys cannot be used; the message names the remedy."""
+
+
+class Roles(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Certificate names of each role; whoever is on no list is let do nothing."""
+
+    tactiled: tuple[str, ...] = ()
+    reachd: tuple[str, ...] = ()
+    arm: tuple[str, ...] = ()
+    operator: tuple[str, ...] = ()
+    viewer: tuple[str, ...] = ()
+
+    def table(self) -> dict[CertificateRole, tuple[str, ...]]:
+        """Names by role."""
+        return {role: getattr(self, role) for role in CERTIFICATE_ROLES}
+
+
+class TlsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Mutual TLS: paths of PEM files, and the certificate names of each role (no others come in).
+
+    ``name``: this party's own common name, so that what it may not ask can be told at once.
+    """
+
+    root_ca: str
+    certificate: str
+    private_key: str
+    roles: Roles
+    name: str = ""
+
+    def role(self) -> CertificateRole | None:
+        """Role of this party's own certificate, None where ``name`` does not say."""
+        return next(
+            (role for role, names in self.roles.table().items() if self.name in names), None
+        )
+
+
+class RolesFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``roles.toml``."""
+
+    name: str = ""
+    roles: Roles
+
+
+def load_keys(folder: Path | str) -> TlsConfig:
+    """What a folder of keys says; `KeysError` when it is not whole."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise KeysError(
+            f"--keys {folder}: there is no such folder; `tactile bus keys` makes one for each party"
+        )
+    parties = ", ".join(sorted(p.name for p in folder.iterdir() if (p / ROLES).exists()))
+    if not (folder / PRIVATE_KEY).exists() and parties:
+        raise KeysError(f"--keys {folder}: name the folder of one party in it ({parties})")
+    try:
+        said = load_toml(folder / ROLES, RolesFile)
+    except ConfigError as error:
+        raise KeysError(str(error)) from error
+    return TlsConfig(
+        root_ca=str(folder / CA),
+        certificate=str(folder / CERTIFICATE),
+        private_key=str(folder / PRIVATE_KEY),
+        roles=said.roles,
+        name=said.name,
+    )
+
+
+def check_keys(tls: TlsConfig) -> None:
+    """`KeysError` when a file is missing, or others of this machine can read the private key."""
+    for path in (tls.root_ca, tls.certificate, tls.private_key):
+        try:
+            with Path(path).open("rb") as file:
+                if not file.read(1):
+                    raise KeysError(f"{path} is empty: make the keys again")
+        except OSError as error:
+            raise KeysError(
+                f"{path}: {error.strerror}; name a folder of keys, which `tactile bus keys` makes"
+            ) from error
+    if Path(tls.private_key).stat().st_mode & stat.S_IRWXO:
+        raise KeysError(
+            f"every user of this machine can read {tls.private_key}: chmod 0600 {tls.private_key}"
+        )
+    if not any(tls.roles.table().values()):
+        raise KeysError("roles is empty: name the certificates of each role")

@@ -1,0 +1,185 @@
+"""Streams over zenoh: publishers that never block, and readers that only ever see the newest."""
+
+from __future__ import annotations
+
+import struct
+import time
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import zenoh
+
+from tactile_core.bus.messages import MAX_PAYLOAD
+from tactile_core.bus.topics import Topic, alive_key
+
+ATTACHMENT = struct.Struct("<qqB16s")
+"""Sequence number, wall-clock ns, length of the id, id of the publisher: rmw_zenoh's layout."""
+
+WALL_LIMIT_NS = (1 << 63) - 1
+
+
+class Publisher:
+    """One stream, for one thread; drops when a link is full, never waits for a subscriber."""
+
+    def __init__(self, session: zenoh.Session, key: str, msgtype: str) -> None:
+        encoding = zenoh.Encoding.APPLICATION_CDR.with_schema(msgtype)
+        self._publisher = session.declare_publisher(
+            key,
+            encoding=encoding,
+            congestion_control=zenoh.CongestionControl.DROP,
+            express=False,
+        )
+        self.key = key
+        self.source = uuid.uuid4().bytes
+        self.sequence = 0
+
+    def put(self, data: bytes, wall_ns: int) -> None:
+        """Send CDR bytes stamped with their wall-clock time; ValueError above MAX_PAYLOAD.
+
+        A time that the attachment cannot hold (64 bits of ns) becomes the nearest that it can.
+        """
+        if len(data) > MAX_PAYLOAD:
+            raise ValueError(f"{len(data)} bytes on {self.key}: {MAX_PAYLOAD} allowed")
+        self.sequence += 1
+        wall_ns = min(max(wall_ns, -WALL_LIMIT_NS), WALL_LIMIT_NS)
+        attachment = ATTACHMENT.pack(self.sequence, wall_ns, 16, self.source)
+        self._publisher.put(data, attachment=attachment)
+
+    def close(self) -> None:
+        """Take the stream back."""
+        self._publisher.undeclare()
+
+
+def declare_publisher(
+    session: zenoh.Session, topic: Topic, name: str, prefix: str = ""
+) -> Publisher:
+    """Stream ``topic`` of the board, arm or reach called ``name``."""
+    return Publisher(session, topic.key(name, prefix), topic.msgtype)
+
+
+@dataclass(frozen=True, slots=True)
+class BusSample:
+    """What a publisher put. The last three are None where the sender attached nothing.
+
+    ``wall_ns``: the sender's stamp. ``source``: 16 bytes that tell one publisher from another.
+    """
+
+    key: str
+    data: bytes
+    sequence: int | None
+    wall_ns: int | None
+    source: bytes | None
+
+
+def read_sample(sample: zenoh.Sample) -> BusSample:
+    """Bytes of a sample and what its publisher said of itself."""
+    sequence = wall_ns = source = None
+    attachment = sample.attachment
+    if attachment is not None and len(attachment) == ATTACHMENT.size:
+        sequence, wall_ns, _, source = ATTACHMENT.unpack(attachment.to_bytes())
+    key = str(sample.key_expr)
+    return BusSample(key, sample.payload.to_bytes(), sequence, wall_ns, source)
+
+
+class Latest:
+    """Newest sample of a key; older ones that were not fetched are gone, and counted.
+
+    zenoh keeps one sample (RingChannel), in its own threads, so the reader's age of data does not
+    grow however slow it is. ``skipped`` is exact for publishers of this project.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(1)
+        self._subscriber = session.declare_subscriber(key, ring)
+        self._last: tuple[bytes, int] | None = None
+        self.key = key
+        self.received = 0
+        self.skipped = 0
+        self.refused = 0  # above MAX_PAYLOAD
+
+    def newest(self) -> BusSample | None:
+        """The newest sample not fetched before, or None. Never blocks."""
+        sample = self._subscriber.try_recv()
+        if sample is None:
+            return None
+        if len(sample.payload) > MAX_PAYLOAD:
+            self.refused += 1
+            return None
+        self.received += 1
+        found = read_sample(sample)
+        if found.source is not None and found.sequence is not None:
+            if self._last is not None and self._last[0] == found.source:
+                self.skipped += max(found.sequence - self._last[1] - 1, 0)
+            self._last = (found.source, found.sequence)
+        return found
+
+    def wait(self, timeout: float, period: float = 0.001) -> BusSample | None:
+        """The newest sample, waiting for one up to ``timeout`` s; None when none came."""
+        deadline = time.monotonic() + timeout
+        while (sample := self.newest()) is None:
+            if time.monotonic() >= deadline:
+                return None
+            time.sleep(period)
+        return sample
+
+    def close(self) -> None:
+        """Take the subscription back."""
+        self._subscriber.undeclare()
+
+
+class Tap:
+    """Every sample of a key expression, handed to ``take`` in zenoh's thread: for logs and watches.
+
+    ``take`` must be quick, for what it leaves undone piles up: control reads `Latest` instead.
+    ``remote_only``: nothing that this session itself puts.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key: str,
+        take: Callable[[BusSample], None],
+        *,
+        remote_only: bool = False,
+    ) -> None:
+        self._take = take
+        self.key = key
+        self.refused = 0  # above MAX_PAYLOAD
+        origin = zenoh.Locality.REMOTE if remote_only else zenoh.Locality.ANY
+        self._subscriber = session.declare_subscriber(key, self._hear, allowed_origin=origin)
+
+    def close(self) -> None:
+        """Take the subscription back."""
+        self._subscriber.undeclare()
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        if len(sample.payload) > MAX_PAYLOAD:
+            self.refused += 1
+        else:
+            self._take(read_sample(sample))
+
+
+def latest(session: zenoh.Session, key: str) -> Latest:
+    """Subscribe for control or display: only ever the newest sample of ``key``."""
+    return Latest(session, key)
+
+
+def declare_alive(session: zenoh.Session, name: str) -> zenoh.LivelinessToken:
+    """Announce that someone publishes for ``name``. Information only: safety rests on data age."""
+    return session.liveliness().declare_token(alive_key(name))
+
+
+def list_alive(session: zenoh.Session, timeout: float = 1.0) -> list[str]:
+    """Names with a liveliness token, sorted; asks until ``timeout`` s passed or one answered."""
+    deadline = time.monotonic() + timeout
+    names: set[str] = set()
+    while not names:
+        remaining = deadline - time.monotonic()
+        if remaining <= 0:
+            break
+        for reply in session.liveliness().get("tactile/*/alive", timeout=remaining):
+            if reply.ok is not None:
+                names.add(str(reply.ok.key_expr).split("/")[-2])
+        time.sleep(0.02)
+    return sorted(names)

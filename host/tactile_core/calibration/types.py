@@ -1,0 +1,143 @@
+"""Calibration of one board as values: its taxels' places, rest fields and force model."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_core.calibration.force_model import NetModel
+from tactile_core.geometry import ArrayGeometry, SkinGeometry
+
+Float = NDArray[np.float64]
+
+YAW_DECIMALS = 9
+"""Chip yaw is kept in degrees in files; this many decimals make degrees → radians → degrees the
+identity, so a calibration keeps its hash through a file."""
+
+
+class CalibrationError(ValueError):
+    """A calibration that cannot be used; names file, key, what was given and what is allowed."""
+
+
+class CalibrationMismatch(CalibrationError):  # noqa: N818 - the name users know from the messages
+    """A calibration that belongs to another board; names both serial numbers."""
+
+    def __init__(self, calibrated: str, board: str, source: str = "the calibration") -> None:
+        self.calibrated = calibrated
+        self.board = board
+        super().__init__(
+            f"{source} belongs to board {calibrated!r}, but the board on the port is {board!r}; "
+            f"give the calibration file of {board!r}, or none to run with nominal figures"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArrayCalibration:
+    """One array of n taxels; all vectors in taxel axes (after the chips' yaw was undone).
+
+    ``rest_ut``: (n, 3) µT unloaded, at ``reference_c`` °C. ``drift_ut_per_k``: (n, 3) µT/K.
+    ``newton_per_ut``: (3n, 3n) N/µT; the taxels' forces, one after another, are this matrix times
+    their fields (rest, drift and ambient taken off). Off-diagonal blocks undo crosstalk.
+    """
+
+    geometry: ArrayGeometry
+    rest_ut: Float
+    drift_ut_per_k: Float
+    reference_c: float
+    newton_per_ut: Float
+
+    def __post_init__(self) -> None:
+        """Refuse shapes that disagree with the geometry, and numbers that are not finite."""
+        n = self.geometry.taxels
+        for label, array, shape in (
+            ("rest_ut", self.rest_ut, (n, 3)),
+            ("drift_ut_per_k", self.drift_ut_per_k, (n, 3)),
+            ("newton_per_ut", self.newton_per_ut, (3 * n, 3 * n)),
+        ):
+            if array.shape != shape:
+                raise CalibrationError(
+                    f"array {self.geometry.name!r}: {label} is {array.shape}, not {shape}"
+                )
+            if not np.isfinite(array).all():
+                raise CalibrationError(f"array {self.geometry.name!r}: {label} is not finite")
+        if not np.isfinite(self.reference_c):
+            raise CalibrationError(f"array {self.geometry.name!r}: reference_c is not finite")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardCalibration:
+    """Calibration of the board with ``serial_number``.
+
+    ``nominal``: made from typical figures, not from measurements of this board; then the rest
+    field is unknown and must be tared. ``nets``: fitted models of the contact as a whole, each
+    with targets of its own; the arrays' matrices then only say how it is shared among taxels.
+    """
+
+    serial_number: str
+    model: str
+    frame: str
+    created: str  # ISO 8601
+    provenance: str
+    nominal: bool
+    arrays: tuple[ArrayCalibration, ...]
+    nets: tuple[NetModel, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse models of another number of taxels, and two for the same target."""
+        taxels = sum(array.geometry.taxels for array in self.arrays)
+        seen: set[str] = set()
+        for i, net in enumerate(self.nets):
+            if net.taxels != taxels:
+                raise CalibrationError(
+                    f"net[{i}] is for {net.taxels} taxels, the board has {taxels}"
+                )
+            for target in net.targets:
+                if target in seen:
+                    raise CalibrationError(f"net[{i}]: another model predicts {target!r} already")
+                seen.add(target)
+
+    @property
+    def geometry(self) -> SkinGeometry:
+        """Geometry of the whole board."""
+        return SkinGeometry(self.model, self.frame, tuple(a.geometry for a in self.arrays))
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 over everything the calibration says, 64 hex digits; the same after a file."""
+        digest = hashlib.sha256()
+
+        def text(value: str) -> None:
+            data = value.encode()
+            digest.update(len(data).to_bytes(4, "little") + data)
+
+        def numbers(value: Float) -> None:
+            digest.update(np.ascontiguousarray(value + 0.0, "<f8").tobytes())  # -0 counts as 0
+
+        for value in (self.serial_number, self.model, self.frame, self.created, self.provenance):
+            text(value)
+        text("nominal" if self.nominal else "measured")
+        for array in self.arrays:
+            g = array.geometry
+            text(f"{g.name}/{int(g.side)}/{g.rows}x{g.columns}{'' if g.posed else '/unposed'}")
+            for place in (g.position, g.rotation, g.surface, yaw_degrees(g.chip_yaw)):
+                numbers(place)
+            numbers(array.rest_ut)
+            numbers(array.drift_ut_per_k)
+            numbers(np.array([array.reference_c]))
+            numbers(array.newton_per_ut)
+        for net in self.nets:
+            net.digest(text, numbers)
+        return digest.hexdigest()
+
+    def require_board(self, serial_number: str, source: str = "the calibration") -> None:
+        """Raise `CalibrationMismatch` unless this calibration is that board's own."""
+        if serial_number != self.serial_number:
+            raise CalibrationMismatch(self.serial_number, serial_number, source)
+
+
+def yaw_degrees(yaw: Float) -> Float:
+    """Chip yaw in degrees as files carry it; ``yaw`` in rad."""
+    return np.asarray(np.round(np.rad2deg(yaw), YAW_DECIMALS) + 0.0, np.float64)

@@ -1,0 +1,1 @@
+"""Logs: writing them crash-safe, reading any, salvaging damaged ones."""

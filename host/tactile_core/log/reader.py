@@ -1,0 +1,990 @@
+"""Reads MCAP logs as they are: finished, cut off, or damaged, of any writer. Constant memory.
+
+A sound file is read record by record, as the format says: records of unknown types and fields that
+were appended are passed over. Where a record cannot be right, reading goes on at the next chunk,
+found by its header; everything passed over is reported as `Damage`, never silently.
+
+The ``mcap`` package takes apart the records of the summary. Its readers are not used for the rest:
+they stop at the first damage, unpack a chunk whatever its size, and take five times as long.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import struct
+import zlib
+from array import array
+from collections.abc import Callable, Collection, Container, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+from typing import TypeVar
+
+from mcap import records as mcap_records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+
+from tactile_core.log import mcap_file as op
+from tactile_core.log.records import (
+    ATTACHMENT_HEAD,
+    COMPRESSIONS,
+    SMALL,
+    U32,
+    U64,
+    WINDOW,
+    AttachmentRecord,
+    BadRecordError,
+    Block,
+    ChannelRecord,
+    ChunkHead,
+    Cursor,
+    Damage,
+    Event,
+    LogBytes,
+    LogError,
+    Message,
+    Packed,
+    Progress,
+    ReadAt,
+    SchemaRecord,
+    parse_channel,
+    parse_metadata,
+    parse_schema,
+    pieces,
+    unpack,
+    unpack_what_can_be,
+    verify,
+)
+
+# The summary at the end of a finished log: read a record at a time, whatever its length.
+
+
+R = TypeVar("R")
+
+ALLOWED = frozenset(
+    (
+        op.SCHEMA,
+        op.CHANNEL,
+        op.CHUNK_INDEX,
+        op.ATTACHMENT_INDEX,
+        op.STATISTICS,
+        op.METADATA_INDEX,
+        op.SUMMARY_OFFSET,
+    )
+)
+"""Records of a summary, beside those of types that this version does not know."""
+
+LARGEST = 16 << 20
+"""Bytes of a summary's record that is looked into; a chunk's index has ten for each channel."""
+
+FOOTER_SIZE = 9 + 20
+
+CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")
+
+
+@dataclass(slots=True)
+class Chunks:
+    """What a summary says of the chunks, in its order; stamps in ns, places in bytes.
+
+    ``length``: of a chunk with the message indexes behind it.
+    """
+
+    first_ns: array[int] = field(default_factory=lambda: array("Q"))
+    last_ns: array[int] = field(default_factory=lambda: array("Q"))
+    offset: array[int] = field(default_factory=lambda: array("Q"))
+    length: array[int] = field(default_factory=lambda: array("Q"))
+
+    def __len__(self) -> int:
+        return len(self.offset)
+
+
+@dataclass(slots=True)
+class Summary:
+    """What stands between ``start`` and the footer at ``end``. ``checked``: its checksum is right.
+
+    ``bad_crc``: it is wrong; then the rest says nothing. ``unindexed``: chunks with messages of
+    which no message index is named. ``troubles``: records that cannot be read, with their places.
+    """
+
+    start: int
+    end: int
+    checked: bool = False
+    bad_crc: bool = False
+    schemas: list[SchemaRecord] = field(default_factory=list)
+    channels: list[ChannelRecord] = field(default_factory=list)
+    statistics: mcap_records.Statistics | None = None
+    chunks: Chunks = field(default_factory=Chunks)
+    unindexed: int = 0
+    attachments: list[mcap_records.AttachmentIndex] = field(default_factory=list)
+    metadata: list[mcap_records.MetadataIndex] = field(default_factory=list)
+    troubles: list[tuple[int, int, str]] = field(default_factory=list)
+
+    @property
+    def knows_all_channels(self) -> bool:
+        """Whether every channel of the file is defined here, so that chunks may be passed over."""
+        statistics = self.statistics
+        return statistics is not None and 0 < statistics.channel_count <= len(self.channels)
+
+
+def parse(read: Callable[[ReadDataStream], R], body: bytes) -> R:
+    """A record taken apart by the ``mcap`` package; `BadRecordError` when it is none."""
+    try:
+        return read(ReadDataStream(io.BytesIO(body)))
+    except (McapError, EOFError, struct.error, UnicodeDecodeError):
+        raise BadRecordError("a record is shorter than its fields") from None
+
+
+def read_summary(read_at: ReadAt, start: int, end: int, crc: int | None) -> Summary | None:
+    """The summary from ``start`` to the footer at ``end``; None when other records stand there.
+
+    ``crc``: of the footer, 0 for none; None when it is not to be checked.
+    """
+    summary = Summary(start, end)
+    for position, opcode, length in _records(read_at, start, end):
+        if opcode == 0 or (opcode <= op.DATA_END and opcode not in ALLOWED):
+            return None
+        if position + 9 + length > end:
+            return None
+    if crc:
+        summary.checked = _crc(read_at, start, end + FOOTER_SIZE - 4) == crc
+        summary.bad_crc = not summary.checked
+        if summary.bad_crc:
+            return summary
+    for position, opcode, length in _records(read_at, start, end):
+        if opcode not in ALLOWED or opcode == op.SUMMARY_OFFSET:
+            continue
+        if length > LARGEST:
+            summary.troubles.append((position, length + 9, f"a record of {length} bytes"))
+            continue
+        try:
+            _take(summary, opcode, read_at(position + 9, length))
+        except BadRecordError as error:
+            summary.troubles.append((position, length + 9, str(error)))
+    return summary
+
+
+def _records(read_at: ReadAt, start: int, end: int) -> Iterator[tuple[int, int, int]]:
+    """Place, type and length of each record; one that ends beyond ``end`` for what is none."""
+    position = start
+    window, begin = b"", start
+    while position < end:
+        if not begin <= position <= begin + len(window) - 9:
+            window, begin = read_at(position, min(WINDOW, end - position)), position
+            if len(window) < 9:
+                yield position, 1, end
+                return
+        opcode, length = op.RECORD.unpack_from(window, position - begin)
+        yield position, opcode, length
+        position += 9 + length
+
+
+def _crc(read_at: ReadAt, start: int, end: int) -> int:
+    crc = 0
+    for at in range(start, end, WINDOW):
+        crc = zlib.crc32(read_at(at, min(WINDOW, end - at)), crc)
+    return crc
+
+
+def _take(summary: Summary, opcode: int, body: bytes) -> None:
+    if opcode == op.SCHEMA:
+        summary.schemas.append(parse_schema(body))
+    elif opcode == op.CHANNEL:
+        summary.channels.append(parse_channel(body))
+    elif opcode == op.STATISTICS:
+        summary.statistics = parse(mcap_records.Statistics.read, body)
+    elif opcode == op.ATTACHMENT_INDEX:
+        summary.attachments.append(parse(mcap_records.AttachmentIndex.read, body))
+    elif opcode == op.METADATA_INDEX:
+        summary.metadata.append(parse(mcap_records.MetadataIndex.read, body))
+    elif opcode == op.CHUNK_INDEX:
+        cursor = Cursor(body)
+        first, last, offset, length, indexes = cursor.take(CHUNK_INDEX_HEAD)
+        cursor.at += indexes  # ten bytes a channel, of no use here
+        (index_length,) = cursor.take(struct.Struct("<Q"))
+        chunks = summary.chunks
+        chunks.first_ns.append(first)
+        chunks.last_ns.append(last)
+        chunks.offset.append(offset)
+        chunks.length.append(min(length + index_length, (1 << 64) - 1))
+        summary.unindexed += not indexes
+
+
+MAX_CHUNK = 256 << 20
+"""Bytes of one chunk, or of a message outside chunks: rosbag2 and Foxglove write chunks of 0.8 to
+4 MB, this project of 1 MB; bounds memory."""
+
+MAX_SUSPECT = 64 << 20
+"""Bytes of a damaged chunk in which whole messages are looked for: it is in memory meanwhile."""
+
+MAX_RECORD = 16 << 20
+"""Bytes of a schema, channel or metadata record: real ones are a few kB."""
+
+MAX_DEFINITIONS = 64 << 20
+"""Bytes of all schemas and channels of a file: three thousand topics have some MB."""
+
+MAX_FILE = 1 << 50
+"""Bytes beyond which no file goes: a length that says so is wrong."""
+
+MAX_DAMAGES = 1000
+"""Places reported one by one; beyond that they are only counted."""
+
+FOOTER = struct.Struct("<QQI")
+
+NO_MESSAGES = frozenset((op.HEADER, op.SCHEMA, op.CHANNEL, op.MESSAGE_INDEX, op.ATTACHMENT,
+                         op.METADATA, op.DATA_END))  # fmt: skip
+"""Records whose loss is not that of a message."""
+
+DATA_RECORDS = frozenset((op.HEADER, op.SCHEMA, op.CHANNEL, op.METADATA, op.MESSAGE))
+
+
+class _Any:
+    """Contains everything."""
+
+    def __contains__(self, _: object) -> bool:
+        return True
+
+
+ANY: Container[int] = _Any()
+"""All channels, for `LogReader.messages` to hand out none of their data."""
+
+
+@dataclass(slots=True)
+class LogReader:
+    """One pass over a log, as a context manager. `LogError` when the file is none.
+
+    ``window``: log times, ns, first and last included; chunks wholly outside may be passed over,
+    and attachments and tables are. ``keep_suspect``: blocks and attachments whose checksum is
+    wrong are handed out all the same, as far as they can be read.
+
+    After the pass: ``schemas`` and ``channels`` by number, ``closed`` (the file was finished in
+    order), ``damages`` (the first MAX_DAMAGES) and their ``damage_count``, ``bytes_damaged``,
+    ``messages_lost`` as far as indexes tell, ``lost_unknown`` places where they do not.
+    ``data_crc``: of all bytes up to ``data_end``, 0 where the writer made none. ``suspect``:
+    messages handed out of blocks whose checksum is wrong; ``unchunked``: those outside chunks.
+    """
+
+    path: Path
+    progress: Progress | None = None
+    window: tuple[int, int] | None = None
+    keep_suspect: bool = False
+    size: int = 0
+    closed: bool = False
+    profile: str = ""
+    library: str = ""
+    schemas: dict[int, SchemaRecord] = field(default_factory=dict)
+    channels: dict[int, ChannelRecord] = field(default_factory=dict)
+    damages: list[Damage] = field(default_factory=list)
+    damage_count: int = 0
+    bytes_damaged: int = 0
+    messages_lost: int = 0
+    lost_unknown: int = 0
+    unchunked: int = 0
+    chunk_count: int = 0
+    suspect: int = 0
+    summary: Summary | None = None
+    data_crc: int = 0
+    data_end: int = 0
+    _bytes: LogBytes = field(init=False)
+    _footer: tuple[int, int] | None = None  # where it says that the summary begins; its checksum
+    _lost_chunk: Damage | None = None
+    _suspect_kept: int = 0  # messages of the lost chunk that were handed out all the same
+    _unknown_at: int | None = None  # the last record, if its type is not known
+    _bad_crc: bool = False
+    _ended: bool = False  # the end mark was passed
+    _definition_bytes: int = 0
+    _redefined: set[tuple[int, int]] = field(default_factory=set)
+    _skips: dict[int, int] | None = None  # places of chunks outside the window, and their ends
+    _blocks: int = 0  # handed out, and read to their ends
+    _read: int = 0
+    _messages: int = 0
+
+    def __post_init__(self) -> None:
+        """Prepare; the file is opened on entering the context."""
+        self._bytes = LogBytes(self.path, self.progress)
+
+    def __enter__(self) -> LogReader:
+        self._bytes.open()
+        self.size = self._bytes.size
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self._bytes.close()
+
+    @property
+    def indexed(self) -> bool:
+        """After the pass: whether the summary tells of all channels and types, and has an index of
+        every chunk and of its messages, so that programs that need one find every message."""
+        summary = self.summary
+        if summary is None or self.unchunked or not summary.knows_all_channels:
+            return False
+        types = {schema.number for schema in summary.schemas} | {0}
+        return (
+            not summary.unindexed
+            and len(summary.chunks) == self.chunk_count
+            and all(channel.schema in types for channel in summary.channels)
+        )
+
+    @property
+    def lossy(self) -> bool:
+        """Whether messages were lost so far, as far as is known."""
+        return bool(self.messages_lost or self.lost_unknown)
+
+    def read_at(self, position: int, size: int) -> bytes:
+        """Bytes of the file; fewer at its end. `LogError` when the disk fails."""
+        return self._bytes.read_at(position, size)
+
+    def pieces_at(self, position: int, size: int) -> Iterator[bytes]:
+        """``size`` bytes of the file, a piece at a time, for what may be of any size."""
+        for at in range(position, position + size, WINDOW):
+            yield self.read_at(at, min(WINDOW, position + size - at))
+
+    def summarize(self) -> Summary | None:
+        """The summary alone, without reading the rest; None where there is none to be believed."""
+        self._start()
+        summary = self.summary
+        return None if summary is None or summary.troubles else summary
+
+    def events(self) -> Iterator[Event]:
+        """Everything readable, in the order of the file."""
+        position = self._start()
+        self._plan_window()
+        while position < self._bytes.end:
+            if self.progress is not None:
+                self.progress(position, self.size)
+            if self._skips is not None and (after := self._skips.get(position)) is not None:
+                if self._may_skip(position, after):
+                    position = after
+                    continue
+                self._skips = None
+            try:
+                after, event = self._record(position)
+            except BadRecordError as error:
+                after, event = self._skip(position, str(error)), None
+            if event is not None:
+                self._blocks += isinstance(event, Block)
+                yield event
+            if after <= position:
+                break
+            position = after
+        self._settle_lost_chunk()
+        self._check_end()
+        if self.progress is not None:
+            self.progress(self.size, self.size)
+
+    def messages(self, block: Block, without: Container[int] = ()) -> Iterator[Message]:
+        """Messages of a block; schemas and channels in it are taken up on the way.
+
+        ``without``: channels whose messages come with no data, for who only counts them.
+        """
+        if block.suspect:
+            yield from self._suspected(block)
+            return
+        if block.packed is not None:
+            yield from self._streamed(block, without)
+            self._read += 1
+            return
+        data, at, end = block.data, 0, len(block.data)
+        head, fixed = op.MESSAGE_HEAD, op.MESSAGE_FIXED
+        count = 0
+        while at + 9 <= end:
+            opcode, length = op.RECORD.unpack_from(data, at)
+            after = at + 9 + length
+            if after > end:
+                break
+            if opcode == op.MESSAGE and length >= fixed:
+                _, _, channel, sequence, log_ns, publish_ns = head.unpack_from(data, at)
+                count += 1
+                payload = b"" if channel in without else data[at + 31 : after]
+                yield Message(channel, sequence, log_ns, publish_ns, payload)
+            elif not self._take_inner(block, opcode, data[at + 9 : after]):
+                break
+            at = after
+        self._read += 1
+        self._messages += count
+        if at < end and not block.partial:
+            self.note_damage(Damage(block.offset, 0, "a chunk whose records do not fit into it"))
+
+    def check_structure(self) -> None:
+        """`LogError` unless the records follow one another soundly; chunks are not unpacked."""
+        position = self._start()
+        while position < self._bytes.end and not self.damage_count:
+            opcode, length = op.RECORD.unpack(self.read_at(position, 9).ljust(9, b"\0"))
+            after = position + 9 + length
+            if (opcode == op.CHUNK and not self._bytes.looks_like_chunk(position)) or (
+                not 0 < opcode <= op.DATA_END and opcode < 0x80
+            ):
+                raise LogError(f"{self.path}: no record at byte {position}")
+            if opcode == op.DATA_END or after > self._bytes.end:
+                break
+            position = after
+        if self.damage_count:
+            raise LogError(f"{self.path}: {self.damages[0].reason}")
+
+    # How a file begins and ends
+
+    def _start(self) -> int:
+        """Where the first record is; finds out whether the file was finished, and how it ends."""
+        if self.size == 0:
+            raise LogError(f"{self.path} is empty: its writer ended before the first byte")
+        self._bytes.end = self.size
+        magic = self.read_at(0, 8)
+        if magic != op.MAGIC:
+            first = self._bytes.find_chunk(0)
+            if op.MAGIC.startswith(magic):
+                raise LogError(f"{self.path} is cut off after {self.size} bytes: nothing to read")
+            if magic[:5] == op.MAGIC[:5] and magic[6:] == op.MAGIC[6:]:
+                raise LogError(
+                    f"{self.path} is in version {chr(magic[5])!r} of the MCAP format, this program "
+                    "reads version '0': update it"
+                )
+            if first is None:
+                raise LogError(f"{self.path} is no MCAP file")
+            self.note_damage(Damage(0, first, "the start of the file is overwritten"))
+            self._read_end()
+            return first
+        self._read_end()
+        return 8
+
+    def _read_end(self) -> None:
+        """Find the footer of a finished file, and the summary where it says that one is."""
+        at = self.size - FOOTER_SIZE - 8
+        tail = self.read_at(max(at, 0), FOOTER_SIZE + 8)
+        if at < 8 or len(tail) != FOOTER_SIZE + 8 or tail[-8:] != op.MAGIC or tail[0] != op.FOOTER:
+            return
+        start, _, crc = FOOTER.unpack_from(tail, 9)
+        self.closed = True
+        self._footer = start, crc
+        self._bytes.end = at
+        if start == 0:
+            return
+        summary = read_summary(self.read_at, start, at, crc) if 8 < start <= at else None
+        if summary is None:
+            return  # the end mark will tell where it is
+        if summary.bad_crc:
+            self.closed, self._bad_crc = False, True
+            self._bytes.end = self.size
+            length = self.size - 12 - start
+            self.note_damage(Damage(start, length, "the checksum of the summary is wrong", 0))
+            return
+        self._bytes.end = start
+        self._take_summary(summary)
+
+    def _take_summary(self, summary: Summary) -> None:
+        self.summary = summary
+        for schema in summary.schemas:
+            self._keep_schema(schema, 0)
+        for channel in summary.channels:
+            self._keep_channel(channel, 0)
+        for position, length, reason in summary.troubles:
+            self.note_damage(Damage(position, length, f"in the summary: {reason}", 0))
+
+    def _end_mark(self, position: int, length: int) -> int:
+        """The end of the data at ``position``; returns where reading ends."""
+        after = position + 9 + length
+        if length < 4:
+            raise BadRecordError("an end mark that is too short")
+        if self._footer is None:
+            if self._bytes.find_chunk(after) is not None:
+                raise BadRecordError("an end mark amid the data")
+            reason = "cut off within the summary"
+            self.note_damage(Damage(position, self.size - position, reason, 0))
+        elif self._bad_crc and after == self._footer[0]:
+            pass  # it was reported
+        elif after != self._bytes.end:
+            footer = self.size - FOOTER_SIZE - 8
+            start, crc = self._footer
+            summary = read_summary(self.read_at, after, footer, None)
+            if summary is None:
+                raise BadRecordError("an end mark amid the data")
+            told = f"begins at byte {start}" if start else "is missing"
+            reason = f"the footer says that the summary {told}, but it begins at byte {after}"
+            self.note_damage(Damage(footer, FOOTER_SIZE, reason, 0))
+            if self.summary is None and not crc:
+                self._take_summary(summary)
+        elif self._footer[0] and self.summary is None:
+            reason = f"the footer says that the summary begins at byte {self._footer[0]}: it is not"
+            self.note_damage(Damage(self._bytes.end, FOOTER_SIZE, f"{reason} there", 0))
+        (self.data_crc,) = U32.unpack(self.read_at(position + 9, 4).ljust(4, b"\0"))
+        self.data_end = position
+        self._ended = True
+        return self._bytes.end
+
+    def _check_end(self) -> None:
+        """What the summary says against what was found, once all is read."""
+        if self.closed and not self._ended and self._footer is not None:
+            reason = "the data have no end mark where the footer says that the summary begins"
+            self.note_damage(Damage(self._bytes.end, 0, reason, 0))
+        statistics = None if self.summary is None else self.summary.statistics
+        if statistics is None or self.window is not None or self._read < self._blocks:
+            return
+        told, found = statistics.message_count, self._messages + self.messages_lost
+        if told != found and not self.lost_unknown:
+            lost = max(told - found, 0)
+            reason = f"the summary counts {told} messages, but {found} are in the file"
+            place = 0 if self.summary is None else self.summary.start
+            self.note_damage(Damage(place, 0, reason, lost))
+
+    def data_checksum_is_right(self) -> bool:
+        """Whether the bytes of the data have their checksum; reads them all where there is one.
+
+        Writers differ in where the data begin: with the file, behind its first eight bytes, or
+        behind the header.
+        """
+        if not self.data_crc:
+            return True
+        header = 8 + 9 + op.RECORD.unpack(self.read_at(8, 9).ljust(9, b"\0"))[1]
+        for start in (0, 8, header):
+            crc = 0
+            for piece in self.pieces_at(start, self.data_end - start):
+                crc = zlib.crc32(piece, crc)
+            if crc == self.data_crc:
+                return True
+        return False
+
+    # Passing over what is outside the window
+
+    def _plan_window(self) -> None:
+        """Note which chunks need not be looked at: by an index of all, and channels all known."""
+        summary = self.summary
+        if self.window is None or summary is None or not summary.knows_all_channels:
+            return
+        first, last = self.window
+        chunks = summary.chunks
+        skips: dict[int, int] = {}
+        spans = sorted(range(len(chunks)), key=chunks.offset.__getitem__)
+        before = 8
+        for k in spans:
+            start, after = chunks.offset[k], chunks.offset[k] + chunks.length[k]
+            if start < before or after > self._bytes.end:
+                return  # an index that cannot be right is none
+            before = after
+            if chunks.last_ns[k] < first or chunks.first_ns[k] > last:
+                skips[start] = after
+        self._skips = skips
+
+    def _may_skip(self, position: int, after: int) -> bool:
+        """Whether a chunk is as the index says; where that has a checksum, it is believed."""
+        if self.summary is None or self.summary.checked:
+            return True
+        found = self._bytes.chunk_head(position)
+        if found is None or self.window is None:
+            return False
+        outside = found[0].end_ns < self.window[0] or found[0].start_ns > self.window[1]
+        return outside and (after == self._bytes.end or self._bytes.plausible(after))
+
+    # Records
+
+    def _record(self, position: int) -> tuple[int, Event | None]:
+        """The record at ``position`` and where the next one is."""
+        head = self.read_at(position, 9)
+        if len(head) < 9:
+            raise BadRecordError("cut off within a record")
+        opcode, length = op.RECORD.unpack(head)
+        after = position + 9 + length
+        if opcode != op.MESSAGE_INDEX:
+            self._settle_lost_chunk()
+        unknown_at, self._unknown_at = self._unknown_at, None
+        if opcode == op.CHUNK:
+            return self._chunk(position, length)
+        if after > self._bytes.end:
+            raise BadRecordError("cut off within a record")
+        if opcode == op.MESSAGE_INDEX:
+            self._message_index(length, unknown_at, position)
+        elif opcode == op.ATTACHMENT:
+            return after, self._attachment(position, length)
+        elif opcode == op.DATA_END:
+            return self._end_mark(position, length), None
+        elif opcode == op.MESSAGE:
+            return after, self._single(position, length)
+        elif opcode in DATA_RECORDS:
+            if length > MAX_RECORD:
+                raise BadRecordError(f"a record of {length} bytes")
+            return after, self._small(opcode, self.read_at(position + 9, length))
+        elif 0 < opcode <= op.DATA_END:
+            raise BadRecordError(f"record type {opcode} amid the data")
+        elif opcode == 0:
+            raise BadRecordError("record type 0, which there is not")
+        else:
+            return after, self._unknown(position, length)
+        return after, None
+
+    def _unknown(self, position: int, length: int) -> Event | None:
+        """A record of a type of later versions, or somebody's own: passed over.
+
+        If it is a chunk in all but its type, a bit of that was flipped, and the checksum tells.
+        """
+        self._unknown_at = position
+        if not self._bytes.looks_like_chunk(position):
+            return None
+        self.note_damage(Damage(position, 1, "a chunk whose record type is wrong", 0))
+        self._unknown_at = None
+        return self._chunk(position, length)[1]
+
+    def _single(self, position: int, length: int) -> Event | None:
+        """A message outside chunks."""
+        if length < op.MESSAGE_FIXED:
+            raise BadRecordError("a message is shorter than its fields")
+        self.unchunked += 1
+        if length > MAX_CHUNK:
+            self.note_damage(Damage(position, length + 9, f"a message of {length} bytes", 1))
+            return None
+        return Block(position, self.read_at(position, 9 + length), False)
+
+    def _small(self, opcode: int, body: bytes) -> Event | None:
+        if opcode == op.METADATA:
+            return parse_metadata(body)
+        if opcode == op.HEADER:
+            cursor = Cursor(body)
+            self.profile, self.library = cursor.string(), cursor.string()
+            return None
+        self._define(opcode, body)
+        return None
+
+    def _define(self, opcode: int, body: bytes) -> None:
+        if opcode == op.SCHEMA:
+            self._keep_schema(parse_schema(body), 1)
+        else:
+            self._keep_channel(parse_channel(body), 1)
+
+    def _keep_schema(self, schema: SchemaRecord, from_data: int) -> None:
+        """Take up a schema; the first of a number holds, and 0 is none."""
+        known = self.schemas.get(schema.number)
+        if schema.number == 0 or known == schema:
+            return
+        if known is not None:
+            self._differs(op.SCHEMA, schema.number, from_data)
+            return
+        self._definition_bytes += len(schema.data)
+        if self._definition_bytes > MAX_DEFINITIONS:
+            self.note_damage(Damage(0, 0, f"definitions of over {MAX_DEFINITIONS} bytes in all", 0))
+            self._definition_bytes -= len(schema.data)
+            schema = replace(schema, data=b"")
+        self.schemas[schema.number] = schema
+
+    def _keep_channel(self, channel: ChannelRecord, from_data: int) -> None:
+        known = self.channels.get(channel.number)
+        if known is None:
+            texts = channel.metadata.items()
+            self._definition_bytes += len(channel.topic) + sum(len(k) + len(v) for k, v in texts)
+            if self._definition_bytes > MAX_DEFINITIONS:
+                raise BadRecordError(f"definitions of over {MAX_DEFINITIONS} bytes in all")
+            self.channels[channel.number] = channel
+        elif known != channel:
+            self._differs(op.CHANNEL, channel.number, from_data)
+
+    def _differs(self, opcode: int, number: int, from_data: int) -> None:
+        """Say once that a definition is not the same everywhere; a checked summary is right."""
+        if from_data and self.summary is not None and self.summary.checked:
+            return
+        if (opcode, number) not in self._redefined:
+            self._redefined.add((opcode, number))
+            what = "schema" if opcode == op.SCHEMA else "channel"
+            self.note_damage(Damage(0, 0, f"{what} {number} is defined twice, and differently", 0))
+
+    # Chunks
+
+    def _chunk(self, position: int, length: int) -> tuple[int, Event | None]:
+        found = self._bytes.chunk_head(position)
+        if found is None:
+            raise BadRecordError("a chunk whose sizes do not agree")
+        self.chunk_count += 1
+        head, place = found
+        after = position + 9 + length
+        packed = Packed(head, place, head.data_length)
+        if after > self._bytes.end:
+            return self._bytes.end, self._cut_chunk(position, packed)
+        if head.size > MAX_CHUNK or length > MAX_CHUNK:
+            self._lose_chunk(position, after, head, f"a chunk of {head.size} bytes")
+            return after, None
+        if self.window is not None and self.summary is not None and self.summary.knows_all_channels:
+            first, last = self.window
+            if head.end_ns < first or head.start_ns > last:
+                return after, None
+        try:
+            if head.compression not in COMPRESSIONS:
+                raise BadRecordError(
+                    f"a chunk compressed with {head.compression!r}, which is not read here"
+                )
+            if head.size <= SMALL and head.data_length <= SMALL:
+                data = unpack(self.read_at, packed)
+                return after, Block(position, data, head.crc != 0)
+            if head.crc:
+                verify(self.read_at, packed)
+            return after, Block(position, b"", head.crc != 0, packed)
+        except BadRecordError as error:
+            self._lose_chunk(position, after, head, str(error))
+            if self.keep_suspect and head.compression in COMPRESSIONS and head.size <= MAX_SUSPECT:
+                return after, Block(position, b"", False, packed, suspect=True)
+            return after, None
+
+    def _cut_chunk(self, position: int, packed: Packed) -> Event | None:
+        """The beginning of a chunk at the end of the file: whole zstd blocks are exact."""
+        if self._bytes.find_chunk(position + 1) is not None:
+            raise BadRecordError("a chunk that is longer than the file")
+        end, head = self._bytes.end, packed.head
+        reason = "cut off within a chunk"
+        if head.size > MAX_CHUNK or head.compression not in COMPRESSIONS:
+            reason = f"cut off within a chunk of {head.size} bytes"
+        self.note_damage(Damage(position, end - position, reason, None, head.start_ns, head.end_ns))
+        if head.size > MAX_CHUNK or head.compression not in COMPRESSIONS:
+            return None
+        rest = Packed(head, packed.place, max(0, min(end - packed.place, packed.length)))
+        return Block(position, b"", False, rest, partial=True)
+
+    def _streamed(self, block: Block, without: Container[int]) -> Iterator[Message]:
+        """Messages of a chunk as it is unpacked, no more of it in memory than the largest."""
+        packed = block.packed
+        if packed is None:
+            return
+        held = bytearray()
+        at = done = 0  # in what is held; bytes before that
+        total = packed.head.size
+        source = pieces(self.read_at, packed)
+        skip = 0  # bytes to come that are not wanted
+        reason = ""
+        while True:
+            while not reason and len(held) - at >= 9:
+                opcode, length = op.RECORD.unpack_from(held, at)
+                size = 9 + length
+                wrong = done + at + size > total or opcode == 0
+                wrong |= opcode == op.MESSAGE and length < op.MESSAGE_FIXED
+                if wrong:
+                    reason = "a chunk whose records do not fit into it"
+                    break
+                if opcode == op.MESSAGE:
+                    if len(held) - at < 31:
+                        break
+                    _, _, channel, *fields = op.MESSAGE_HEAD.unpack_from(held, at)
+                    sequence, log_ns, publish_ns = fields
+                    if channel in without:
+                        self._messages += 1
+                        yield Message(channel, sequence, log_ns, publish_ns, b"")
+                        skip = max(0, at + size - len(held))
+                        at = min(at + size, len(held))
+                        if skip:
+                            break
+                        continue
+                    if len(held) - at < size:
+                        break
+                    self._messages += 1
+                    data = bytes(memoryview(held)[at + 31 : at + size])
+                    yield Message(channel, sequence, log_ns, publish_ns, data)
+                elif opcode in (op.SCHEMA, op.CHANNEL) and length <= MAX_RECORD:
+                    if len(held) - at < size:
+                        break
+                    self._take_inner(block, opcode, bytes(held[at + 9 : at + size]))
+                else:
+                    if not self._take_inner(block, opcode, b""):
+                        reason = "-"
+                        break
+                    skip = max(0, at + size - len(held))
+                    at = min(at + size, len(held))
+                    if skip:
+                        break
+                    continue
+                at += size
+            if reason:
+                break
+            done += at
+            del held[:at]
+            at = 0
+            try:
+                piece = next(source, b"")
+            except BadRecordError as error:
+                reason = str(error)
+                break
+            if not piece:
+                break
+            if skip:
+                taken = min(skip, len(piece))
+                skip -= taken
+                done += taken
+                piece = piece[taken:]
+            held += piece
+        if block.partial:
+            return  # reported
+        if reason != "-" and (reason or len(held) > at or done + at != total):
+            reason = reason or "a chunk whose records do not fit into it"
+            self.note_damage(Damage(block.offset, 0, reason))
+
+    def _suspected(self, block: Block) -> Iterator[Message]:
+        """Messages of a chunk that is damaged somewhere: all those that look like one."""
+        packed = block.packed
+        if packed is None:
+            return
+        data, at = unpack_what_can_be(self.read_at, packed), 0
+        while at + 9 <= len(data):
+            opcode, length = op.RECORD.unpack_from(data, at)
+            after = at + 9 + length
+            if opcode == op.MESSAGE and self._likely(data, at, packed.head):
+                if after < len(data) and not self._likely(data, after, packed.head):
+                    following = self._resume(data, at + 31, packed.head)
+                    if following < after:  # its length is wrong: it would swallow others
+                        at = following
+                        continue
+                _, _, channel, *fields = op.MESSAGE_HEAD.unpack_from(data, at)
+                sequence, log_ns, publish_ns = fields
+                self.suspect += 1
+                self._suspect_kept += 1
+                yield Message(channel, sequence, log_ns, publish_ns, data[at + 31 : after])
+            elif opcode in (op.SCHEMA, op.CHANNEL) and after <= len(data):
+                with contextlib.suppress(BadRecordError):
+                    self._define(opcode, data[at + 9 : after])
+            elif not self.channels or not opcode > op.DATA_END or after > len(data):
+                at = self._resume(data, at + 1, packed.head)
+                continue
+            at = after
+
+    def _likely(self, data: bytes, at: int, head: ChunkHead) -> bool:
+        """Whether a message can begin here: of a channel there is, at a time of its chunk."""
+        if at + 31 > len(data):
+            return False
+        _, length, channel, _, log_ns, _ = op.MESSAGE_HEAD.unpack_from(data, at)
+        return (
+            length >= op.MESSAGE_FIXED
+            and at + 9 + length <= len(data)
+            and channel in self.channels
+            and head.start_ns <= log_ns <= head.end_ns
+        )
+
+    def _resume(self, data: bytes, at: int, head: ChunkHead) -> int:
+        """Where the next likely message begins; the end where there is none."""
+        while (at := data.find(op.MESSAGE, at)) >= 0:
+            if self._likely(data, at, head):
+                return at
+            at += 1
+        return len(data)
+
+    def _take_inner(self, block: Block, opcode: int, body: bytes) -> bool:
+        """Take up a record within a chunk that is not a message; False when the rest is lost."""
+        if opcode in (op.SCHEMA, op.CHANNEL):
+            try:
+                self._define(opcode, body)
+            except BadRecordError as error:
+                self.note_damage(Damage(block.offset, 0, str(error)))
+        elif opcode == op.MESSAGE:
+            self.note_damage(Damage(block.offset, 0, "a message is shorter than its fields", 1))
+        elif opcode == op.CHUNK:
+            self.note_damage(Damage(block.offset, 0, "a chunk within a chunk"))
+        elif opcode == 0:
+            self.note_damage(Damage(block.offset, 0, "record type 0, which there is not"))
+            return False
+        return True
+
+    def _lose_chunk(self, position: int, after: int, head: ChunkHead, reason: str) -> None:
+        """Note a chunk that is lost; the indexes behind it will say how many messages it had."""
+        self._lost_chunk = Damage(position, after - position, reason, 0, head.start_ns, head.end_ns)
+
+    def _settle_lost_chunk(self) -> None:
+        lost, self._lost_chunk = self._lost_chunk, None
+        kept, self._suspect_kept = self._suspect_kept, 0
+        if lost is not None:
+            known = max(0, lost.messages - kept) if lost.messages else None
+            self.note_damage(replace(lost, messages=known))  # no index followed: nobody knows
+
+    def _message_index(self, length: int, unknown_at: int | None, position: int) -> None:
+        if length < 6:
+            raise BadRecordError("a message index of impossible length")
+        head = self.read_at(position + 9, 6)
+        (size,) = U32.unpack_from(head, 2)
+        if size % 16 or 6 + size > length:
+            raise BadRecordError("a message index of impossible length")
+        lost = self._lost_chunk
+        if lost is not None:
+            self._lost_chunk = replace(lost, messages=(lost.messages or 0) + size // 16)
+        elif unknown_at is not None:  # indexes follow chunks alone
+            reason = "a chunk whose record type is wrong"
+            self._lost_chunk = Damage(unknown_at, position - unknown_at, reason, size // 16)
+
+    # What is neither
+
+    def _attachment(self, position: int, length: int) -> AttachmentRecord | None:
+        if self.window is not None:
+            return None
+        head = Cursor(self.read_at(position + 9, min(length, 1 << 12)))
+        try:
+            log_ns, create_ns = head.take(ATTACHMENT_HEAD)
+            name, media_type = head.string(), head.string()
+            (size,) = head.take(U64)
+        except BadRecordError:
+            head = Cursor(self.read_at(position + 9, min(length, MAX_RECORD)))
+            log_ns, create_ns = head.take(ATTACHMENT_HEAD)
+            name, media_type = head.string(), head.string()
+            (size,) = head.take(U64)
+        if head.at + size + 4 > length:
+            raise BadRecordError("an attachment whose sizes do not agree")
+        start = position + 9 + head.at
+        (stored,) = U32.unpack(self.read_at(start + size, 4))
+        crc = stored
+        if stored:
+            crc = 0
+            for piece in self.pieces_at(position + 9, head.at + size):
+                crc = zlib.crc32(piece, crc)
+        if stored != crc:
+            reason = f"the checksum of attachment {name!r} is wrong"
+            self.note_damage(Damage(position, length + 9, reason, 0))
+            if not self.keep_suspect:
+                return None
+        return AttachmentRecord(name, media_type, log_ns, create_ns, start, size)
+
+    def _skip(self, position: int, reason: str) -> int:
+        """Pass over what cannot be read: one record where its length leads to another, or else
+        all up to the next chunk or the end of the data."""
+        self._settle_lost_chunk()
+        head = self.read_at(position, 9)
+        after = position + 9 + op.RECORD.unpack(head)[1] if len(head) == 9 else self._bytes.end
+        messages = None
+        if head[:1] and head[0] in NO_MESSAGES:
+            length = after - position - 9
+            believed = head[0] == op.ATTACHMENT or length <= MAX_RECORD
+            messages = 0 if believed and after <= MAX_FILE else None
+        if head[:1] == bytes((op.MESSAGE,)) and after > self._bytes.end:
+            messages = 1
+        if not self._bytes.plausible(after) and after != self._bytes.end:
+            found = self._bytes.find_chunk(position + 1)
+            if found is not None or (after < self._bytes.end and not messages):
+                messages = None  # others may have stood there
+            after = self._bytes.end if found is None else found
+        self.note_damage(Damage(position, after - position, reason, messages))
+        return after
+
+    def note_damage(self, damage: Damage) -> None:
+        """Count a damage, of which the first MAX_DAMAGES are kept."""
+        self.damage_count += 1
+        self.bytes_damaged += damage.length
+        self.messages_lost += damage.messages or 0
+        self.lost_unknown += damage.messages is None
+        if len(self.damages) < MAX_DAMAGES:
+            self.damages.append(damage)
+
+
+def read_messages(
+    path: Path, topics: Collection[str] | None = None
+) -> Iterator[tuple[ChannelRecord, Message]]:
+    """Messages of a log in the order of the file, whole or cut off; all, or those of ``topics``.
+
+    `LogError` when the file is no log. Damaged stretches are passed over.
+    """
+    with LogReader(path) as reader:
+        for event in reader.events():
+            if not isinstance(event, Block):
+                continue
+            for message in reader.messages(event):
+                channel = reader.channels.get(message.channel)
+                if channel is not None and (topics is None or channel.topic in topics):
+                    yield channel, message
+
+
+def check_readable(path: Path) -> None:
+    """`LogError` unless the records of a log follow one another soundly to its end.
+
+    Chunks are not decompressed: meant to be cheap, before older files are deleted.
+    """
+    with LogReader(path) as reader:
+        reader.check_structure()

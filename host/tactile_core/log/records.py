@@ -1,0 +1,504 @@
+"""Chunks unpacked: small ones at once, large or doubtful ones piece by piece. Bounded memory.
+
+What a chunk says of its size is never believed: nothing beyond it is unpacked, and nothing is
+allocated for it in advance.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import zstandard
+
+from tactile_core.log import mcap_file as op
+
+# What a log consists of, and how its records are taken apart. Pure: bytes in, values out.
+#
+# A record may be longer than its fields: later versions of the format append fields, which a reader
+# ignores.
+
+
+U16 = struct.Struct("<H")
+U32 = struct.Struct("<I")
+U64 = struct.Struct("<Q")
+CHANNEL_HEAD = struct.Struct("<HH")
+ATTACHMENT_HEAD = struct.Struct("<QQ")
+
+
+class LogError(Exception):
+    """The file is no log, or cannot be read; the message says which."""
+
+
+@dataclass(frozen=True, slots=True)
+class SchemaRecord:
+    """Definition of a message type."""
+
+    number: int
+    name: str
+    encoding: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelRecord:
+    """One stream. ``schema``: number of its schema, 0 for none."""
+
+    number: int
+    schema: int
+    topic: str
+    encoding: str
+    metadata: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class MetadataRecord:
+    """A named table of texts."""
+
+    name: str
+    values: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class AttachmentRecord:
+    """A file within the file; its bytes are ``size`` long from ``position`` on."""
+
+    name: str
+    media_type: str
+    log_ns: int
+    create_ns: int
+    position: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkHead:
+    """Fields of a chunk record before its data. ``size``, ``crc``: of the data unpacked."""
+
+    start_ns: int
+    end_ns: int
+    size: int
+    crc: int
+    compression: str
+    data_length: int
+
+
+@dataclass(frozen=True, slots=True)
+class Packed:
+    """Where the compressed bytes of a chunk stand, for one that is unpacked piece by piece."""
+
+    head: ChunkHead
+    place: int
+    length: int
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Messages, schemas and channels, as a run of records: ``data``, or ``packed`` for a large one.
+
+    ``verified``: its checksum was right. ``partial``: its end is not there, which was reported.
+    ``suspect``: its checksum is wrong, and it is read all the same.
+    """
+
+    offset: int
+    data: bytes
+    verified: bool
+    packed: Packed | None = None
+    partial: bool = False
+    suspect: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """Bytes that could not be read. ``messages`` lost there, None where that is not known."""
+
+    offset: int
+    length: int
+    reason: str
+    messages: int | None = None
+    first_ns: int | None = None
+    last_ns: int | None = None
+
+
+class Message(NamedTuple):
+    """One message of a log; stamps in wall-clock ns."""
+
+    channel: int
+    sequence: int
+    log_ns: int
+    publish_ns: int
+    data: bytes
+
+
+Event = Block | MetadataRecord | AttachmentRecord
+
+
+class BadRecordError(Exception):
+    """A record that cannot be right; caught within the reader."""
+
+
+@dataclass(slots=True)
+class Cursor:
+    """Takes fields off a record's body."""
+
+    data: bytes
+    at: int = 0
+
+    def take(self, layout: struct.Struct) -> tuple[int, ...]:
+        """Numbers of a fixed layout."""
+        try:
+            values = layout.unpack_from(self.data, self.at)
+        except struct.error:
+            raise BadRecordError("a record is shorter than its fields") from None
+        self.at += layout.size
+        return values
+
+    def bytes(self, size: int) -> bytes:
+        """The next ``size`` bytes."""
+        if size > len(self.data) - self.at:
+            raise BadRecordError("a record is shorter than its fields")
+        self.at += size
+        return self.data[self.at - size : self.at]
+
+    def string(self) -> str:
+        """A text with its length before it."""
+        try:
+            return self.bytes(*self.take(U32)).decode()
+        except UnicodeDecodeError:
+            raise BadRecordError("a text is no UTF-8") from None
+
+    def map(self) -> dict[str, str]:
+        """A table of texts with its length before it."""
+        (size,) = self.take(U32)
+        end = self.at + size
+        found = {}
+        while self.at < end:
+            key = self.string()
+            found[key] = self.string()
+        if self.at != end:
+            raise BadRecordError("a table is longer than it says")
+        return found
+
+
+def parse_schema(body: bytes) -> SchemaRecord:
+    """Schema record; BadRecordError when it is none."""
+    cursor = Cursor(body)
+    (number,) = cursor.take(U16)
+    name, encoding = cursor.string(), cursor.string()
+    return SchemaRecord(number, name, encoding, cursor.bytes(*cursor.take(U32)))
+
+
+def parse_channel(body: bytes) -> ChannelRecord:
+    """Channel record; BadRecordError when it is none."""
+    cursor = Cursor(body)
+    number, schema = cursor.take(CHANNEL_HEAD)
+    topic, encoding = cursor.string(), cursor.string()
+    return ChannelRecord(number, schema, topic, encoding, cursor.map())
+
+
+def parse_metadata(body: bytes) -> MetadataRecord:
+    """Metadata record; BadRecordError when it is none."""
+    cursor = Cursor(body)
+    return MetadataRecord(cursor.string(), cursor.map())
+
+
+# A log as bytes: reading at a place, and finding where chunks begin.
+
+
+Progress = Callable[[int, int], None]
+"""Called with the bytes done and those there are in all."""
+
+WINDOW = 1 << 20
+"""Bytes read at once while looking for the next chunk."""
+
+CHUNK_START = re.compile(rb"(?=\x06.{4}\x00{4})", re.DOTALL)
+CHUNK_FIXED = 40  # bytes of a chunk record but for its compression's name and its data
+MAX_NAME = 40  # bytes read of that name and the size behind it
+
+FRAME_STARTS = {"zstd": b"\x28\xb5\x2f\xfd", "lz4": b"\x04\x22\x4d\x18"}
+
+
+class LogBytes:
+    """Random access to a log. ``end``: where its data ends, for all that searches."""
+
+    def __init__(self, path: Path, progress: Progress | None) -> None:
+        self.path = path
+        self.size = 0
+        self.end = 0
+        self._progress = progress
+        self._file: BinaryIO | None = None
+
+    def open(self) -> None:
+        """Open the file; `LogError` when it is none or cannot be read."""
+        try:
+            if not stat.S_ISREG(os.stat(self.path).st_mode) and not self.path.is_dir():
+                raise LogError(f"{self.path} is no file but a device or a pipe")
+            self._file = open(self.path, "rb")  # noqa: SIM115 - closed by close()
+            self.size = self.end = os.fstat(self._file.fileno()).st_size
+        except OSError as error:
+            raise LogError(f"{self.path}: {error.strerror}") from error
+
+    def close(self) -> None:
+        """Let go of the file."""
+        if self._file is not None:
+            self._file.close()
+
+    def read_at(self, position: int, size: int) -> bytes:
+        """Bytes of the file; fewer at its end. `LogError` when the disk fails."""
+        if self._file is None:
+            raise ValueError("the log is not open")
+        try:
+            self._file.seek(position)
+            return self._file.read(size)
+        except OSError as error:
+            raise LogError(f"{self.path}: {error.strerror} at byte {position}") from error
+
+    def chunk_head(self, position: int) -> tuple[ChunkHead, int] | None:
+        """Header of a chunk at ``position`` and where its data begins; None when it is none.
+
+        The record type is not looked at.
+        """
+        raw = self.read_at(position, 9 + CHUNK_FIXED + MAX_NAME)
+        if len(raw) < 9 + CHUNK_FIXED:
+            return None
+        return _chunk_head(raw, position)
+
+    def looks_like_chunk(self, position: int) -> bool:
+        """Whether a chunk begins here for all that can be told: for searching amid other bytes.
+
+        Its sizes agree to the byte, or (fields may have been appended) its data begin as such do.
+        The record type is not looked at.
+        """
+        raw = self.read_at(position, 9 + CHUNK_FIXED + MAX_NAME)
+        if len(raw) < 9 + CHUNK_FIXED:
+            return False
+        found = _chunk_head(raw, position)
+        if found is None or found[0].compression not in ("", "lz4", "zstd"):
+            return False
+        head, place = found
+        (length,) = U64.unpack_from(raw, 1)
+        if head.data_length + CHUNK_FIXED + len(head.compression) == length:
+            return True
+        if head.compression:
+            return self.read_at(place, 4) == FRAME_STARTS[head.compression]
+        start = self.read_at(place, 9)
+        if len(start) < 9:
+            return False
+        opcode, size = op.RECORD.unpack(start)
+        known = opcode in (op.SCHEMA, op.CHANNEL, op.MESSAGE)
+        return bool(known and 9 + size <= head.data_length == head.size)
+
+    def find_chunk(self, position: int) -> int | None:
+        """Offset of the first whole, plausible chunk at or after ``position``."""
+        while position < self.end:
+            window = self.read_at(position, WINDOW + 16)
+            for match in CHUNK_START.finditer(window):
+                at = position + match.start()
+                (length,) = U64.unpack_from(window, match.start() + 1)
+                if at + 9 + length <= self.end and self.looks_like_chunk(at):
+                    return at
+            if self._progress is not None:
+                self._progress(position, self.size)
+            position += WINDOW
+        return None
+
+    def plausible(self, position: int, steps: int = 4) -> bool:
+        """Whether a record seems to begin here; a chance hit is one in 10^10.
+
+        A record of a type that is not known must be followed by one that is.
+        """
+        if position >= self.end:
+            return False
+        head = self.read_at(position, 9)
+        if len(head) < 9:
+            return False
+        opcode, length = op.RECORD.unpack(head)
+        after = position + 9 + int(length)
+        if opcode == op.CHUNK:
+            return self.looks_like_chunk(position)
+        if opcode > op.DATA_END:
+            return after <= self.end and steps > 0 and self.plausible(after, steps - 1)
+        return opcode > 0 and after <= self.size
+
+
+def _chunk_head(raw: bytes, position: int) -> tuple[ChunkHead, int] | None:
+    (length,) = U64.unpack_from(raw, 1)
+    start, end, size, crc = op.CHUNK_HEAD.unpack_from(raw, 9)
+    (name_length,) = U32.unpack_from(raw, 37)
+    if name_length > MAX_NAME - 8 or len(raw) < 41 + name_length + 8:
+        return None
+    (data_length,) = U64.unpack_from(raw, 41 + name_length)
+    if data_length + CHUNK_FIXED + name_length > length:
+        return None
+    try:
+        name = raw[41 : 41 + name_length].decode()
+    except UnicodeDecodeError:
+        return None
+    place = position + 9 + CHUNK_FIXED + name_length
+    return ChunkHead(start, end, size, crc, name, data_length), place
+
+
+COMPRESSIONS = ("", "zstd", "lz4")
+"""Names of the compressions that are unpacked here: all that the format's specification lists."""
+
+SMALL = 8 << 20
+"""Bytes of a chunk that is unpacked at once: writers make chunks of 0.8 to 4 MB."""
+
+PIECE = 1 << 16
+"""Bytes handed over at a time."""
+
+MAX_WINDOW = 1 << 27
+"""Bytes that a zstd frame may look back, which the unpacker keeps: the most that zstd itself takes
+without being told otherwise."""
+
+ReadAt = Callable[[int, int], bytes]
+"""Reads so many bytes at a place of the file."""
+
+
+def _lz4() -> Any:
+    import importlib
+
+    try:
+        return importlib.import_module("lz4.frame")
+    except ImportError:
+        raise BadRecordError("a chunk in lz4: install the lz4 package") from None
+
+
+def pieces(read_at: ReadAt, packed: Packed) -> Iterator[bytes]:
+    """A chunk's records, a piece at a time; `BadRecordError` where they cannot be unpacked.
+
+    Ends without an error where the packed bytes end early: that is for the caller to notice.
+    """
+    head = packed.head
+    left = head.size
+    for piece in _unpacked(read_at, packed):
+        if len(piece) > left:
+            yield piece[:left]
+            raise BadRecordError("a chunk that unpacks to more than it says")
+        left -= len(piece)
+        yield piece
+
+
+def _unpacked(read_at: ReadAt, packed: Packed) -> Iterator[bytes]:
+    source = _source(read_at, packed)
+    match packed.head.compression:
+        case "":
+            yield from source
+        case "zstd":
+            yield from _unzstd(source)
+        case "lz4":
+            yield from _unlz4(source)
+        case name:
+            raise BadRecordError(f"a chunk compressed with {name!r}, which is not read here")
+
+
+def _source(read_at: ReadAt, packed: Packed) -> Iterator[bytes]:
+    for at in range(packed.place, packed.place + packed.length, PIECE):
+        piece = read_at(at, min(PIECE, packed.place + packed.length - at))
+        if not piece:
+            return
+        yield piece
+
+
+class _Stream:
+    """The little of a file that zstandard's reader asks for."""
+
+    def __init__(self, source: Iterator[bytes]) -> None:
+        self._source = source
+
+    def read(self, _: int = -1) -> bytes:
+        """The next bytes, whatever was asked for; none at the end."""
+        return next(self._source, b"")
+
+
+def _unzstd(source: Iterator[bytes]) -> Iterator[bytes]:
+    unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
+    reader: Any = unpacker.stream_reader(
+        _Stream(source),  # type: ignore[arg-type]  # asks for no more than read()
+        read_size=PIECE,
+        read_across_frames=True,
+    )
+    try:
+        while piece := reader.read(PIECE):
+            yield piece
+    except (zstandard.ZstdError, MemoryError):
+        raise BadRecordError("a chunk that does not decompress") from None
+
+
+def _unlz4(source: Iterator[bytes]) -> Iterator[bytes]:
+    frame = _lz4()
+    unpacker: Any = None
+    held = b""
+    try:
+        while True:
+            if not held and (unpacker is None or unpacker.needs_input or unpacker.eof):
+                held = next(source, b"")
+                if not held:
+                    return
+            if unpacker is None or unpacker.eof:
+                unpacker = frame.LZ4FrameDecompressor()
+            piece = unpacker.decompress(held, max_length=PIECE)
+            held = unpacker.unused_data or b"" if unpacker.eof else b""
+            if piece:
+                yield piece
+    except (RuntimeError, MemoryError, EOFError):
+        raise BadRecordError("a chunk that does not decompress") from None
+
+
+def verify(read_at: ReadAt, packed: Packed) -> None:
+    """`BadRecordError` unless a chunk unpacks to its size and its checksum."""
+    crc = size = 0
+    for piece in pieces(read_at, packed):
+        crc = zlib.crc32(piece, crc)
+        size += len(piece)
+    _check(size, crc, packed.head)
+
+
+def unpack(read_at: ReadAt, packed: Packed) -> bytes:
+    """Records of a whole chunk of at most `SMALL` bytes, checked; `BadRecordError`."""
+    head = packed.head
+    raw = read_at(packed.place, packed.length)
+    data: bytes | None = None
+    if head.compression == "":
+        data = raw
+    elif head.compression == "zstd" and _told_size(raw) == head.size > 0:
+        try:  # one frame that tells its size, as nearly every writer makes them: at once
+            data = zstandard.ZstdDecompressor().decompress(raw, max_output_size=head.size)
+        except (zstandard.ZstdError, MemoryError):
+            raise BadRecordError("a chunk that does not decompress") from None
+    if data is None:
+        data = b"".join(pieces(read_at, packed))
+    _check(len(data), zlib.crc32(data) if head.crc else 0, head)
+    return data
+
+
+def unpack_what_can_be(read_at: ReadAt, packed: Packed) -> bytes:
+    """Records of a chunk up to where it cannot be unpacked any more, unchecked."""
+    data = bytearray()
+    try:
+        for piece in pieces(read_at, packed):
+            data += piece
+    except BadRecordError:
+        pass
+    return bytes(data)
+
+
+def _told_size(raw: bytes) -> int:
+    try:
+        return zstandard.frame_content_size(raw)
+    except zstandard.ZstdError:
+        return -1
+
+
+def _check(size: int, crc: int, head: ChunkHead) -> None:
+    if size != head.size:
+        raise BadRecordError(f"a chunk that unpacks to {size} bytes and says {head.size}")
+    if head.crc and crc != head.crc:
+        raise BadRecordError("the checksum of a chunk is wrong")

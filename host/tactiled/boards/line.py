@@ -1,0 +1,506 @@
+"""One port: bytes or CAN frames on one side, the links of the boards behind it on the other.
+
+Pure: chunks and instants in; events, and payloads to write, out.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from sensor_proto.anyskin import AnySkinDecoder
+from sensor_proto.can_transfers import BROADCAST, CanDecoder, CanEncoder, CanFrame
+from sensor_proto.framing import SerialDecoder, encode_serial
+from sensor_proto.layouts import FORM, Framing, Kind, Layout, LayoutDecoder, TextDecoder
+from sensor_proto.packets import FloatSamples, HostMessage, Identify, Message, Received, Reject
+from sensor_proto.survey import Finding, Survey
+from tactile_core.types import NS_PER_S, Instant, after
+from tactiled.blocks import Chunk
+from tactiled.boards.board import BoardLink, State
+from tactiled.boards.diagnosis import NOTHING_AFTER, Diagnosis
+from tactiled.boards.events import Diagnosed, Event, Found, Identity, Refusal
+from tactiled.boards.float_board import FloatLink
+from tactiled.transports.base import Medium
+
+KINDS = ("auto", "tactile", "anyskin", "reskin", "eflesh")
+"""What --board takes besides a layout; the last three are the same boards."""
+
+FLOAT_MODEL = "anyskin"
+"""What calibrations call boards that send floats."""
+
+JUDGE_FIRST, JUDGE_SLOWEST = 0.25, 2.0
+"""s between looks at bytes of which no decoder makes a frame; the time doubles while nothing is
+found, as a look takes some milliseconds."""
+
+PATIENCE = 30.0
+"""s for which the frames of a layout that was found are awaited; the slowest board sends ten."""
+
+REPEAT_DIAGNOSIS = 30.0
+"""s between repetitions of a diagnosis that still holds."""
+
+Admit = Callable[[int, Identity], Refusal | None]
+"""Judges the board with a node number (0 on a serial line)."""
+
+Link = BoardLink | FloatLink
+Unframed = AnySkinDecoder | LayoutDecoder | TextDecoder
+Payload = bytes | tuple[CanFrame, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LineEvent:
+    """Something that happened to the board ``node``, or (None) to the port as a whole."""
+
+    node: int | None
+    event: Event
+
+
+class Line(Protocol):
+    """What the daemon sees of a port, whatever the medium."""
+
+    @property
+    def links(self) -> dict[int, Link]:
+        """Boards found so far, by node."""
+
+    @property
+    def rejects(self) -> dict[str, int]:
+        """What the decoders refused, by reason."""
+
+    def connect(self, now: Instant, usb_serial: str = "", byte_time: float = 0.0) -> None:
+        """The port is open. ``byte_time``: s that each byte takes on the wire, 0 over USB."""
+
+    def disconnect(self) -> list[LineEvent]:
+        """The port is closed or gone; commands that waited are given up."""
+
+    def receive(self, chunk: Chunk) -> list[LineEvent]:
+        """Take what one read returned."""
+
+    def tick(self, now: Instant) -> list[LineEvent]:
+        """Do what time demands."""
+
+    def outgoing(self) -> list[Payload]:
+        """What to write now, taken out."""
+
+
+class SerialLine:
+    """A serial line: one board, whose kind is found out unless ``kind`` says it.
+
+    ``kind``: one of `KINDS`, or a layout. ``arrays``: magnetometers of each board of a controller.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        admit: Admit,
+        kind: str = "auto",
+        rate: float | None = None,
+        baud: int = 115_200,
+        listen_only: bool = False,
+        arrays: tuple[int, ...] | None = None,
+    ) -> None:
+        self._declared = board_kind(kind)
+        self._kind = kind if self._declared is None else "declared"
+        self._own = SerialDecoder()
+        self._floats: Unframed | None = AnySkinDecoder()
+        self._survey = Survey(self._declared)
+        self._settled = False  # whether the unframed decoder has given a frame since the opening
+        self._former: Counter[str] = Counter()  # counts of unframed decoders that were given up
+        self._layout: Layout | None = None  # what the unframed decoder reads; None: usual floats
+        self._finding: Finding | None = None
+        self._judge_due, self._judge_wait = Instant(0), JUDGE_FIRST
+        self._patient_until = Instant(0)
+        self._board = BoardLink(lambda identity: admit(0, identity), rate, listen_only)
+        self._float = FloatLink(lambda identity: admit(0, identity), FLOAT_MODEL, "", arrays)
+        self._link: Link | None = None
+        self._diagnosis = Diagnosis(port, baud, kind)
+        if self._declared is not None:
+            self._adopt(self._declared)
+        self._diagnose_from = Instant(0)
+        self._byte_ns = 0.0
+        self._up = False
+
+    @property
+    def links(self) -> dict[int, Link]:
+        """The board, once its kind is known."""
+        return {} if self._link is None else {0: self._link}
+
+    @property
+    def rejects(self) -> dict[str, int]:
+        """Refusals of the decoder in use (of ours while the kind is not known)."""
+        counts = Counter(self._own.counters)
+        if isinstance(self._link, FloatLink):
+            counts = self._former + Counter({} if self._floats is None else self._floats.counters)
+        return {reason: n for reason, n in counts.items() if reason != "accepted"}
+
+    def connect(self, now: Instant, usb_serial: str = "", byte_time: float = 0.0) -> None:
+        """The port is open; see `Line.connect`."""
+        self._up = True
+        self._byte_ns = byte_time * NS_PER_S
+        self._float.serial_number = usb_serial
+        self._own.reset()
+        if self._floats is not None:
+            self._floats.reset()
+        self._survey.reset()
+        self._settled, self._finding = False, None
+        self._patient_until = after(now, PATIENCE)
+        self._judge_due, self._judge_wait = after(now, JUDGE_FIRST), JUDGE_FIRST
+        self._diagnosis.begin(now, uart=byte_time > 0)
+        self._diagnose_from = now
+        if self._kind in ("auto", "tactile") and not isinstance(self._link, FloatLink):
+            self._board.connect(now)
+        self._float.connect()
+
+    def disconnect(self) -> list[LineEvent]:
+        """The port is closed or gone; commands that waited are given up."""
+        self._up = False
+        self._float.disconnect()
+        return [LineEvent(0, event) for event in self._board.disconnect()]
+
+    def receive(self, chunk: Chunk) -> list[LineEvent]:
+        """Take bytes; TypeError for CAN frames."""
+        data = chunk.payload
+        if not isinstance(data, bytes):
+            raise TypeError("a serial line takes bytes")
+        if not self._served:
+            self._diagnosis.feed(data, chunk.received)
+        events: list[Event] = []
+        found = list(self._decode(data, chunk.received))
+        arrivals = [
+            Instant(chunk.received - round(each.trailing * self._byte_ns)) for each in found
+        ]
+        for place, (received, arrival) in enumerate(zip(found, arrivals, strict=True), start=1):
+            message = received.message
+            if isinstance(message, FloatSamples):
+                behind = len(found) - place
+                events += self._float.receive(message, arrival, behind, arrivals[-1])
+            else:
+                events += self._board.receive(message, arrival)
+        return [LineEvent(0, event) for event in events]
+
+    def tick(self, now: Instant) -> list[LineEvent]:
+        """Drive the link; say what is wrong while no board is found."""
+        if not self._up:
+            return []
+        link = self._link or self._board
+        was_served = self._served
+        out = [LineEvent(0, event) for event in link.tick(now)]
+        if was_served:
+            # Should it go out of service, what is wrong is judged from here on.
+            self._diagnosis.begin(now)
+        elif self._about_to_read and now < self._patient_until:
+            pass
+        elif link.state is not State.REFUSED and now >= self._diagnose_from:
+            waiting = self._diagnosis.waiting(now)
+            if waiting is not None:
+                out.append(LineEvent(None, waiting))
+            answered = isinstance(self._link, BoardLink)
+            diagnosed = self._diagnosis.judge(now, answered, self._finding)
+            if diagnosed is not None:
+                self._diagnose_from = after(now, REPEAT_DIAGNOSIS)
+                out.append(LineEvent(None, diagnosed))
+        return out
+
+    def outgoing(self) -> list[Payload]:
+        """Frames to write now."""
+        return [encode_serial(message) for message in self._board.outgoing()]
+
+    @property
+    def _served(self) -> bool:
+        """Whether a board has been found since the port was opened."""
+        return self._link is not None and self._link.state in (State.CONFIGURING, State.STREAMING)
+
+    @property
+    def _about_to_read(self) -> bool:
+        """Whether it is known how the board writes, and its next frames are awaited."""
+        return self._finding is not None and self._finding.layout is not None
+
+    def _decode(self, data: bytes, now: Instant) -> list[Received]:
+        """Messages by whichever decoder fits; the first to find one is kept."""
+        if isinstance(self._link, BoardLink):
+            return self._own.feed(data)
+        if self._link is None and self._kind in ("auto", "tactile"):
+            found = self._own.feed(data)
+            if found:
+                self._link = self._board
+                return found
+        if self._kind == "tactile":
+            return []
+        if self._floats is None:
+            self._former[Reject.DISCARDED_BYTES] += len(data)
+            found = []
+        else:
+            found = self._floats.feed(data)
+        if found:
+            self._settled = True
+            if self._link is None:
+                self._link = self._float
+                self._board.disconnect()
+        elif not self._settled:
+            self._look(data, now)
+        return found
+
+    def _look(self, data: bytes, now: Instant) -> None:
+        """Find out how the board writes, where it is plain: two looks must say the same."""
+        self._survey.feed(data)
+        if now < self._judge_due:
+            return
+        before, self._finding = self._finding, self._survey.judge()
+        layout = None if self._finding is None else self._finding.layout
+        if layout is not None:
+            self._judge_wait = JUDGE_FIRST
+            if before is not None and before.layout == layout:
+                self._adopt(layout)
+        elif self._survey.full:
+            self._judge_wait = min(2 * self._judge_wait, JUDGE_SLOWEST)
+        self._judge_due = after(now, self._judge_wait)
+
+    def _adopt(self, layout: Layout) -> None:
+        """Read frames of ``layout`` from now on, once it is known what stands round its numbers."""
+        if layout == self._layout:
+            return  # give it time
+        self._layout = layout
+        usual = layout == replace(USUAL, chips=layout.chips, framing=layout.framing)
+        usual &= layout.framing in (None, USUAL.framing)
+        if usual and self._declared is None and isinstance(self._floats, AnySkinDecoder):
+            return  # it will come to see it
+        if self._floats is not None:
+            self._former.update(self._floats.counters)
+        if layout.kind is Kind.TEXT:
+            self._floats = TextDecoder(layout)
+        elif usual:
+            chips = None if self._declared is None else layout.chips
+            self._floats = AnySkinDecoder(chips)
+        else:
+            self._floats = None if layout.framing is None else LayoutDecoder(layout)
+        self._float.thermometer = "t" in layout.fields
+        self._float.layout = "" if isinstance(self._floats, AnySkinDecoder) else str(layout)
+
+
+USUAL = Layout(Kind.FLOATS, 1, "txyz", framing=Framing(end=b"\r\n"))
+"""What `AnySkinDecoder` reads: it knows that layout best."""
+
+
+def board_kind(text: str) -> Layout | None:
+    """Layout that ``--board`` declares, None for one of `KINDS`; ValueError for anything else."""
+    if text in KINDS:
+        return None
+    if ":" not in text:
+        raise ValueError(f"board kind {text!r}; allowed: {', '.join(KINDS)}, or a layout: {FORM}")
+    return Layout.parse(text)
+
+
+# A CAN bus as a line: boards found by a broadcast question, one link each. Pure.
+
+
+DISCOVER_EVERY = 0.2
+"""s between broadcast questions until boards are known. Boards plugged in later show themselves by
+their status, once a second."""
+
+GATHER = 0.5
+"""s from the first board's word until the boards of a bus are taken as known: two questions more,
+should an answer have been lost. Their names depend on how many they are."""
+
+EARLY = 4096
+"""Messages kept while boards are gathered: sixteen of them at 493 Hz for half a second."""
+
+MAX_NODES = 16
+"""Boards used on one bus; more would not leave 25 Hz of samples each on CAN 2.0B."""
+
+
+class CanLine:
+    """A CAN bus: any number of boards, each found by its answer to a broadcast question."""
+
+    def __init__(
+        self,
+        port: str,
+        admit: Admit,
+        fd: bool = False,
+        rate: float | None = None,
+        nodes: frozenset[int] | None = None,
+        listen_only: bool = False,
+    ) -> None:
+        self._port = port
+        self._admit = admit
+        self._fd = fd
+        self._rate = rate
+        self._nodes = nodes
+        self._listen_only = listen_only
+        self._decoder = CanDecoder()
+        self._everyone = CanEncoder(BROADCAST, fd)
+        self._encoders: dict[int, CanEncoder] = {}
+        self._links: dict[int, BoardLink] = {}
+        self._up = False
+        self._frames = self._errors = 0
+        self._since = self._discover_due = self._diagnose_from = Instant(0)
+        self._known_at: Instant | None = None  # when the boards met until then are enough
+        self._known = False
+        self._early: deque[tuple[int, Message, Instant]] = deque(maxlen=EARLY)
+        self._questions: list[Payload] = []
+        self.strangers = 0
+        """Messages of boards beyond `MAX_NODES` or not asked for."""
+
+    @property
+    def links(self) -> dict[int, Link]:
+        """Boards found so far, by node."""
+        return dict(self._links)
+
+    @property
+    def rejects(self) -> dict[str, int]:
+        """Refusals of the decoder, for the whole bus."""
+        counts = {reason: n for reason, n in self._decoder.counters.items() if reason != "accepted"}
+        return counts | {"strangers": self.strangers}
+
+    def connect(self, now: Instant, usb_serial: str = "", byte_time: float = 0.0) -> None:  # noqa: ARG002 - properties of a serial line
+        """The bus is open."""
+        self._up = True
+        self._decoder.reset()
+        self._frames = self._errors = 0
+        self._since = self._discover_due = self._diagnose_from = now
+        if self._known:
+            for link in self._links.values():
+                link.connect(now)
+
+    def disconnect(self) -> list[LineEvent]:
+        """The bus is closed or gone; see `Line.disconnect`."""
+        self._up = False
+        self._questions.clear()
+        return [
+            LineEvent(node, event)
+            for node, link in self._links.items()
+            for event in link.disconnect()
+        ]
+
+    def receive(self, chunk: Chunk) -> list[LineEvent]:
+        """Take frames; TypeError for bytes."""
+        if isinstance(chunk.payload, bytes):
+            raise TypeError("a CAN bus brings frames, not bytes")
+        self._frames += len(chunk.payload)
+        self._errors += sum(frame.error for frame in chunk.payload)
+        heard: list[LineEvent] = []
+        out: list[LineEvent] = []
+        for received in self._decoder.feed(chunk.payload):
+            message, node = received.message, received.board
+            if isinstance(message, FloatSamples | HostMessage):
+                continue  # another host's question
+            if node not in self._links:
+                if not self._wanted(node):
+                    self.strangers += 1
+                    continue
+                out += self._meet(node, chunk.received)
+            if self._known and not out and not self._early:
+                heard += self._hear(node, message, chunk.received)
+            else:
+                # Whoever listens must first be told of the board, which it is when this returns.
+                self._early.append((node, message, chunk.received))
+        return heard + out
+
+    def tick(self, now: Instant) -> list[LineEvent]:
+        """Look for boards, drive their links."""
+        if not self._up:
+            return []
+        if not self._known and now >= self._discover_due:
+            self._discover_due = after(now, DISCOVER_EVERY)
+            self._questions = [self._everyone.encode(Identify(0))]
+        out: list[LineEvent] = []
+        if not self._known and self._known_at is not None and now >= self._known_at:
+            out += self._take_up(now)
+        elif self._known:
+            while self._early:
+                out += self._hear(*self._early.popleft())
+            for node, link in self._links.items():
+                out += [LineEvent(node, event) for event in link.tick(now)]
+        if not self._links and now >= max(after(self._since, NOTHING_AFTER), self._diagnose_from):
+            self._diagnose_from = after(now, REPEAT_DIAGNOSIS)
+            out.append(LineEvent(None, self._diagnose()))
+        return out
+
+    def outgoing(self) -> list[Payload]:
+        """Transfers to write now."""
+        out, self._questions = self._questions, []
+        for node, link in self._links.items():
+            out += [self._encoders[node].encode(message) for message in link.outgoing()]
+        return out
+
+    def _wanted(self, node: int) -> bool:
+        if self._nodes is not None:
+            return node in self._nodes
+        return len(self._links) < MAX_NODES
+
+    def _meet(self, node: int, now: Instant) -> list[LineEvent]:
+        def admit(identity: Identity) -> Refusal | None:
+            return self._admit(node, identity)
+
+        link = BoardLink(admit, self._rate, self._listen_only)
+        self._encoders[node] = CanEncoder(node, self._fd)
+        self._links[node] = link
+        if self._known:
+            link.connect(now)
+            return [LineEvent(None, Found((node,), late=True))]
+        if self._known_at is None:
+            self._known_at = after(now, GATHER)
+        return []
+
+    def _take_up(self, now: Instant) -> list[LineEvent]:
+        """Put the boards met so far into service; what they said meanwhile is heard next."""
+        self._known = True
+        for link in self._links.values():
+            link.connect(now)
+        return [LineEvent(None, Found(tuple(sorted(self._links)), late=False))]
+
+    def _hear(self, node: int, message: Message, arrival: Instant) -> list[LineEvent]:
+        return [LineEvent(node, event) for event in self._links[node].receive(message, arrival)]
+
+    def _diagnose(self) -> Diagnosed:
+        if not self._frames:
+            return Diagnosed(
+                f"{self._port} is silent: no frame at all, and no answer to Identify",
+                "check the bit rate (…@1000000), termination (60 Ω across the bus), power and "
+                "that the adapter is the right one",
+            )
+        if self._errors == self._frames:
+            return Diagnosed(
+                f"{self._port} carries nothing but error frames ({self._errors})",
+                "the bit rate is wrong (…@1000000), the bus is not terminated, or nobody else is "
+                "on it to acknowledge",
+            )
+        return Diagnosed(
+            f"{self._port} carries {self._frames} frames, but no taxel board answers Identify",
+            "check the board's firmware and, for CAN FD, that the bus was given with +fd",
+        )
+
+
+# The line of a port by its medium, and the names of the boards behind it.
+
+
+def make_line(
+    port: str,
+    admit: Admit,
+    medium: Medium,
+    *,
+    kind: str,
+    rate: float | None,
+    baud: int,
+    fd: bool,
+    nodes: frozenset[int] | None,
+    listen_only: bool,
+    arrays: tuple[int, ...] | None = None,
+) -> Line:
+    """The line of ``port``; ``nodes``: boards wanted on a CAN bus, None for all.
+
+    ``arrays``: magnetometers of each board of a controller that does not say it.
+    """
+    if medium is Medium.CAN:
+        return CanLine(port, admit, fd, rate, nodes, listen_only)
+    return SerialLine(port, admit, kind, rate, baud, listen_only, arrays)
+
+
+def bus_names(
+    stem: str, given: dict[int, str], nodes: tuple[int, ...], late: bool
+) -> dict[int, str]:
+    """Names of boards on a CAN bus: as given by node; the stem for a lone board, else stem-node."""
+    if given:
+        return {node: given[node] for node in nodes if node in given}
+    if len(nodes) == 1 and not late:
+        return {nodes[0]: stem}
+    return {node: f"{stem}-{node}" for node in nodes}

@@ -1,1 +1,0 @@
-"""What a log needs so that it can be run again to the bit, and running it."""

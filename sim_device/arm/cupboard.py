@@ -1,0 +1,202 @@
+"""The cupboard in real time: world and arm, moved on to whatever instant it is. Pure.
+
+The world keeps to the host's clock. When the process was held up, the steps it missed are made up
+for at once, in order, so nothing ever jumps; a controller sees old states with their true, old
+stamps, then new ones. Beyond `MAX_CATCH_UP` the world is suspended for what is left, which is
+longer than any command holds: the arm has come to rest before, so nothing moves meanwhile.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from sim_device.arm.arm import STEP_NS, ArmFault, ArmSettings, SimulatedArm
+from sim_device.faults import Window
+from sim_device.skin.elastomer import Contact
+from sim_device.world.base import World
+from sim_device.world.touch import on_skin
+from tactile_core.geometry import TIP_X
+from tactile_core.types import NS_PER_S, ArmLimits, ArmState, Echo, Instant, Twist, seconds_between
+
+COMMAND_EXPIRY: Final = 0.045
+"""s a command holds from its receipt at most, however much of its own expiry is left. With its
+braking, the period of states and the way over the bus, whoever watches the arm sees it at rest
+within 100 ms of the last command; with 50 ms the longest of twenty times was 101."""
+
+MAX_CATCH_UP: Final = 0.25
+"""s that are made up for at most: 3 ms of work, and three times what a command may hold."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScheduledFault:
+    """A fault of the arm, in a window of s since the start."""
+
+    kind: ArmFault
+    window: Window
+
+
+class NotNow(Exception):  # noqa: N818 - a request that the state of things forbids
+    """The arm's state forbids what was asked; the message says why and what to do."""
+
+
+class Cupboard:
+    """World and arm from `begin` on. ``counters``: of the arm, and of lateness.
+
+    ``late_steps``: physics steps that were made a step or more after their time. ``suspended_ms``:
+    time in which the world stood still because the process did.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        settings: ArmSettings,
+        faults: Sequence[ScheduledFault],
+        rng: np.random.Generator,
+    ) -> None:
+        self._world = world
+        self._settings = settings
+        self._faults = tuple(faults)
+        self._rng = rng
+        self._active: frozenset[ScheduledFault] = frozenset()
+        self._arm: SimulatedArm | None = None
+        self._start = Instant(0)
+        self._suspended = 0
+        self._late = {"late_steps": 0, "late_commands": 0}
+        self._counted: dict[str, int] = {}
+        self.resets = 0
+
+    @property
+    def world(self) -> World:
+        """The world of the present trial."""
+        return self._world
+
+    @property
+    def arm(self) -> SimulatedArm:
+        """The arm; RuntimeError before `begin`."""
+        if self._arm is None:
+            raise RuntimeError("the cupboard has not begun")
+        return self._arm
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Of all trials together."""
+        own = self._late | {"suspended_ms": self._suspended // 1_000_000}
+        counts = {} if self._arm is None else self._arm.counters
+        return {k: v + self._counted.get(k, 0) for k, v in counts.items()} | own
+
+    @property
+    def distance(self) -> float:
+        """m from the tip to the scene's goal."""
+        finger, (gx, gy) = self._world.finger(), self._world.scene.goal
+        x = finger.x + TIP_X * math.cos(finger.heading)
+        y = finger.y + TIP_X * math.sin(finger.heading)
+        return math.hypot(gx - x, gy - y)
+
+    def contacts(self) -> list[Contact]:
+        """What the skin feels now."""
+        world = self._world
+        return on_skin(world.contacts(), world.scene)
+
+    def heading(self) -> float:
+        """Heading of the finger in rad."""
+        return self._world.finger().heading
+
+    def begin(self, now: Instant) -> None:
+        """Let time run from ``now`` on."""
+        self._start = now
+        self._arm = SimulatedArm(self._world, self._settings, now, self._rng)
+        self._apply_faults(0.0)
+
+    def advance(self, now: Instant) -> list[ArmState]:
+        """Move on to ``now``; the states that were received meanwhile, in order."""
+        self._apply_faults(seconds_between(self._start, now))
+        arm = self.arm
+        behind = now - self._suspended - arm.now
+        if behind >= 2 * STEP_NS:
+            self._late["late_steps"] += behind // STEP_NS - 1
+        states: list[ArmState] = []
+        excess = behind - round(MAX_CATCH_UP * NS_PER_S)
+        if excess > 0:
+            states = self._moved_on(Instant(arm.now + behind - excess))
+            self._suspended += excess
+        return states + self._moved_on(Instant(now - self._suspended))
+
+    def command(
+        self,
+        twist: Twist,
+        now: Instant,
+        waited: float,
+        left: float = COMMAND_EXPIRY,
+        echo: Echo | None = None,
+    ) -> bool:
+        """Obey ``twist`` for ``left`` s more; False when refused.
+
+        It came at most ``waited`` s before ``now``, and holds no longer than if it had come that
+        early. Call it after `advance` to ``now``.
+        """
+        expiry = min(left, COMMAND_EXPIRY - waited)
+        if expiry <= 0:
+            self._late["late_commands"] += 1
+            return False
+        return self.arm.command(twist, Instant(now - self._suspended), expiry, echo)
+
+    def request_limits(self, limits: ArmLimits) -> ArmLimits:
+        """Ask the arm for ``limits``; returns those in force."""
+        return self.arm.request_limits(limits)
+
+    def clear(self) -> str:
+        """Enable the arm after a stop; returns its mode. `NotNow` while the cause is there."""
+        if not self.arm.enable():
+            raise NotNow(f"the cause of {self.arm.mode!r} is still there: wait until it is gone")
+        return self.arm.mode
+
+    def reset(self, world: World) -> None:
+        """Go on with ``world``, the arm where that has it; limits, faults and stops remain.
+
+        `NotNow` while the arm moves.
+        """
+        old = self.arm
+        if old.mode == "moving":
+            raise NotNow("the arm is moving: stop it first")
+        for name, count in old.counters.items():
+            self._counted[name] = self._counted.get(name, 0) + count
+        new = SimulatedArm(world, self._settings, old.now, self._rng)
+        new.request_limits(old.limits)
+        if old.mode in (ArmFault.FAULT, ArmFault.ESTOP):  # latched, whether or not the cause lasts
+            cause = ArmFault(old.mode)
+            new.inject(cause)
+            new.clear(cause)
+        for fault in self._active:
+            new.inject(fault.kind)
+        self._world, self._arm = world, new
+        self.resets += 1
+
+    def _moved_on(self, simulated: Instant) -> list[ArmState]:
+        """States up to an instant of the simulation, stamped with the host's."""
+        states = self.arm.advance(simulated)
+        if not self._suspended:
+            return states
+        gap = self._suspended
+        return [
+            replace(s, captured=Instant(s.captured + gap), received=Instant(s.received + gap))
+            for s in states
+        ]
+
+    def _apply_faults(self, seconds: float) -> None:
+        """Let faults begin and end that are due."""
+        if not self._faults:
+            return
+        active = frozenset(f for f in self._faults if f.window.covers(seconds))
+        if active == self._active:
+            return
+        kinds, before = {f.kind for f in active}, {f.kind for f in self._active}
+        for kind in sorted(kinds - before):
+            self.arm.inject(kind)
+        for kind in sorted(before - kinds):
+            self.arm.clear(kind)
+        self._active = active

@@ -1,0 +1,90 @@
+"""From what `simdevice cupboard` is asked for to an arm in a world and boards on its finger."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from sim_device.arm.arm import ArmSettings
+from sim_device.arm.cupboard import Cupboard, ScheduledFault
+from sim_device.arm.server import ArmServer
+from sim_device.ports_plan import BoardsRequest, Planned, plan_boards
+from sim_device.world.engines import world_maker
+from sim_device.world.scene_loading import load_scene
+from sim_device.world.scenes import Scene, SceneError
+from tactile_core.bus.session import BusConfig
+from tactile_core.bus.topics import NAME
+
+
+@dataclass(frozen=True, slots=True)
+class CupboardRequest:
+    """What `simdevice cupboard` was asked for; units as in its help."""
+
+    scene: str
+    seed: int
+    engine: str
+    arm: str
+    world: str
+    settings: ArmSettings
+    arm_faults: tuple[ScheduledFault, ...]
+    boards: BoardsRequest
+    bus: BusConfig
+
+
+def scene_of(request: CupboardRequest) -> Scene:
+    """The scene asked for; SceneError or ValueError where it cannot be had."""
+    try:
+        return load_scene(request.scene, request.seed)
+    except RuntimeError as error:
+        raise SceneError(f"{request.scene}: {error}; take another seed") from error
+
+
+def _another(request: CupboardRequest, seed: int) -> Scene:
+    """Scene ``seed`` of those asked for; SceneError or ValueError where there is none."""
+    if request.scene.endswith(".json"):
+        raise SceneError(f"{request.scene} is one scene: leave the seed out to begin it again")
+    return scene_of(replace(request, seed=seed))
+
+
+def plan_cupboard(request: CupboardRequest) -> list[Planned]:
+    """Arm and boards, all made and nothing open.
+
+    ValueError (SceneError is one) for what does not fit together, `EngineMissing`, WorldError.
+    """
+    for name in (request.arm, request.world):
+        if not NAME.fullmatch(name):
+            raise ValueError(f"{name!r} is no name; allowed: letters, digits, _ and -, at most 64")
+    make_world = world_maker(request.engine)
+    scene = scene_of(request)
+    cupboard = Cupboard(
+        make_world(scene),
+        request.settings,
+        request.arm_faults,
+        np.random.default_rng([request.seed, 2]),
+    )
+    server = ArmServer(
+        cupboard, request.arm, request.world, request.bus, partial(_another, request), make_world
+    )
+    boards: list[Planned] = []
+    if request.boards.ptys or request.boards.slcans:  # an arm without touch is an arm, too
+        boards = plan_boards(
+            replace(request.boards, touched=cupboard.contacts, heading=cupboard.heading)
+        )
+    gx, gy = scene.goal
+    arm = "" if request.arm == "arm" else f" --arm {request.arm}"
+    connect = (
+        f"reachd --strategy hybrid_event --set {scene.parameters} --target {goal_text(scene)}{arm}"
+    )
+    line = (
+        f"{scene.source} seed {scene.seed}, {len(scene.objects)} objects, {scene.fill:.0%} full, "
+        f"goal {gx:.3f} {gy:.3f} m, {request.engine}"
+    )
+    return [Planned(server, f"arm {request.arm}", connect, (line,), server.note), *boards]
+
+
+def goal_text(scene: Scene) -> str:
+    """Goal as `reachd --target` takes it, to the tenth of a millimetre."""
+    x, y = scene.goal
+    return f"{x:.4f},{y:.4f}"

@@ -1,0 +1,1 @@
+"""Simulated boards: firmware, wires, faults."""

@@ -1,0 +1,1 @@
+"""The simulated skin: contacts to counts of its magnetometers."""

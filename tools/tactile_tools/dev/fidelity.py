@@ -1,0 +1,226 @@
+"""``tactile fidelity``: our engine against recorded outcomes of the authors' simulator."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from reachd.strategies.parameters import parameters
+from sim_device.world.engines import ENGINES, make_world
+from sim_device.world.recorded_scenes import load_outcomes, load_recorded
+from sim_device.world.scene_loading import (
+    FOLDER_VARIABLE,
+    RECORDED_SCENES,
+    find_recorded,
+)
+from sim_device.world.scenes import Pose, Scene, SceneError
+from tactile_tools.reach.lockstep import run_trial
+
+STRATEGIES = ("straight", "burrow", "excavate", "hybrid_clock", "hybrid_event")
+REFERENCE_RATES = {
+    # Success at 1 mm and its 95 % interval over seeds 1–88 of the authors' simulator.
+    "straight": (0.33, 0.24, 0.43),
+    "burrow": (0.59, 0.49, 0.69),
+    "excavate": (0.40, 0.30, 0.50),
+    "hybrid_clock": (0.51, 0.41, 0.61),
+    "hybrid_event": (0.63, 0.52, 0.72),
+}
+REFERENCE_NAMES = {"clock": "hybrid_clock", "event": "hybrid_event"}
+"""What the recorded outcomes call our strategies, where they differ."""
+
+PERTURBATION_M = 1e-4
+"""Standard deviation of a perturbed start across the cupboard: far below what matters to a user."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One trial: scene, strategy, and how it was perturbed (0: not at all)."""
+
+    seed: int
+    strategy: str
+    perturbed: int
+    success: bool
+    entered: bool
+    distance: float
+    time: float
+    excavations: int
+    ejected: int
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``fidelity`` to the umbrella command."""
+    parser = subparsers.add_parser(
+        "fidelity",
+        help="compare our engine with recorded outcomes of the authors' simulator",
+        description="Runs every strategy on recorded scenes and compares outcomes trial by trial "
+        "with the reference, beside the agreement of our own repeated runs with starts moved by "
+        "0.1 mm: the ceiling that chance allows.",
+    )
+    parser.add_argument(
+        "--scenes",
+        type=Path,
+        metavar="FILE",
+        help=f"recorded scenes (default: {RECORDED_SCENES} in the folder that {FOLDER_VARIABLE} "
+        "names)",
+    )
+    parser.add_argument(
+        "--outcomes",
+        type=Path,
+        metavar="FILE",
+        help="what the reference did there (default: beside the scenes, outcomes_1_60.csv of "
+        "scenes_1_60.json.gz)",
+    )
+    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
+    parser.add_argument("--depth", choices=("contacts", "taxels"), default="contacts")
+    parser.add_argument(
+        "--repeats", type=int, default=2, help="perturbed runs (default 2; 0: no ceiling)"
+    )
+    parser.add_argument("--most", type=int, help="scenes to use (default all)")
+    parser.add_argument("--jobs", type=int, default=multiprocessing.cpu_count())
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.set_defaults(func=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run, print and write the comparison; 0 when all of it ran."""
+    console = Console()
+    if options.repeats < 0 or options.jobs < 1 or (options.most is not None and options.most < 1):
+        print(
+            "tactile fidelity: --repeats is at least 0, --jobs and --most are at least 1",
+            file=sys.stderr,
+        )
+        return 2
+    try:
+        file = options.scenes or find_recorded(RECORDED_SCENES)
+        scenes = load_recorded(file)[: options.most]
+        outcomes = load_outcomes(options.outcomes or outcomes_of(file))
+    except (SceneError, OSError) as error:
+        print(f"tactile fidelity: {error}", file=sys.stderr)
+        return 3
+    reference = {(o.seed, REFERENCE_NAMES.get(o.strategy, o.strategy)): o for o in outcomes}
+    tasks = [
+        (scene, strategy, repeat)
+        for scene in scenes
+        for strategy in STRATEGIES
+        for repeat in range(options.repeats + 1)
+    ]
+    work = partial(_trial, engine=options.engine, depth=options.depth)
+    with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
+        trials = list(
+            track(pool.imap(work, tasks), total=len(tasks), description="trials", console=console)
+        )
+    summary = {
+        strategy: summarise(
+            [t for t in trials if t.strategy == strategy],
+            {seed: o.success for (seed, name), o in reference.items() if name == strategy},
+        )
+        for strategy in STRATEGIES
+    }
+    console.print(_table(summary, len(scenes)))
+    if options.json is not None:
+        report = {
+            "engine": options.engine,
+            "depth": options.depth,
+            "scenes": len(scenes),
+            "perturbation_m": PERTURBATION_M,
+            # What was not measured is left out: JSON has no NaN.
+            "summary": {
+                name: {key: value for key, value in row.items() if not math.isnan(value)}
+                for name, row in summary.items()
+            },
+            "trials": [asdict(t) for t in trials],
+        }
+        options.json.write_text(json.dumps(report) + "\n", encoding="utf-8")
+        console.print(f"wrote {options.json}")
+    return 0
+
+
+def outcomes_of(scenes: Path) -> Path:
+    """Outcomes that lie beside a file of scenes: outcomes_1_60.csv of scenes_1_60.json.gz."""
+    name = scenes.name.removesuffix(".gz").removesuffix(".json")
+    return scenes.with_name(name.replace("scenes", "outcomes", 1) + ".csv")
+
+
+def _trial(task: tuple[Scene, str, int], engine: str, depth: str) -> Trial:
+    scene, strategy, repeat = task
+    if repeat:
+        rng = np.random.default_rng([scene.seed, repeat])
+        start = scene.start
+        moved = Pose(start.x, start.y + PERTURBATION_M * rng.standard_normal(), start.heading)
+        scene = replace(scene, start=moved)
+    result = run_trial(
+        scene,
+        strategy,
+        parameters(scene.parameters),
+        scene.seed,
+        depth="taxels" if depth == "taxels" else "contacts",
+        world=make_world(engine, scene),
+    )
+    o = result.outcome
+    return Trial(
+        seed=scene.seed,
+        strategy=strategy,
+        perturbed=repeat,
+        success=o.success,
+        entered=result.entered,
+        distance=o.distance,
+        time=o.time,
+        excavations=len(o.excavations),
+        ejected=result.ejected,
+    )
+
+
+def summarise(trials: Sequence[Trial], reference: dict[int, bool]) -> dict[str, float]:
+    """Success rates, agreement with the reference, and agreement of our own repeated runs."""
+    plain = {t.seed: t.success for t in trials if t.perturbed == 0}
+    same = [plain[seed] == success for seed, success in reference.items() if seed in plain]
+    repeats: dict[int, list[bool]] = {}
+    for t in trials:
+        repeats.setdefault(t.seed, []).append(t.success)
+    own = [
+        a == b
+        for outcomes in repeats.values()
+        for i, a in enumerate(outcomes)
+        for b in outcomes[i + 1 :]
+    ]
+    of_reference = [success for seed, success in reference.items() if seed in plain]
+    return {
+        "success": float(np.mean(list(plain.values()))),
+        "entered": float(np.mean([t.entered for t in trials if t.perturbed == 0])),
+        "success_all_repeats": float(np.mean([t.success for t in trials])),
+        "reference_success": float(np.mean(of_reference)) if of_reference else float("nan"),
+        "agreement": float(np.mean(same)) if same else float("nan"),
+        "own_agreement": float(np.mean(own)) if own else float("nan"),
+        "ejected": float(np.mean([t.ejected for t in trials])),
+    }
+
+
+def _table(summary: dict[str, dict[str, float]], scenes: int) -> Table:
+    table = Table(title=f"{scenes} recorded scenes: success within 1 mm, and agreement")
+    for name in ("strategy", "ours", "reference", "95 % of 88", "in 7.5 mm", "agree", "ceiling"):
+        table.add_column(name, justify="left" if name == "strategy" else "right")
+    for strategy, row in summary.items():
+        _, low, high = REFERENCE_RATES[strategy]
+        inside = low <= row["success_all_repeats"] <= high
+        table.add_row(
+            strategy,
+            f"[{'green' if inside else 'red'}]{row['success_all_repeats']:.0%}[/]",
+            f"{row['reference_success']:.0%}",
+            f"{low:.0%}–{high:.0%}",
+            f"{row['entered']:.0%}",
+            f"{row['agreement']:.0%}",
+            "–" if math.isnan(row["own_agreement"]) else f"{row['own_agreement']:.0%}",
+        )
+    return table

@@ -1,0 +1,293 @@
+"""``tactile mutation``: change the safety gate in small ways and see whether its tests notice.
+
+A mutant that no test fails on is a survivor: either a test is missing, or the change makes no
+difference that matters. Works in a checkout only, for it needs the tests.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import json
+import multiprocessing
+import os
+import random
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import Progress
+
+ROOT = Path(__file__).parents[3]
+PACKAGE = ROOT / "host" / "reachd"
+FILES = ("gate/gate.py", "gate/limits.py", "gate/motion.py")
+TESTS = (
+    "test_gate_limits.py",
+    "test_gate_workspace.py",
+    "test_gate_wrench.py",
+    "test_gate_constraints.py",
+    "test_gate_geometry.py",
+    "test_gate_inputs.py",
+    "test_gate_ages.py",
+    "test_gate_arming.py",
+    "test_gate_motion.py",
+    "test_gate_loads.py",
+    "test_gate_echo.py",
+    "test_gate_random.py",
+)
+RANDOM_INPUTS = "2000"
+"""Inputs of the random test for each mutant: what it finds it finds among the first."""
+
+SWAPS: dict[type[ast.AST], tuple[type[Any], ...]] = {
+    ast.Lt: (ast.LtE, ast.Gt),
+    ast.LtE: (ast.Lt, ast.Gt),
+    ast.Gt: (ast.GtE, ast.Lt),
+    ast.GtE: (ast.Gt, ast.Lt),
+    ast.Eq: (ast.NotEq,),
+    ast.NotEq: (ast.Eq,),
+    ast.Is: (ast.IsNot,),
+    ast.IsNot: (ast.Is,),
+    ast.In: (ast.NotIn,),
+    ast.NotIn: (ast.In,),
+    ast.And: (ast.Or,),
+    ast.Or: (ast.And,),
+    ast.Add: (ast.Sub,),
+    ast.Sub: (ast.Add,),
+    ast.Mult: (ast.Div,),
+    ast.Div: (ast.Mult,),
+}
+NAMES = {"min": "max", "max": "min", "cos": "sin", "sin": "cos"}
+
+
+@dataclass(frozen=True, slots=True)
+class Mutant:
+    """One change: where, and the expression before and after."""
+
+    file: str
+    line: int
+    before: str
+    after: str
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of a mutant: "killed", "survived" or "timeout"."""
+
+    mutant: Mutant
+    fate: str
+
+
+def variants(node: ast.AST) -> Iterator[ast.AST]:
+    """Small changes of one node, each a new node."""
+    match node:
+        case ast.Compare(ops=ops):
+            for index, op in enumerate(ops):
+                for other in SWAPS.get(type(op), ()):
+                    changed = copy.deepcopy(node)
+                    changed.ops[index] = other()
+                    yield changed
+        case ast.BoolOp(op=op) | ast.BinOp(op=op):
+            for other in SWAPS.get(type(op), ()):
+                changed_op = copy.deepcopy(node)
+                changed_op.op = other()
+                yield changed_op
+        case ast.UnaryOp(op=ast.Not() | ast.USub(), operand=operand):
+            yield copy.deepcopy(operand)
+        case ast.Constant(value=bool() as value):
+            yield ast.Constant(not value)
+        case ast.Constant(value=int() | float() as value):
+            yield ast.Constant(value + 1)
+        case ast.Name(id=name) if name in NAMES:
+            yield ast.Name(NAMES[name], ast.Load())
+        case ast.Attribute(attr=name) if name in NAMES:
+            renamed = copy.deepcopy(node)
+            renamed.attr = NAMES[name]
+            yield renamed
+        case ast.Expr(value=ast.Call()) | ast.AugAssign():
+            yield ast.Pass()
+
+
+def mutants(file: str, source: str) -> list[Mutant]:
+    """Every single change of ``source``; annotations and module constants are left alone."""
+    tree = ast.parse(source)
+    found = []
+    for holder in ast.walk(tree):
+        if not isinstance(holder, ast.FunctionDef):
+            continue
+        for parent in (n for statement in holder.body for n in ast.walk(statement)):
+            for name, value in ast.iter_fields(parent):
+                if name in ("annotation", "returns"):
+                    continue
+                places = value if isinstance(value, list) else [value]
+                for index, node in enumerate(places):
+                    if not isinstance(node, ast.AST):
+                        continue
+                    for changed in variants(node):
+                        ast.copy_location(changed, node)
+                        _put(parent, name, index, changed)
+                        text = ast.unparse(tree)
+                        _put(parent, name, index, node)
+                        line = getattr(node, "lineno", holder.lineno)
+                        before, after = ast.unparse(node), ast.unparse(changed)
+                        found.append(Mutant(file, line, before, after, text))
+    return found
+
+
+def _put(parent: ast.AST, name: str, index: int, node: ast.AST) -> None:
+    holder = getattr(parent, name)
+    if isinstance(holder, list):
+        holder[index] = node
+    else:
+        setattr(parent, name, node)
+
+
+def trial(overlay: str, tests: Sequence[str]) -> None:
+    """Run the tests on the package in ``overlay``; the process exits with pytest's code."""
+    import pytest
+
+    sink = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(sink, 1)
+    os.dup2(sink, 2)
+    os.environ["REACH_RANDOM_INPUTS"] = RANDOM_INPUTS
+    sys.path.insert(0, overlay)
+    import reachd
+
+    if not str(reachd.__file__).startswith(overlay):
+        sys.exit(99)
+    os.chdir(ROOT)
+    options = ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "--hypothesis-seed=1"]
+    sys.exit(pytest.main([*options, *tests]))
+
+
+def judge(package: Path, mutant: Mutant | None, tests: Sequence[str], limit: float) -> str:
+    """Fate of one mutant of ``package``, or of the package as it is where there is none."""
+    context = multiprocessing.get_context("forkserver")
+    with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
+        _copy(package, Path(folder) / "reachd")
+        if mutant is not None:
+            (Path(folder) / "reachd" / mutant.file).write_text(mutant.source, encoding="utf-8")
+        process = context.Process(target=trial, args=(folder, tests), daemon=True)
+        process.start()
+        process.join(limit)
+        if process.is_alive():
+            process.kill()
+            process.join()
+            return "timeout"
+        if process.exitcode == 99:
+            raise RuntimeError("the mutated package was not the one that was imported")
+        return "survived" if process.exitcode == 0 else "killed"
+
+
+def _copy(source: Path, target: Path) -> None:
+    shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
+
+
+def run(options: argparse.Namespace) -> int:
+    """Judge every mutant, several at a time, and report the survivors."""
+    folder = ROOT / "tests" / "reach"
+    if not folder.is_dir() or not PACKAGE.is_dir():
+        print(
+            f"no tests at {folder}: run this in a checkout of the project, not in an installation",
+            file=sys.stderr,
+        )
+        return 3
+    with tempfile.TemporaryDirectory(prefix="mutation-") as frozen:
+        # Copies, so that work on the checkout does not disturb a run of many minutes.
+        package, tests = Path(frozen) / "reachd", Path(frozen) / "tests"
+        _copy(PACKAGE, package)
+        _copy(folder, tests)
+        return _judge_all(package, [str(tests / name) for name in TESTS], options)
+
+
+def _judge_all(package: Path, tests: Sequence[str], options: argparse.Namespace) -> int:
+    made = [m for f in options.file for m in mutants(f, (package / f).read_text(encoding="utf-8"))]
+    total = len(made)
+    if options.sample is not None and options.sample < total:
+        made = random.Random(options.seed).sample(made, options.sample)
+    multiprocessing.get_context("forkserver").set_forkserver_preload(
+        ["pytest", "numpy", "hypothesis", "scipy.integrate"]
+    )
+    if judge(package, None, tests, options.limit) != "survived":
+        print("the tests fail on the package as it is: mend that first", file=sys.stderr)
+        return 3
+    verdicts = []
+    console = Console()
+    with Progress(console=console, transient=True) as bar, ThreadPoolExecutor(options.jobs) as pool:
+        task = bar.add_task(f"{len(made)} of {total} mutants", total=len(made))
+        jobs = {pool.submit(judge, package, m, tests, options.limit): m for m in made}
+        for job in as_completed(jobs):
+            verdicts.append(Verdict(jobs[job], job.result()))
+            bar.advance(task)
+            if verdicts[-1].fate == "survived":
+                console.print(_line(jobs[job]), markup=False, soft_wrap=True)
+    return _report(verdicts, total, console, options)
+
+
+def _line(mutant: Mutant) -> str:
+    return f"{mutant.file}:{mutant.line}: {mutant.before}  →  {mutant.after}"
+
+
+def _report(
+    verdicts: list[Verdict], total: int, console: Console, options: argparse.Namespace
+) -> int:
+    """Sum up, and write what survived; 1 when that is more than was allowed."""
+    survivors = sorted(
+        (v.mutant for v in verdicts if v.fate == "survived"), key=lambda m: (m.file, m.line)
+    )
+    slow = sum(v.fate == "timeout" for v in verdicts)
+    console.print(
+        f"{len(verdicts)} mutants of {total}: {len(verdicts) - len(survivors)} killed "
+        f"({slow} by the time limit), {len(survivors)} survived"
+    )
+    if options.json:
+        _write(options.json, len(verdicts), survivors, slow)
+    allowed = options.max_survivors
+    return 1 if allowed is not None and len(survivors) > allowed else 0
+
+
+def _write(path: Path, judged: int, survivors: list[Mutant], slow: int) -> None:
+    def plain(mutant: Mutant) -> dict[str, Any]:
+        return {k: v for k, v in asdict(mutant).items() if k != "source"}
+
+    found = {
+        "mutants": judged,
+        "killed": judged - len(survivors),
+        "timeouts": slow,
+        "survivors": [plain(m) for m in survivors],
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add ``mutation`` to the umbrella command."""
+    parser = subparsers.add_parser(
+        "mutation", help="mutate the safety gate and report what its tests miss"
+    )
+    parser.add_argument(
+        "--file", nargs="+", default=list(FILES), choices=FILES, help="default: %(default)s"
+    )
+    parser.add_argument("--jobs", type=_positive, default=os.cpu_count() or 1, help="at a time")
+    parser.add_argument("--sample", type=_positive, help="this many, chosen at random")
+    parser.add_argument("--seed", type=int, default=0, help="of the sample (default: 0)")
+    parser.add_argument(
+        "--limit", type=_positive, default=120, help="s for one mutant (default: 120)"
+    )
+    parser.add_argument("--max-survivors", type=int, help="exit with 1 when more survive")
+    parser.add_argument("--json", type=Path, help="write the report to this file")
+    parser.set_defaults(func=run)
+
+
+def _positive(text: str) -> int:
+    value = int(text) if text.isdigit() else 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
+    return value

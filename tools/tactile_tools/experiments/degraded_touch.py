@@ -1,0 +1,221 @@
+"""Touch that is worse than it should be: noise, a slow stream, dead taxels, a stretched finger."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+
+from reachd.interfaces import Touch
+from sim_device.board.catalogue import identity
+from sim_device.board.firmware import SerialBoard
+from sim_device.faults import FaultPlan, TaxelFault, TaxelFaultKind, Window
+from sim_device.skin.parameters import SkinParameters
+from sim_device.skin.skin import SkinModel
+from sim_device.world.base import FingerContact, FingerState, World
+from sim_device.world.scenes import Scene
+from tactile_core.geometry import finger
+from tactile_core.types import Instant, after
+from tactile_tools.reach.touch_senses import ContactSense, TaxelSense
+from tactiled.sensing.pipeline import PipelineSettings
+
+BOARD_RATE = 25.0
+"""Hz of a board that nobody set up otherwise, as the paper's."""
+
+FIELD_PER_NEWTON_UT = 152.0
+"""µT that 1 N moves a chip's reading by, in the simulated skin: turns noise in N to one in µT."""
+
+SAME_COLUMN = 1e-3
+"""m along the outline within which taxels stand above one another."""
+
+
+def dead_taxels(seed: int, fraction: float) -> list[tuple[str, int]]:
+    """Array and number of the taxels that are dead: ``fraction`` of all, drawn by ``seed``.
+
+    A greater fraction of the same seed holds the taxels of a lesser one.
+    """
+    every = [(a.name, i) for a in finger().arrays for i in range(a.taxels)]
+    order = np.random.default_rng([seed, 4]).permutation(len(every))
+    return [every[i] for i in sorted(order[: round(fraction * len(every))].tolist())]
+
+
+class SeenWorld:
+    """What a sense looks at of a world: its contacts, changed by ``change``."""
+
+    def __init__(
+        self,
+        world: World,
+        change: Callable[[tuple[FingerContact, ...]], tuple[FingerContact, ...]],
+    ) -> None:
+        self._world = world
+        self._change = change
+
+    @property
+    def scene(self) -> Scene:
+        """Of the world itself."""
+        return self._world.scene
+
+    def contacts(self) -> tuple[FingerContact, ...]:
+        """The world's, changed."""
+        return self._change(self._world.contacts())
+
+    def finger(self) -> FingerState:
+        """Of the world itself."""
+        return self._world.finger()
+
+
+class Unstretched:
+    """Between a finger stretched across by ``stretch`` and the skin of the finger as built.
+
+    The skin of the other finger has the same taxels at the same places along its outline.
+    """
+
+    def __init__(self, stretch: float) -> None:
+        self._stretch = stretch
+
+    def contacts(self, contacts: Sequence[FingerContact]) -> tuple[FingerContact, ...]:
+        """Contacts of the stretched finger where they are on the finger as built."""
+        if self._stretch == 1.0:
+            return tuple(contacts)
+        moved = []
+        for c in contacts:
+            # A normal goes with the inverse of the stretch; what it makes of the force stays.
+            nx, ny = c.normal_x / self._stretch, c.normal_y
+            length = math.hypot(nx, ny)
+            ax, ay = nx / length, ny / length
+            normal, shear = c.normal_force, c.shear_force
+            moved.append(
+                FingerContact(
+                    x=c.x,
+                    y=c.y / self._stretch,
+                    normal_x=ax,
+                    normal_y=ay,
+                    force_x=-normal * ax - shear * ay,
+                    force_y=-normal * ay + shear * ax,
+                    body=c.body,
+                )
+            )
+        return tuple(moved)
+
+    def touch(self, touch: Touch) -> Touch:
+        """``touch`` of the finger as built on the stretched one."""
+        if self._stretch == 1.0:
+            return touch
+        return replace(touch, peak_y=touch.peak_y * self._stretch)
+
+
+class DegradedContacts:
+    """The engine's contacts, worse.
+
+    ``noise``: N, of peak, tip and total force alike. ``rate``: Hz, None for every cycle. ``dead``:
+    fraction of dead taxels; a contact is felt in part as the taxels of its column are alive.
+    ``stretch``: of the finger across.
+    """
+
+    cycle = None
+
+    def __init__(
+        self, seed: int, *, noise: float, rate: float | None, dead: float, stretch: float
+    ) -> None:
+        self._inner = ContactSense()
+        self._rng = np.random.default_rng([seed, 3])
+        self._noise = noise
+        self._period = None if rate is None else 1.0 / rate
+        self._due: Instant | None = None
+        self._touch: Touch | None = None
+        self._unstretched = Unstretched(stretch)
+        self._columns = _columns(seed, dead) if dead > 0 else None
+
+    def settle(self, world: World, now: Instant) -> Instant:
+        """There is nothing to start."""
+        return self._inner.settle(world, now)
+
+    def feel(self, world: World, now: Instant) -> Touch | None:
+        """The newest touch; a new one only when it is due."""
+        if self._touch is not None and self._due is not None and now < self._due:
+            return self._touch
+        if self._period is not None:
+            self._due = after(now if self._due is None else self._due, self._period)
+        seen = SeenWorld(world, self._felt)
+        # A sense only looks at a world, and a `SeenWorld` is all that there is to look at.
+        touch = self._inner.feel(cast(World, seen), now)
+        if self._noise > 0:
+            touch = self._disturbed(touch)
+        self._touch = self._unstretched.touch(touch)
+        return self._touch
+
+    def _felt(self, contacts: tuple[FingerContact, ...]) -> tuple[FingerContact, ...]:
+        moved = self._unstretched.contacts(contacts)
+        if self._columns is None:
+            return moved
+        places, alive = self._columns
+        felt = []
+        for c in moved:
+            away = (places[:, 0] - c.x) ** 2 + (places[:, 1] - c.y) ** 2
+            share = float(alive[int(away.argmin())])
+            if share > 0:
+                felt.append(replace(c, force_x=share * c.force_x, force_y=share * c.force_y))
+        return tuple(felt)
+
+    def _disturbed(self, touch: Touch) -> Touch:
+        """``touch`` with noise; a force is never below 0."""
+        peak, total, tip = (self._rng.standard_normal(3) * self._noise).tolist()
+        return replace(
+            touch,
+            peak_force=max(0.0, touch.peak_force + peak),
+            total_force=max(0.0, touch.total_force + total),
+            tip_force=max(0.0, touch.tip_force + tip),
+        )
+
+
+class DegradedTaxels(TaxelSense):
+    """The whole chain of taxels with a worse board: noisier chips, slower, some of them failed."""
+
+    def __init__(
+        self, seed: int, *, noise: float, rate: float | None, dead: float, stretch: float
+    ) -> None:
+        rate = BOARD_RATE if rate is None else rate
+        extra = noise * FIELD_PER_NEWTON_UT
+        # A user knows the noise of the board at hand and sets it, or every field fit would fail.
+        x, y, z = (math.hypot(n, extra) for n in PipelineSettings().noise_ut)
+        super().__init__(seed, rate=rate, settings=PipelineSettings(noise_ut=(x, y, z)))
+        parameters = SkinParameters()
+        chip = parameters.chip
+        chip = replace(
+            chip,
+            noise_xy_ut=math.hypot(chip.noise_xy_ut, extra),
+            noise_z_ut=math.hypot(chip.noise_z_ut, extra),
+        )
+        always = Window(0.0, math.inf)
+        plan = FaultPlan(
+            taxels=tuple(
+                TaxelFault(TaxelFaultKind.FAILED, array, taxel, always)
+                for array, taxel in dead_taxels(seed, dead)
+            )
+        )
+        # The same skin as the plain one of this seed: tolerances are drawn before any noise.
+        skin = SkinModel(finger(), replace(parameters, chip=chip), np.random.default_rng([seed, 0]))
+        self._board = SerialBoard(skin, identity("finger", seed), rate=rate, plan=plan)
+        self._unstretched = Unstretched(stretch)
+
+    def feel(self, world: World, now: Instant) -> Touch | None:
+        """As a `TaxelSense`, through the stretched finger."""
+        seen = SeenWorld(world, self._unstretched.contacts)
+        touch = super().feel(cast(World, seen), now)
+        return None if touch is None else self._unstretched.touch(touch)
+
+
+def _columns(seed: int, fraction: float) -> tuple[Any, Any]:
+    """Places (n, 2) m of the taxels, and what share of the taxels above one another is alive."""
+    dead = set(dead_taxels(seed, fraction))
+    places, alive = [], []
+    for array in finger().arrays:
+        for index in range(array.taxels):
+            places.append(array.position[index, :2])
+            alive.append((array.name, index) not in dead)
+    at, up = np.array(places), np.array(alive, dtype=np.float64)
+    near = np.linalg.norm(at[:, None] - at[None], axis=2) < SAME_COLUMN
+    return at, (near * up).sum(axis=1) / near.sum(axis=1)

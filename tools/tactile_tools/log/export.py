@@ -1,0 +1,254 @@
+"""``tactile log export``: the messages of a log as tables for other programs."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import resource
+import shutil
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tactile_core.bus.messages import DecodeError
+from tactile_core.bus.topics import RAW, find_topic
+from tactile_tools.log.arguments import Selection, add_files, add_selection, select
+from tactile_tools.log.stream import Reading, Record, Stream, read_merged
+from tactile_tools.log.terminal import (
+    FAULTY,
+    ToolError,
+    bytes_text,
+    cannot_write,
+    complain,
+    plain_console,
+    progress,
+)
+
+if TYPE_CHECKING:
+    from tactile_tools.log.columns import Column
+    from tactile_tools.log.decode import Decoder
+    from tactile_tools.log.tables import Table
+
+FORMATS = ("csv", "parquet", "npz")
+
+MAX_FILES = 65_536
+
+CONTENTS = "columns.json"
+"""Says what the columns of every file are, with units as the definitions tell them; a folder that
+has it was made by this tool, and may be overwritten with --force."""
+
+
+def fill(parser: argparse.ArgumentParser) -> None:
+    """Give ``tactile log export`` its arguments."""
+    parser.description = (
+        "Write a folder with one table a topic. Nested fields are flattened "
+        f"(header.stamp_ns, wrench.force.x); {CONTENTS} says what each column is. Lists of numbers "
+        "are columns name.0, name.1 … in CSV, lists in Parquet, matrices in npz; lists of messages "
+        "are JSON in CSV, lists of structures in Parquet, flat arrays with offsets in npz. Raw "
+        "bytes of boards are left out unless --topic names them."
+    )
+    add_files(parser)
+    parser.add_argument("--to", dest="format", choices=FORMATS, required=True, help="format")
+    parser.add_argument(
+        "--out", type=Path, metavar="FOLDER", help="new folder (default: FILE's name and format)"
+    )
+    parser.add_argument("--force", action="store_true", help="overwrite an earlier export")
+    add_selection(parser, until="--until")
+    parser.set_defaults(func=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Export; 0 when every message was written, 1 when some were lost or could not be decoded."""
+    chosen = select(options)
+    left_out: set[str] = set()
+    if chosen.wanted is None:
+        chosen = replace(chosen, wanted=partial(_is_no_raw, left_out))
+    _allow_files()
+    source = chosen.logs[0].paths[0]
+    out: Path = options.out or source.with_name(f"{source.stem}_{options.format}")
+    _check_folder(out, options.force)
+    part = out.with_name(f".{out.name}.{os.getpid()}.part")
+    try:
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        result = _export(chosen, options.format, part)
+        if out.exists():
+            shutil.rmtree(out)
+        part.replace(out)
+    except OSError as error:
+        raise cannot_write(out, error) from error
+    finally:
+        with contextlib.suppress(OSError):
+            shutil.rmtree(part)
+    return _report(result, out, left_out)
+
+
+def _is_no_raw(left_out: set[str], topic: str) -> bool:
+    """Whether a topic is anything but the bytes of a board, which are noted in ``left_out``."""
+    found = find_topic(topic)
+    if found is None or found[0] != RAW:
+        return True
+    left_out.add(topic)
+    return False
+
+
+def _allow_files() -> None:
+    """Have the system let us open as many files as it would: one a topic."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_FILES)
+    if soft != resource.RLIM_INFINITY and soft < most:
+        with contextlib.suppress(ValueError, OSError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+
+
+def _check_folder(out: Path, force: bool) -> None:
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise ToolError(f"{out} is a file: name a folder with --out")
+    if not any(out.iterdir()):
+        return
+    if not (out / CONTENTS).exists():
+        raise ToolError(f"{out} is there already and no export: name another folder with --out")
+    if not force:
+        raise ToolError(f"{out} exists and is not overwritten: name another, or give --force")
+
+
+class _Export:
+    """Tables by stream; made with the first message of each."""
+
+    def __init__(self, folder: Path, kind: str, start_ns: int, decoder: Decoder) -> None:
+        self.folder = folder
+        self.tables: dict[Stream, Table] = {}
+        self.refused: dict[str, str] = {}
+        self.undecoded: dict[str, int] = {}
+        self.decoder = decoder
+        self.reading = Reading()
+        self.widths: dict[Stream, dict[str, int]] = {}
+        from tactile_tools.log.columns import FileNames
+        from tactile_tools.log.tables import Budget
+
+        self._kind = kind
+        self._start_ns = start_ns
+        self._files = FileNames(f".{kind}")
+        self._budget = Budget()
+
+    @property
+    def names(self) -> dict[Stream, str]:
+        """Names of the files."""
+        return self._files.names
+
+    def take(self, record: Record) -> None:
+        """Write one message."""
+        stream = record.stream
+        try:
+            message = self.decoder.decode(stream, record.data)
+        except DecodeError as error:
+            self.refused.setdefault(stream.topic, str(error))
+            self.undecoded[stream.topic] = self.undecoded.get(stream.topic, 0) + 1
+            return
+        table = self.tables.get(stream)
+        if table is None:
+            table = self.tables[stream] = self._make(stream)
+        table.add(record, message)
+        if self._budget.spent:
+            for each in self.tables.values():
+                each.relieve()
+
+    def columns(self, stream: Stream) -> list[Column]:
+        """Columns of a stream."""
+        from tactile_tools.log.columns import plan
+
+        return plan(stream, self.decoder.reader(stream))
+
+    def close(self) -> None:
+        """Write all that is left, and what the columns are."""
+        contents = []
+        for stream, table in self.tables.items():
+            columns = table.close()
+            contents.append(
+                {
+                    "file": self.names[stream],
+                    "topic": stream.topic,
+                    "type": stream.msgtype,
+                    "rows": table.rows,
+                    "columns": columns,
+                }
+            )
+        text = json.dumps(contents, indent=1, ensure_ascii=False)
+        (self.folder / CONTENTS).write_text(text + "\n", encoding="utf-8")
+
+    def _make(self, stream: Stream) -> Table:
+        path, columns = self.folder / self._files.add(stream), self.columns(stream)
+        if self._kind == "npz":
+            from tactile_tools.log.npz import NpzTable
+
+            scratch = path.with_suffix(".parts")
+            return NpzTable(path, columns, self._start_ns, scratch, self._budget)
+        from tactile_tools.log.tables import ArrowTable
+
+        widths = self.widths.get(stream, {}) if self._kind == "csv" else None
+        return ArrowTable(path, stream, columns, self._start_ns, widths, self._budget)
+
+
+def _export(chosen: Selection, kind: str, folder: Path) -> _Export:
+    from tactile_tools.log.decode import Decoder
+
+    result = _Export(folder, kind, chosen.start_ns, Decoder())
+    if kind == "csv":
+        with progress("measuring lists") as report:
+            _measure(chosen, result, report)
+    with progress("exporting") as report:
+        for _, item in read_merged(
+            chosen.logs, result.reading, report, chosen.wanted, chosen.window
+        ):
+            if isinstance(item, Record):
+                result.take(item)
+    result.close()
+    return result
+
+
+def _measure(chosen: Selection, result: _Export, report: Any) -> None:
+    """How long lists get: CSV needs to know its columns before the first row."""
+    lists: dict[Stream, list[Column]] = {}
+    for _, item in read_merged(chosen.logs, Reading(), report, chosen.wanted, chosen.window):
+        if not isinstance(item, Record):
+            continue
+        stream = item.stream
+        try:
+            if stream not in lists:
+                lists[stream] = [
+                    column
+                    for column in result.columns(stream)
+                    if column.kind in ("numbers", "texts")
+                ]
+                result.widths[stream] = dict.fromkeys((c.name for c in lists[stream]), 0)
+            if not lists[stream]:
+                continue
+            message = result.decoder.decode(stream, item.data)
+        except DecodeError:
+            continue
+        widths = result.widths[stream]
+        for column in lists[stream]:
+            length = len(column.get(message))
+            if length > widths[column.name]:
+                widths[column.name] = length
+
+
+def _report(result: _Export, out: Path, left_out: set[str]) -> int:
+    console = plain_console()
+    for stream, table in result.tables.items():
+        size = bytes_text((out / result.names[stream]).stat().st_size)
+        console.print(f"{out / result.names[stream]}: {table.rows} messages, {size}")
+    if not result.tables:
+        console.print(f"{out}: no message in what was asked for")
+    for topic in sorted(left_out):
+        console.print(f"left out: {topic}, the bytes of a board; --topic {topic} exports them")
+    if remark := result.reading.remark():
+        complain(f"{remark}; exported what could be read")
+    for topic, reason in result.refused.items():
+        complain(f"{result.undecoded[topic]} messages of {topic} left out: {reason}")
+    return FAULTY if result.refused or result.reading.lossy else 0

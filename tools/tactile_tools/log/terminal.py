@@ -1,0 +1,143 @@
+"""What the log tools say: errors with their exit codes, progress, times and sizes."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+from tactile_core.log.records import LogError
+from tactile_core.log.records import Progress as Report
+from tactile_core.types import NS_PER_S
+
+FAULTY, BAD_ARGUMENT, REFUSED = 1, 2, 3
+"""Exit codes: the log has faults; an argument cannot be used; the system does not let us."""
+
+UNITS = ("B", "kB", "MB", "GB", "TB")
+
+PLAIN_WIDTH = 160
+"""Columns of a table that goes into a pipe or a file."""
+
+
+class ToolError(Exception):
+    """What the user asked for cannot be done; the text names the remedy."""
+
+    def __init__(self, text: str, code: int = BAD_ARGUMENT) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+def shown(text: object, limit: int | None = None) -> str:
+    """A text that may come from anybody, safe to be printed on one line.
+
+    Control and format characters (which move the cursor, change colours or turn the direction of
+    writing) become escapes such as ``\\x1b``. ``limit``: letters after which it is cut, told.
+    """
+    text = str(text)
+    rest = 0 if limit is None else len(text) - limit
+    if rest > 0:
+        text = text[:limit]
+    if not text.isprintable():
+        text = "".join(c if c.isprintable() else _escape(c) for c in text)
+    return f"{text}… ({rest} more letters)" if rest > 0 else text
+
+
+def _escape(letter: str) -> str:
+    return letter.encode("unicode_escape", "backslashreplace").decode()
+
+
+NOT_IN_JSON = re.compile("[\x7f-\uffff]|[\U00010000-\U0010ffff]")
+
+
+def json_text(value: Any, **options: Any) -> str:
+    """JSON with letters as they are, but none that a terminal takes for a command."""
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, **options)
+    if text.isascii() and "\x7f" not in text:
+        return text
+    return NOT_IN_JSON.sub(lambda m: m[0] if m[0].isprintable() else json.dumps(m[0])[1:-1], text)
+
+
+def complain(text: str, code: int = BAD_ARGUMENT) -> int:
+    """Say what is wrong; returns the exit code."""
+    print(f"tactile log: {shown(text)}", file=sys.stderr)
+    return code
+
+
+def fail(error: LogError) -> int:
+    """Message and exit code for a file that cannot be read."""
+    cause = error.__cause__
+    if isinstance(cause, FileNotFoundError):
+        return complain(f"{error}; name a file that exists")
+    if isinstance(cause, OSError):
+        return complain(f"{error}; check the file's permissions and the disk", REFUSED)
+    return complain(f"{error}; name a log that tactiled or another MCAP writer made")
+
+
+def cannot_write(what: object, error: OSError) -> ToolError:
+    """`ToolError` for an output that the system refuses, with the remedy."""
+    if error.errno == errno.EMFILE:
+        remedy = "take fewer topics at a time with --topic"
+        return ToolError(f"cannot write {what}: {error.strerror}; {remedy}", REFUSED)
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    remedy = "make room, or name a place on another disk" if full else "name a place to write to"
+    return ToolError(f"cannot write {what}: {error.strerror or error}; {remedy}", REFUSED)
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Report | None]:
+    """A progress bar in bytes, on a terminal alone (else None); it goes away when done."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    console = Console(stderr=True)
+    columns = (TextColumn(what), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(what)
+        yield lambda done, size: bar.update(task, completed=done, total=size)
+
+
+class PlainConsole(Console):
+    """Prints texts on one line each, as they are: no markup, no emoji, escapes made visible."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print; a text may hold whatever a log does."""
+        safe = (Text(shown(each)) if isinstance(each, str) else each for each in objects)
+        super().print(*safe, **options)
+
+
+def plain_console() -> Console:
+    """Standard output; wide where it is not a terminal, and texts of a log safe to be seen."""
+    width = None if sys.stdout.isatty() else PLAIN_WIDTH
+    return PlainConsole(width=width, soft_wrap=True, highlight=False, markup=False, emoji=False)
+
+
+def clock_text(wall_ns: int) -> str:
+    """UTC time with milliseconds; plain nanoseconds where no calendar goes that far."""
+    try:
+        moment = datetime.fromtimestamp(wall_ns / NS_PER_S, UTC)
+    except (OverflowError, ValueError, OSError):
+        return f"{wall_ns} ns"
+    return moment.strftime("%Y-%m-%d %H:%M:%S.") + f"{wall_ns // 1_000_000 % 1000:03d}Z"
+
+
+def seconds_text(ns: int) -> str:
+    """Duration."""
+    return f"{ns / NS_PER_S:.3f} s"
+
+
+def bytes_text(count: int) -> str:
+    """Size, in powers of 1000."""
+    if count < 1000:
+        return f"{count} B"
+    power = min(int(math.log10(count) / 3), 4)
+    return f"{count / 1000**power:.1f} {UNITS[power]}"

@@ -1,0 +1,1 @@
+"""Running rigs: status, tare, health, keys, service units."""

@@ -1,0 +1,188 @@
+"""``tactile health``: whether a rig is well, in one line and an exit status, for monitoring."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from tactile_core.options import BusTable, add_bus, bus_config, finite_above_zero
+
+if TYPE_CHECKING:
+    import zenoh
+
+HEALTHY, DEGRADED, USAGE, NOBODY, FAILED = range(5)
+"""Exit status: all well; to be looked at; bad argument; nobody answers; something has failed."""
+
+WORDS = {HEALTHY: "OK", DEGRADED: "WARNING", FAILED: "CRITICAL", NOBODY: "NOBODY"}
+
+LATE_S = 0.010
+"""s of the control loop's lateness (99.9 %) that is too much: a whole cycle."""
+
+KINDS = ("tactile", "reach", "arm")
+CALLED = {"tactile": "board", "reach": "reach", "arm": "arm"}
+
+
+@dataclass
+class Part:
+    """One board, reach or arm: ``level`` is an exit status, ``problems`` say why."""
+
+    kind: str
+    name: str
+    level: int = HEALTHY
+    state: str = ""
+    problems: list[str] = field(default_factory=list)
+
+    def add(self, level: int, problem: str) -> None:
+        """Something is not as it should be."""
+        self.level = max(self.level, level)
+        self.problems.append(problem)
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``health`` to the umbrella command."""
+    parser = subparsers.add_parser(
+        "health",
+        help="say in one line whether a rig is well",
+        description="Asks every board, reach and arm on the bus how it is. Exit: 0 all well; 1 to "
+        "be looked at (an alarm, features not valid, a late loop); 2 bad argument; 3 nobody "
+        "answers, or the bus cannot be joined; 4 failed (a board silent or refused, a log that is "
+        "not written, one that was named and is not there).",
+    )
+    for kind in KINDS:
+        parser.add_argument(
+            f"--{CALLED[kind]}",
+            action="append",
+            default=[],
+            metavar="NAME",
+            help=f"{CALLED[kind]} that must be there; may be repeated (default: those that are)",
+        )
+    parser.add_argument(
+        "--timeout",
+        type=lambda text: finite_above_zero(text, "s"),
+        default=2.0,
+        metavar="S",
+        help="how long to wait for answers (s; default %(default)g)",
+    )
+    parser.add_argument("--json", action="store_true", help="print all of it as JSON")
+    add_bus(parser, "tool")
+    parser.set_defaults(func=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Ask and tell; the exit status says how it is."""
+    from tactile_core.bus.session import BusError, close_session, open_session
+
+    try:
+        session = open_session(bus_config(options, BusTable(), "tool"))
+    except BusError as error:
+        print(f"tactile health: {error}", file=sys.stderr)
+        return NOBODY
+    try:
+        wanted = {kind: list(getattr(options, CALLED[kind])) for kind in KINDS}
+        parts = look(session, wanted, options.timeout)
+    finally:
+        close_session(session)
+    level = max((part.level for part in parts), default=NOBODY)
+    if options.json:
+        print(json.dumps({"level": WORDS[level], "parts": [_shown(p) for p in parts]}))
+    else:
+        print(line(level, parts))
+    return level
+
+
+def line(level: int, parts: list[Part]) -> str:
+    """All of it in one line: what is wrong first."""
+    if not parts:
+        return f"{WORDS[level]}: no board, reach or arm answers on this bus"
+    wrong = [f"{p.kind} {p.name}: {'; '.join(p.problems)}" for p in parts if p.problems]
+    well = [f"{p.kind} {p.name} {p.state}".strip() for p in parts if not p.problems]
+    return f"{WORDS[level]}: " + " | ".join([*wrong, *well])
+
+
+def look(session: zenoh.Session, wanted: dict[str, list[str]], timeout: float) -> list[Part]:
+    """Ask whoever is there, and whoever is wanted; in a fixed order."""
+    from tactile_core.bus.services import ServiceError, call
+    from tactile_core.bus.topics import service_key
+
+    parts = []
+    for kind in KINDS:
+        names = dict.fromkeys(wanted[kind])
+        if not any(wanted.values()):
+            names = dict.fromkeys(_alive(session, kind, timeout))
+        for name in names:
+            part = Part(CALLED[kind], name)
+            parts.append(part)
+            try:
+                status = call(session, service_key(name, "status", kind), timeout=timeout)
+            except (ServiceError, ValueError) as error:
+                part.add(FAILED, str(error))
+                continue
+            JUDGES[kind](part, status if isinstance(status, dict) else {})
+    return parts
+
+
+def _alive(session: zenoh.Session, kind: str, timeout: float) -> list[str]:
+    """Names that have a token; links take a moment to come about, so it is asked again."""
+    import time
+
+    key, found = f"{kind}/*/alive", set()
+    deadline = time.monotonic() + min(timeout, 1.0)
+    while (left := deadline - time.monotonic()) > 0:
+        for reply in session.liveliness().get(key, timeout=left):
+            if reply.ok is not None:
+                found.add(str(reply.ok.key_expr).split("/")[1])
+        if found:
+            break
+        time.sleep(0.05)
+    return sorted(found)
+
+
+def _judge_board(part: Part, status: dict[str, Any]) -> None:
+    state = str(status.get("state", "unknown"))
+    part.state = f"{state} {status.get('rate_hz', 0):g} Hz"
+    if state in ("silent", "unplugged", "refused"):
+        part.add(FAILED, str(status.get("refused") or state))
+    elif state != "streaming":
+        part.add(DEGRADED, state)
+    elif not status.get("features_valid", False):
+        reasons = ", ".join(map(str, status.get("reasons", ()))) or "no reason given"
+        part.add(DEGRADED, f"features not valid ({reasons})")
+    for reason, count in (status.get("unhealthy_taxels") or {}).items():
+        part.add(DEGRADED, f"{count} taxels {reason}")
+    _judge_common(part, status)
+
+
+def _judge_reach(part: Part, status: dict[str, Any]) -> None:
+    part.state = str(status.get("state", "unknown"))
+    if status.get("armed") is False:
+        part.state += " disarmed"
+    late = (status.get("lateness_s") or {}).get("p99.9", 0.0)
+    if late > LATE_S:
+        part.add(DEGRADED, f"control loop {late * 1e3:.0f} ms late (99.9 %)")
+    _judge_common(part, status)
+
+
+def _judge_arm(part: Part, status: dict[str, Any]) -> None:
+    part.state = str(status.get("mode", "unknown"))
+    if part.state == "fault":
+        part.add(FAILED, "fault")
+    elif part.state == "estop":
+        part.add(DEGRADED, "emergency stop")
+
+
+def _judge_common(part: Part, status: dict[str, Any]) -> None:
+    for alarm in status.get("alarms") or ():
+        part.add(DEGRADED, str(alarm))
+    log = status.get("log")
+    if isinstance(log, dict) and log.get("state") not in ("recording", None):
+        part.add(FAILED, f"log {log['state']} {log.get('last_error', '')}".strip())
+
+
+JUDGES = {"tactile": _judge_board, "reach": _judge_reach, "arm": _judge_arm}
+
+
+def _shown(part: Part) -> dict[str, Any]:
+    return asdict(part) | {"level": WORDS[part.level]}

@@ -1,0 +1,161 @@
+"""``tactile status``: how the boards of a running tactiled do."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import textwrap
+from collections.abc import Mapping
+from typing import Any
+
+from tactile_core.bus.services import ServiceError, call
+from tactile_core.bus.topics import service_key
+from tactile_tools.operate import boards
+
+INDENT = 13
+"""Columns before what is said of each matter."""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``status`` to the umbrella command."""
+    parser = subparsers.add_parser(
+        "status",
+        help="how the boards of a running tactiled do",
+        description="Says of each board what it feels, whether that can be relied on and if not "
+        "why, its rest, rate, clock, losses, taxels, calibration and log.",
+        epilog="exit status: 0 told; 2 no such board; 3 no tactiled.",
+    )
+    boards.add_board(parser, "(default: all)")
+    parser.add_argument(
+        "--json", action="store_true", help="everything tactiled knows, an object by board"
+    )
+    parser.set_defaults(func=boards.run("status", status))
+
+
+def status(options: argparse.Namespace) -> None:
+    """Print what tactiled says of one board, or of all."""
+    with boards.bus(options) as session:
+        names = boards.find(session, options)
+        if options.board is not None:
+            names = [boards.choose(options.board, names)]
+        told: dict[str, Any] = {}
+        for name in names:
+            try:
+                told[name] = call(session, service_key(name, "status"), timeout=boards.STATUS_S)
+            except ServiceError as error:
+                told[name] = {"state": "unknown", "reasons": [str(error)]}
+    if options.json:
+        print(json.dumps(told, indent=2, ensure_ascii=False))
+        return
+    width = shutil.get_terminal_size().columns
+    for name, values in told.items():
+        print("\n".join(describe(name, values, width)))
+
+
+def describe(name: str, values: Mapping[str, Any], width: int) -> list[str]:
+    """What ``tactile status`` says of one board, in lines of at most ``width`` columns."""
+    board = " ".join(str(values[k]) for k in ("model", "serial_number") if values.get(k))
+    port = f" on {values['port']}" if values.get("port") else ""
+    out = _wrap(f"{name}: {values.get('state', 'unknown')}", f"{board}{port}".strip(), width)
+    for label, text in matters(values):
+        if text:
+            out += _wrap(f"  {label}", text, width)
+    return out
+
+
+def matters(values: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Label and text of each thing to say; empty texts where there is nothing."""
+    reasons = "; ".join(str(reason) for reason in values.get("reasons", ()))
+    felt = _force(values)
+    valid = values.get("features_valid")
+    drops: Mapping[str, int] = values.get("drops", {})
+    listed = ", ".join(f"{n} {reason}" for reason, n in sorted(drops.items(), key=lambda i: -i[1]))
+    sick: Mapping[str, int] = values.get("unhealthy_taxels", {})
+    taxels = ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in sick.items())
+    return [
+        ("refused", str(values.get("refused", ""))),
+        ("force", felt if valid else ""),
+        ("not valid" if valid is False or valid is None else "but", reasons),
+        ("rest", _rest(values)),
+        ("rate", _rate(values)),
+        ("clock", _clock(values)),
+        ("dropped", f"{sum(drops.values())}: {listed}" if drops else "0"),
+        ("taxels", f"masked: {taxels}" if taxels else ""),
+        ("calibration", _calibration(values.get("calibration") or {})),
+        ("log", _log(values.get("log"))),
+    ]
+
+
+def _force(values: Mapping[str, Any]) -> str:
+    whole, peak = values.get("normal_force_n"), values.get("peak_force_n")
+    if whole is None or peak is None:
+        return ""
+    bound = values.get("normal_force_bound_n")
+    within = "" if bound is None else f" ± {bound:.2f}"
+    return f"{whole:.2f}{within} N, of it {peak:.2f} N on the taxel pressed most"
+
+
+def _rest(values: Mapping[str, Any]) -> str:
+    rest = values.get("rest")
+    if isinstance(rest, Mapping):
+        rest = "; ".join(str(v) for v in rest.values() if v not in (None, ""))
+    if rest:
+        return str(rest)
+    return "taring" if values.get("taring") else ""
+
+
+def _rate(values: Mapping[str, Any]) -> str:
+    if not values.get("rate_hz"):
+        return ""
+    text = f"{values['rate_hz']:.3g} Hz"
+    half, most = values.get("latency_p50_s"), values.get("latency_p99_s")
+    if half is not None and most is not None:
+        text += f", features {half * 1e3:.1f} ms after the last byte (99 %: {most * 1e3:.1f} ms)"
+    return text
+
+
+def _clock(values: Mapping[str, Any]) -> str:
+    if values.get("clock_trouble"):
+        return f"cannot be used: {values['clock_trouble']}"
+    error = values.get("clock_uncertainty_s")
+    if error is None:
+        return ""
+    text = f"instants known to ± {error * 1e3:.2g} ms"
+    off = values.get("clock_rate_error")
+    if off is not None:
+        text += f", the board's own {abs(off):.2%} {'fast' if off > 0 else 'slow'}"
+    return text
+
+
+def _calibration(used: Mapping[str, Any]) -> str:
+    if not used:
+        return ""
+    if used.get("nominal"):
+        return "none: forces are nominal, right to about a factor of two"
+    return str(used.get("file") or used.get("hash", ""))
+
+
+def _log(log: Mapping[str, Any] | None) -> str:
+    if log is None:
+        return ""
+    text = f"{log['path']}, {log['bytes'] / 1e6:.1f} MB"
+    if log["state"] != "recording":
+        text += f", {log['state']} {log['last_error']}".rstrip()
+    dropped = sum(log["drops"].values())
+    return text + (f", {dropped} messages dropped" if dropped else "")
+
+
+def _wrap(label: str, text: str, width: int) -> list[str]:
+    """``text`` beside its label, broken between words only."""
+    head = f"{label:{INDENT}} "
+    if len(label) > INDENT:
+        head = f"{label}  "
+    return textwrap.wrap(
+        text,
+        max(width, 2 * INDENT),
+        initial_indent=head,
+        subsequent_indent=" " * (INDENT + 1),
+        break_long_words=False,
+        break_on_hyphens=False,
+    ) or [label]

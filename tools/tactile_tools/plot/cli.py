@@ -1,0 +1,200 @@
+"""``tactile plot``: what a skin felt and how a reach went, from a log, as a picture."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tactile_tools.log.sources import find_series
+from tactile_tools.log.terminal import ToolError, progress
+
+if TYPE_CHECKING:
+    from tactile_tools.plot.series import BoardSeries
+
+WHATS = ("reach", "taxels", "forces", "field", "timing")
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``plot`` to the umbrella command."""
+    parser = subparsers.add_parser(
+        "plot",
+        help="draw a reach, taxel maps, forces, the field removed or the timing of a log",
+        description="Draw a log. reach: the cupboard from above and what happened; taxels: maps of "
+        "each side at the strongest moments (circles: normal force, arrows: shear); forces: "
+        "features and events over time; field: what compensation removed; timing: clock and "
+        "latency. No display is needed.",
+    )
+    parser.add_argument(
+        "files",
+        nargs="+",
+        type=Path,
+        metavar="FILE",
+        help="MCAP log, whole or cut off; a folder; or the name that the files of a log share",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="PICTURE", help="default: FILE with .png, or with --format"
+    )
+    parser.add_argument(
+        "--what",
+        choices=WHATS,
+        help="default: the reach if the log holds one, else an overview of the skin",
+    )
+    parser.add_argument("--name", help="board to draw (default: the one with the most taxels)")
+    parser.add_argument(
+        "--reach",
+        type=int,
+        metavar="N",
+        help="which of several reaches to draw, in the order they began (default: the last)",
+    )
+    parser.add_argument("--arm", help="arm of the reach (default: the one heard most)")
+    parser.add_argument(
+        "--size",
+        choices=("screen", "page", "column"),
+        default="screen",
+        help="how wide: for a screen (default), a paper's page (180 mm) or its column (89 mm)",
+    )
+    parser.add_argument("--format", choices=("png", "pdf", "svg"), help="default: by --out, or png")
+    parser.add_argument(
+        "--dpi",
+        type=int,
+        metavar="N",
+        help="dots an inch, 30 to 600 (default: 100 for a screen, 300 for a paper)",
+    )
+    parser.add_argument(
+        "--at",
+        type=float,
+        action="append",
+        metavar="S",
+        help="moment of the taxel maps, s since the first cycle (default: the strongest); may be "
+        "repeated",
+    )
+    parser.set_defaults(func=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Draw; 0 when the picture was written, 2 for a bad argument, 3 for an unreadable log."""
+    from tactile_core.log.records import LogError
+    from tactile_tools.plot.series import LogUnreadableError
+
+    try:
+        first = find_series(options.files)[0].paths[0]
+        out = options.out or first.with_suffix(f".{options.format or 'png'}")
+        _check_output(out, options)
+        remark = _draw(options, out)
+    except ToolError as error:
+        return _complain(str(error), error.code)
+    except LogError as error:
+        missing = isinstance(error.__cause__, FileNotFoundError)
+        return _complain(str(error), 2 if missing else 3)
+    except LogUnreadableError as error:
+        return _complain(str(error), 3)
+    except OSError as error:
+        return _complain(f"cannot write {out}: {error.strerror}; name another with --out", 3)
+    if remark:
+        print(remark)
+    print(f"wrote {out}")
+    return 0
+
+
+def _complain(text: str, code: int) -> int:
+    print(f"tactile plot: {text}", file=sys.stderr)
+    return code
+
+
+def _check_output(out: Path, options: argparse.Namespace) -> None:
+    """Refuse what matplotlib could not write, before the log is read."""
+    from tactile_tools.plot.look import LEAST_DPI, MOST_DPI
+
+    allowed = (".png", ".pdf", ".svg", ".jpg", ".jpeg")
+    suffix = out.suffix.lower()
+    if suffix not in allowed:
+        raise ToolError(f"--out {out}; allowed: a file that ends in {', '.join(allowed)}")
+    if options.format is not None and suffix != f".{options.format}":
+        raise ToolError(f"--format {options.format} and --out {out} say two things; give one")
+    if options.dpi is not None and not LEAST_DPI <= options.dpi <= MOST_DPI:
+        raise ToolError(f"--dpi {options.dpi}; allowed: {LEAST_DPI} to {MOST_DPI}")
+    if out.is_dir() or any(out == source for source in options.files):
+        raise ToolError(f"--out {out} is a folder or the log itself: name another file")
+    if not out.parent.is_dir():
+        raise ToolError(f"--out {out}: there is no folder {out.parent}")
+
+
+def _draw(options: argparse.Namespace, out: Path) -> str:
+    """Draw; what there would have been to choose from, in words, "" where there was nothing."""
+    of_reach = options.reach is not None or options.arm is not None
+    if of_reach and options.what not in (None, "reach"):
+        raise ToolError(f"--reach and --arm are of a reach: leave them out with {options.what}")
+    if options.what in (None, "reach"):
+        remark = _draw_reach(options, out, must=of_reach or options.what == "reach")
+        if remark is not None:
+            return remark
+    return _draw_skin(options, out)
+
+
+def _draw_skin(options: argparse.Namespace, out: Path) -> str:
+    from tactile_tools.plot.curves import draw_field, draw_forces, draw_timing
+    from tactile_tools.plot.look import LOOKS, of_several
+    from tactile_tools.plot.series import read_boards
+    from tactile_tools.plot.skin import draw, draw_taxels
+
+    with progress("reading") as report:
+        boards = read_boards(options.files, report)
+    held = sorted(boards)
+    if options.name is not None and options.name not in boards:
+        raise ToolError(f"no board {options.name!r} in the log; it holds {', '.join(held)}")
+    name = options.name or max(held, key=lambda n: boards[n].force[0].size)
+    board: BoardSeries = boards[name]
+    for at in options.at or ():
+        if not board.first - 1.0 <= at <= board.last + 1.0:
+            raise ToolError(
+                f"--at {at:g}; the log of {name} goes from {board.first:.2f} to {board.last:.2f} s"
+            )
+    look = LOOKS[options.size]
+    title = of_several("board", name, held) if len(held) > 1 else ""
+    style: dict[str, Any] = {"look": look, "dpi": options.dpi, "title": title}
+    drawers: dict[str, Callable[[], Any]] = {
+        "taxels": lambda: draw_taxels(board, out, at=options.at, **style),
+        "forces": lambda: draw_forces(board, out, **style),
+        "field": lambda: draw_field(board, out, **style),
+        "timing": lambda: draw_timing(board, out, **style),
+    }
+    if options.what in drawers:
+        drawers[options.what]()
+    else:
+        draw(board, out, at=options.at[0] if options.at else None, **style)
+    if len(held) == 1 or options.name is not None:
+        return ""
+    return f"drawn: {of_several('board', name, held, most=len(held))}; choose with --name"
+
+
+def _draw_reach(options: argparse.Namespace, out: Path, *, must: bool) -> str | None:
+    """Draw a reach; None when the log holds none, which is an error only if it must."""
+    from tactile_tools.plot.look import LOOKS, of_several
+    from tactile_tools.plot.reach import draw
+    from tactile_tools.plot.reach_series import listed, read_reach
+    from tactile_tools.plot.series import LogUnreadableError
+
+    try:
+        reach = read_reach(options.files, options.reach, options.name, options.arm)
+    except LogUnreadableError:
+        if must:
+            raise
+        return None
+    draw(reach, out, LOOKS[options.size], options.dpi)
+    said = []
+    if len(reach.all_reaches) > 1 and options.reach is None:
+        said.append(
+            f"drawn: reach {reach.number} of {len(reach.all_reaches)}; choose with --reach\n"
+            + listed(reach.all_reaches)
+        )
+    for what, flag, asked, name, held in (
+        ("board", "--name", options.name, reach.board_name, reach.boards),
+        ("arm", "--arm", options.arm, reach.arm_name, reach.arms),
+    ):
+        if len(held) > 1 and asked is None:
+            names = sorted(held)
+            said.append(f"drawn: {of_several(what, name, names, len(names))}; choose with {flag}")
+    return "\n".join(said)

@@ -1,0 +1,1 @@
+"""Reaches in lockstep on virtual time, and as real processes."""

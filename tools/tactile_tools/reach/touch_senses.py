@@ -1,0 +1,168 @@
+"""Two depths of touch for a trial in lockstep: exact contacts, or the whole chain of taxels."""
+
+from __future__ import annotations
+
+import math
+from functools import cache, lru_cache
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reachd.interfaces import Touch
+from sim_device.board.catalogue import build_skin, factory_calibration, identity
+from sim_device.board.firmware import SerialBoard
+from sim_device.skin.environment import rotation_about
+from sim_device.world.base import World
+from sim_device.world.touch import on_skin
+from tactile_core.geometry import Side, finger
+from tactile_core.types import Instant, after
+from tactiled.blocks import Chunk, Cycle
+from tactiled.boards.events import Event, Identity, Refusal, Refused, Sampled
+from tactiled.boards.line import SerialLine
+from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
+
+Float = NDArray[np.float64]
+
+UP = np.array([0.0, 0.0, 1.0])
+
+CELL_M = 1e-4
+"""m; fifty times finer than taxels lie apart. A search of the nearest costs more than a trial's
+whole control cycle, and a finger is touched in few of these cells."""
+
+SETTLE_S = 1.0
+"""s that a board is given to be identified, its clock to be mapped and its first fits made."""
+
+
+class Sense(Protocol):
+    """Where a trial's touch comes from."""
+
+    def settle(self, world: World, now: Instant) -> Instant:
+        """Start up before the trial; returns when it is done. The world stands still."""
+        ...
+
+    def feel(self, world: World, now: Instant) -> Touch | None:
+        """Return the newest touch at ``now``; None before the first."""
+        ...
+
+    @property
+    def cycle(self) -> Cycle | None:
+        """The cycle behind the newest touch; None where contacts are felt as they are."""
+        ...
+
+
+class ContactSense:
+    """The engine's contacts as they are, at every control cycle, in the features' own type."""
+
+    cycle: Cycle | None = None
+
+    def settle(self, world: World, now: Instant) -> Instant:
+        """There is nothing to start."""
+        del world
+        return now
+
+    def feel(self, world: World, now: Instant) -> Touch:
+        """Touch from the contacts of the last physics step."""
+        peak, tip, total = None, 0.0, 0.0
+        greatest, peak_side = -1.0, Side.NONE
+        for contact in world.contacts():
+            force, side = contact.normal_force, side_of(contact.x, contact.y)
+            total += force
+            if side is Side.TIP:
+                tip += force
+            if force > greatest:
+                peak, greatest, peak_side = contact, force, side
+        if peak is None:
+            return Touch(now, now, True, 0.0, Side.NONE, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        # The engine's own contacts are exact.
+        return Touch(now, now, True, greatest, peak_side, peak.x, peak.y, total, tip, 0.0, 0.0)
+
+
+def side_of(x: float, y: float) -> Side:
+    """Part of the skin that a contact at (x, y) m in ``ee`` is felt by: that of the nearest taxel.
+
+    Places are told apart to `CELL_M`.
+    """
+    return _side_of_cell(math.floor(x / CELL_M), math.floor(y / CELL_M))
+
+
+@lru_cache(maxsize=1 << 16)
+def _side_of_cell(column: int, row: int) -> Side:
+    """Part of the skin that the middle of a cell belongs to."""
+    places, sides = _taxels()
+    middle = ((column + 0.5) * CELL_M, (row + 0.5) * CELL_M)
+    return sides[int(((places - middle) ** 2).sum(axis=1).argmin())]
+
+
+@cache
+def _taxels() -> tuple[Float, list[Side]]:
+    """Places (n, 2) m in ``ee`` and sides of the finger's taxels."""
+    skin = finger()
+    places = np.concatenate([a.position[:, :2] for a in skin.arrays])
+    return places, [a.side for a in skin.arrays for _ in range(a.taxels)]
+
+
+class TaxelSense:
+    """Contacts → elastomer → magnetometers → bytes → decoder → pipeline, as in the daemon."""
+
+    def __init__(self, seed: int, rate: float = 25.0, settings: PipelineSettings | None = None):
+        """``seed``: which board, its tolerances and noise. ``rate``: Hz (the paper has 25)."""
+        self._board = SerialBoard(build_skin("finger", seed), identity("finger", seed), rate=rate)
+        self._pipeline = BoardPipeline(factory_calibration("finger", seed), settings)
+        self._line = SerialLine("lockstep", self._admit, "tactile", rate)
+        self._touch: Touch | None = None
+        self.cycle: Cycle | None = None
+
+    @staticmethod
+    def _admit(node: int, identity: Identity) -> Refusal | None:
+        """Every board of ours is welcome."""
+        del node, identity
+        return None
+
+    def settle(self, world: World, now: Instant) -> Instant:
+        """Identify the board, map its clock, see the first cycles; the finger touches nothing."""
+        self._line.connect(now)
+        end = after(now, SETTLE_S)
+        while now < end:
+            now = after(now, 0.01)
+            self.feel(world, now)
+        return now
+
+    def feel(self, world: World, now: Instant) -> Touch | None:
+        """Pass the bytes there are both ways; the newest touch, if a cycle was completed."""
+        board = self._board
+        # As functions: a board samples four times more rarely than it is asked for bytes.
+        board.contacts = lambda _: on_skin(world.contacts(), world.scene)
+        board.attitude = lambda _: rotation_about(UP, world.finger().heading)
+        events: list[Event] = [e.event for e in self._line.tick(now)]
+        for payload in self._line.outgoing():
+            if isinstance(payload, bytes):
+                board.receive(payload, now)
+        if data := board.tick(now):
+            events += [e.event for e in self._line.receive(Chunk(now, data))]
+        for event in events:
+            if isinstance(event, Sampled):
+                for cycle in self._pipeline.feed(event.block):
+                    self._touch, self.cycle = touch_of(cycle), cycle
+            elif isinstance(event, Refused):
+                raise RuntimeError(f"the simulated board was refused: {event}")
+        return self._touch
+
+
+def touch_of(cycle: Cycle) -> Touch:
+    """Return what a strategy sees of a cycle; the same fields as go over the bus."""
+    features = cycle.features
+    x, y = (float(v) for v in features.peak_position[:2])
+    return Touch(
+        captured=cycle.captured,
+        received=cycle.received,
+        valid=features.valid and math.isfinite(features.peak_force),
+        peak_force=features.peak_force,
+        peak_side=features.peak_side,
+        peak_x=x,
+        peak_y=y,
+        total_force=features.normal_force,
+        tip_force=features.tip_force,
+        peak_force_bound=features.peak_force_bound,
+        normal_force_bound=features.normal_force_bound,
+    )
