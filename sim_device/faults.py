@@ -1,14 +1,13 @@
-"""What is to go wrong, when and how often: a seeded plan, from text or from a TOML table."""
+"""What is to go wrong, when and how often: a seeded plan, from text."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from sim_device.scripts import ScriptError
+from tactile_core.config import ConfigError
 
 DELAY_S = 0.02
 """s that a delayed frame holds up the line unless told: two samples at 100 Hz."""
@@ -108,30 +107,11 @@ class FaultPlan:
         ``silence@Ts+Ds``, ``busoff@Ts+Ds``, ``copy@Ts+Ds``, ``reset@Ts``; ``skinoff@Ts+Ds``,
         ``newskin@Ts``, ``gain=FACTOR@Ts+Ds``, ``leap=MICROTESLA@Ts+Ds``; a `TaxelFaultKind`
         such as ``zeros=ARRAY:TAXEL`` (``*``: every taxel) with an optional ``:SHARE`` of its
-        readings and an optional ``@Ts`` or ``@Ts+Ds`` (``nan`` is ``failed``). ScriptError names
+        readings and an optional ``@Ts`` or ``@Ts+Ds`` (``nan`` is ``failed``). ConfigError names
         the entry and what is allowed.
         """
         entries = [e.strip() for e in text.split(",")]
-        return _collect([(e, f"fault {e!r}") for e in entries if e])
-
-    @classmethod
-    def from_table(cls, table: Mapping[str, object], where: str) -> FaultPlan:
-        """Plan from a TOML table that holds the words of `parse` by their names.
-
-        ``flip = 1e-5``, ``delay = "0.01:0.02s"``, ``silence = ["5s+2s"]``, ``reset = "8s"``,
-        ``stuck = ["left:3@2s"]``. ``where``: file and table, for messages.
-        """
-        entries = []
-        for key, value in table.items():
-            for item in value if isinstance(value, list) else [value]:
-                if isinstance(item, bool) or not isinstance(item, (int, float, str)):
-                    raise ScriptError(
-                        f"{where}: {key}: given {item!r}; allowed: a number, a text such as "
-                        f"'5s+2s', or a list of these"
-                    )
-                mark = "@" if key in TIMED else "="
-                entries.append((f"{key}{mark}{item}", f"{where}: {key}: {item!r}"))
-        return _collect(entries)
+        return _collect([e for e in entries if e])
 
     @property
     def touches_wire(self) -> bool:
@@ -172,40 +152,40 @@ _FORMS = (
 )
 
 
-def _collect(entries: list[tuple[str, str]]) -> FaultPlan:
-    """Plan of ``(entry, how to call it in a message)``."""
+def _collect(entries: list[str]) -> FaultPlan:
     figures: dict[str, float] = {}
     seed: int | None = None
     windows: dict[str, list[Window]] = {name: [] for name in TIMED}
     sized: dict[str, list[tuple[float, Window]]] = {name: [] for name in SIZED}
     taxels: list[TaxelFault] = []
-    for entry, label in entries:
+    for entry in entries:
+        label = f"fault {entry!r}"
         match = _ENTRY.fullmatch(entry)
         if match is None:
-            raise ScriptError(f"{label} is not understood; {_FORMS}")
+            raise ConfigError(f"{label} is not understood; {_FORMS}")
         name, mark, rest = match["name"], match["mark"], match["rest"].strip()
         if name in TIMED and mark == "@":
             windows[name].append(
                 _window(rest, label, needs_end=name not in STARTING, may_end=name not in STARTING)
             )
         elif mark != "=":
-            raise ScriptError(f"{label} is not understood; {_FORMS}")
+            raise ConfigError(f"{label} is not understood; {_FORMS}")
         elif name in _TAXEL_FAULTS:
             taxels.append(_taxel_fault(_TAXEL_FAULTS[name], rest, label))
         elif name in SIZED:
             sized[name].append(_sized(rest, label))
         elif name in figures or (name == "seed" and seed is not None):
-            raise ScriptError(f"{label}: {name} is given twice; give it once")
+            raise ConfigError(f"{label}: {name} is given twice; give it once")
         elif name == "seed":
             if not rest.isdecimal():
-                raise ScriptError(f"{label}: allowed: a whole number of at least 0")
+                raise ConfigError(f"{label}: allowed: a whole number of at least 0")
             seed = int(rest)
         elif name == "delay":
             figures |= _delay(rest, label)
         elif name in PROBABILITIES:
             figures[name] = _probability(rest, label)
         else:
-            raise ScriptError(f"{label} is not understood; {_FORMS}")
+            raise ConfigError(f"{label} is not understood; {_FORMS}")
     chance = {name: figures.get(name, 0.0) for name in PROBABILITIES}
     return FaultPlan(
         seed=seed or 0,
@@ -236,14 +216,14 @@ def _probability(text: str, label: str) -> float:
     except ValueError:
         value = math.nan
     if not 0 <= value <= 1:
-        raise ScriptError(f"{label}: allowed: a probability from 0 to 1")
+        raise ConfigError(f"{label}: allowed: a probability from 0 to 1")
     return value
 
 
 def _delay(text: str, label: str) -> dict[str, float]:
     match = _DELAY.fullmatch(text)
     if match is None:
-        raise ScriptError(f"{label}: allowed: PROBABILITY:SECONDSs, such as 0.01:0.02s")
+        raise ConfigError(f"{label}: allowed: PROBABILITY:SECONDSs, such as 0.01:0.02s")
     plan = {"delay": _probability(match["p"], label)}
     if match["s"]:
         plan["delay_s"] = float(match["s"])
@@ -257,7 +237,7 @@ def _sized(text: str, label: str) -> tuple[float, Window]:
     except ValueError:
         value = math.nan
     if not mark or not 0 < value < 1e5:
-        raise ScriptError(
+        raise ConfigError(
             f"{label}: allowed: a figure above 0, then @Ts or @Ts+Ds, such as gain=1.67@4s (factor "
             "of all counts) or leap=2000@4s+2s (µT)"
         )
@@ -268,20 +248,20 @@ def _window(text: str, label: str, needs_end: bool, may_end: bool) -> Window:
     match = _WINDOW.fullmatch(text)
     if match is None or (needs_end and not match["for"]) or (match["for"] and not may_end):
         form = "Ts+Ds" if needs_end else "Ts or Ts+Ds" if may_end else "Ts"
-        raise ScriptError(f"{label}: allowed: {form}, seconds after power-on, such as 5s+2s or 5s")
+        raise ConfigError(f"{label}: allowed: {form}, seconds after power-on, such as 5s+2s or 5s")
     return Window(float(match["at"]), float(match["for"]) if match["for"] else math.inf)
 
 
 def _taxel_fault(kind: TaxelFaultKind, text: str, label: str) -> TaxelFault:
     match = _TAXEL.fullmatch(text)
     if match is None:
-        raise ScriptError(
+        raise ConfigError(
             f"{label}: allowed: ARRAY:TAXEL (* for all), then :SHARE of its readings, then @Ts or "
             "@Ts+Ds, such as left:3@2s+5s or skin:*:0.05@4s"
         )
     share = float(match["share"]) if match["share"] else 1.0
     if not 0 < share <= 1:
-        raise ScriptError(f"{label}: allowed: a SHARE above 0 and up to 1")
+        raise ConfigError(f"{label}: allowed: a SHARE above 0 and up to 1")
     window = (
         _window(match["window"], label, needs_end=False, may_end=True)
         if match["window"]

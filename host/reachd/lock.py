@@ -17,7 +17,7 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
-from tactile_core.toml_text import printable
+from tactile_core.config import printable
 
 RUNTIME_VARIABLE = "TACTILE_RUNTIME_DIR"
 """Environment variable that names another folder for locks: simulations side by side, each with

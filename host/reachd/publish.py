@@ -37,9 +37,9 @@ from tactile_core.bus.topics import (
     find_topic,
     service_key,
 )
+from tactile_core.config import printable
 from tactile_core.log.recorder import Recorder
 from tactile_core.throttle import Throttle
-from tactile_core.toml_text import printable
 from tactile_core.types import Instant, WallClock, monotonic_now
 
 # Everything that is said on the bus about a trial, into the log as it came.

@@ -15,7 +15,6 @@ import zenoh
 
 from reachd.arms.base import Arm, ArmError
 from reachd.control import ControlLoop
-from reachd.fields import SettingError
 from reachd.gate.gate import CONFIRMED_WITHIN
 from reachd.gate.settings import Check
 from reachd.interfaces import Goal
@@ -23,19 +22,19 @@ from reachd.publish import Reporter
 from reachd.strategies.parameter_fields import Parameters
 from tactile_core.bus.services import Service, ServiceError, declare_service
 from tactile_core.bus.topics import service_key
-from tactile_core.toml_text import printable
+from tactile_core.config import ConfigError, printable
 from tactile_core.types import ArmLimits, ArmState, Instant, monotonic_now
 
 # Targets as people give them, checked before anything moves.
 
 
 def parse_target(text: str) -> tuple[float, float]:
-    """``X,Y`` in m in ``cupboard``; SettingError says what was given."""
+    """``X,Y`` in m in ``cupboard``; ConfigError says what was given."""
     parts = text.split(",")
     try:
         x, y = (float(part) for part in parts)
     except ValueError as error:
-        raise SettingError(
+        raise ConfigError(
             f"target {text!r} is not X,Y in metres from the middle of the cupboard's front edge, "
             "such as 0.358,0.03 (x into the cupboard, y left)"
         ) from error
@@ -52,7 +51,7 @@ def make_goal(
 ) -> Goal:
     """Goal of a reach with the set's radius and time limit unless given.
 
-    SettingError for a target where the tip may not go, or a radius or time that is not positive
+    ConfigError for a target where the tip may not go, or a radius or time that is not positive
     and finite.
     """
     goal = Goal(
@@ -63,13 +62,13 @@ def make_goal(
     )
     for name, value, unit in (("radius", goal.radius, "m"), ("time limit", goal.time_limit, "s")):
         if not (math.isfinite(value) and value > 0.0):
-            raise SettingError(f"{name} {value} {unit} is not a finite number above 0")
+            raise ConfigError(f"{name} {value} {unit} is not a finite number above 0")
     if not (math.isfinite(x) and math.isfinite(y)):
-        raise SettingError(f"target {x}, {y} is not finite")
+        raise ConfigError(f"target {x}, {y} is not finite")
     region = parameters.safety.tip_region
     if region.depth(x, y) < 0.0:
         corners = ", ".join(f"({cx:g}, {cy:g})" for cx, cy in region.corners)
-        raise SettingError(
+        raise ConfigError(
             f"target {x:g}, {y:g} m lies outside the region where the tip may go, with corners "
             f"{corners}; change the target or safety.tip_region"
         )
@@ -135,7 +134,7 @@ class OperatorRequests:
     def reach(
         self, x: float, y: float, radius: float | None = None, time_limit: float | None = None
     ) -> Goal:
-        """Begin a trial. `SettingError` for a goal that cannot be.
+        """Begin a trial. `ConfigError` for a goal that cannot be.
 
         Without the log that was asked for none begins; one that is under way when the log fails
         goes on.
@@ -301,5 +300,5 @@ class ReachServices:
     def _granted(self, work: Callable[[], Any]) -> Any:
         try:
             return work()
-        except (RefusedError, SettingError) as error:
+        except (RefusedError, ConfigError) as error:
             raise ServiceError(str(error)) from error

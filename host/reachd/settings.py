@@ -9,26 +9,23 @@ from __future__ import annotations
 import argparse
 import math
 import secrets
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
-from reachd.fields import SettingError
 from reachd.interfaces import Goal
 from reachd.services import make_goal, parse_target
 from reachd.strategies.parameter_fields import Parameters
-from reachd.strategies.parameters import SETS, parameters
+from reachd.strategies.parameters import SETS, ParameterTable, parameters
 from reachd.trial import Pose
 from tactile_core.bus.session import BusConfig
 from tactile_core.bus.topics import NAME
-from tactile_core.config import ConfigError, Duration, Positive, load_toml
+from tactile_core.config import ConfigError, Document, Duration, Metres, unit
 from tactile_core.log.recorder import RecorderSettings
 from tactile_core.options import BusTable, LogTable, bus_config, log_destination
-from tactile_core.toml_lines import key_lines
 
 DEFAULT_STRATEGY = "hybrid_event"
 """The paper's best."""
@@ -45,8 +42,6 @@ DEFAULT_PRIORITY = 20
 SEEDS = 1 << 32
 """A seed that nobody gave is drawn from so many: short enough to be typed again."""
 
-Seed = Annotated[int, Meta(ge=0, le=2**63 - 1, description="a whole number, 0 or more")]
-Priority = Annotated[int, Meta(ge=0, le=98, description="a whole number from 0 (none) to 98")]
 Clock = Literal["same", "remote"]
 
 
@@ -55,34 +50,60 @@ class SettingsError(Exception):
 
 
 class InputsTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[inputs]``. Clocks: "remote" where tactiled, or the arm's driver, is on another machine."""
+    """``[inputs]``: features and arm."""
 
-    board_clock: Clock = "same"
-    arm_clock: Clock = "same"
-    wait_s: Duration = DEFAULT_WAIT
+    board_clock: Annotated[
+        Clock, Meta(description="remote where tactiled is on another machine")
+    ] = "same"
+    arm_clock: Annotated[
+        Clock, Meta(description="remote where the arm's driver is on another machine")
+    ] = "same"
+    wait_s: Annotated[
+        Duration, Meta(description="time for features and arm to come; a first tare takes a few s")
+    ] = DEFAULT_WAIT
 
 
 class LoopTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[loop]``: real-time priority of the control loop where the system grants it."""
+    """``[loop]``: the control loop."""
 
-    priority: Priority = DEFAULT_PRIORITY
+    priority: Annotated[
+        int,
+        Meta(ge=0, le=98, description="real-time priority where the system grants it; 0: none"),
+    ] = DEFAULT_PRIORITY
 
 
 class ConfigFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The whole file. ``home``: x, y in m and heading in degrees of the pivot."""
+    """Configuration of reachd."""
 
-    strategy: str = DEFAULT_STRATEGY
-    set: str = DEFAULT_SET
-    board: str = "board0"
-    arm: str = "arm"
-    name: str = "reach"
-    target: tuple[float, float] | None = None
-    radius: Positive | None = None
-    time_limit: Duration | None = None
-    seed: Seed | None = None
-    home: tuple[float, float, float] | None = None
-    auto_reset: bool = False
-    parameters: dict[str, Any] = {}
+    strategy: Annotated[
+        str, Meta(description="name of a strategy, or module:Class of one of your own")
+    ] = DEFAULT_STRATEGY
+    set: Annotated[str, Meta(description="parameter set: hardware or authors_sim")] = DEFAULT_SET
+    board: Annotated[str, Meta(description="board whose features are followed")] = "board0"
+    arm: Annotated[str, Meta(description="arm that is commanded")] = "arm"
+    name: Annotated[str, Meta(description="of this reachd in keys and logs")] = "reach"
+    target: Annotated[
+        tuple[float, float] | None,
+        unit("m"),
+        Meta(description="x, y in `cupboard` of a first reach; left out: goals come over the bus"),
+    ] = None
+    radius: Annotated[
+        Annotated[Metres, Meta(gt=0)] | None,
+        Meta(description="distance that counts as success; left out: the set's"),
+    ] = None
+    time_limit: Annotated[
+        Duration | None, Meta(description="time the first reach may take; left out: the set's")
+    ] = None
+    seed: Annotated[
+        Annotated[int, Meta(ge=0, le=2**63 - 1)] | None,
+        Meta(description="of the strategy's random draws; left out: a new one is drawn and said"),
+    ] = None
+    home: Annotated[
+        tuple[float, float, float] | None,
+        Meta(description="x, y in m and heading in ° of the pivot, where a reset goes"),
+    ] = None
+    auto_reset: Annotated[bool, Meta(description="go home by itself after every reach")] = False
+    parameters: ParameterTable = ParameterTable()
     inputs: InputsTable = InputsTable()
     loop: LoopTable = LoopTable()
     log: LogTable = LogTable()
@@ -120,11 +141,14 @@ class Settings:
 def make_settings(options: argparse.Namespace) -> Settings:
     """Settings from parsed flags and the file they name; `SettingsError` for anything wrong."""
     path: Path | None = options.config
+    document = Document({})
     try:
-        file = ConfigFile() if path is None else load_toml(path, ConfigFile)
+        if path is not None:
+            document = Document.read(path)
+        file = document.convert(ConfigFile)
+        values = _parameters(options.set or file.set, file.parameters, document)
     except ConfigError as error:
         raise SettingsError(str(error)) from error
-    values = _parameters(options.set or file.set, file.parameters, path)
     goal = _goal(options, file, values)
     serve = goal is None if options.serve is None else options.serve
     if goal is None and not serve:
@@ -163,34 +187,14 @@ def make_settings(options: argparse.Namespace) -> Settings:
     )
 
 
-def _parameters(name: str, overrides: Mapping[str, Any], path: Path | None) -> Parameters:
+def _parameters(name: str, overrides: ParameterTable, document: Document) -> Parameters:
     try:
         return parameters(name, overrides)
-    except SettingError as error:
-        raise SettingsError(_where(name, overrides, path) + str(error)) from error
-
-
-def _where(name: str, overrides: Mapping[str, Any], path: Path | None) -> str:
-    """File and line of the first override that fails by itself, or of their table."""
-    if path is None or name not in SETS or not overrides:
-        return ""
-    lines = key_lines(path.read_text())
-    line = lines.get(("parameters",), 1)
-    gate = overrides.get("safety")
-    alone: list[tuple[tuple[str | int, ...], dict[str, Any]]] = [
-        (("parameters", key), {key: value}) for key, value in overrides.items()
-    ]
-    if isinstance(gate, Mapping):
-        alone = [
-            (("parameters", "safety", key), {"safety": {key: value}}) for key, value in gate.items()
-        ] + alone
-    for keys, one in alone:
-        try:
-            parameters(name, one)
-        except SettingError:
-            line = lines.get(keys, line)
-            break
-    return f"{path}:{line}: parameters: "
+    except ConfigError as error:
+        if name not in SETS or "parameters" not in document.data:
+            raise
+        keys = ("parameters", *error.keys)
+        raise document.error(keys, f"parameters: {error}") from error
 
 
 def _goal(options: argparse.Namespace, file: ConfigFile, values: Parameters) -> Goal | None:
@@ -203,7 +207,7 @@ def _goal(options: argparse.Namespace, file: ConfigFile, values: Parameters) -> 
                 raise SettingsError("--radius and --time-limit go with --target; none is given")
             return None
         return make_goal(*target, values, radius=radius, time_limit=limit)
-    except SettingError as error:
+    except ConfigError as error:
         raise SettingsError(str(error)) from error
 
 

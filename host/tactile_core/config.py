@@ -1,227 +1,386 @@
-"""Configuration from TOML, checked against msgspec structs.
+"""The configuration layer: every TOML file of the project is read, checked and described here.
 
-Every error names the file, the line, what was given and what is allowed. Commands print it and
-exit with 2.
+A schema is a frozen `msgspec.Struct` that forbids unknown fields. The types of its fields carry
+everything there is to say about a key: unit (`Seconds`, `Newtons`, ...), range and meaning
+(`msgspec.Meta`). That one description serves three purposes:
+
+- `load_toml` reads a file in bounded time and memory and converts it,
+- whatever is wrong is refused in one sentence that names file, line, key, what was found and what
+  is allowed (`ConfigError`); commands print it and exit with 2,
+- `describe` lists the keys for the reference in ``docs/configuration.md``.
+
+Frozen dataclasses whose fields are annotated in the same way are checked with `check_fields` when
+they are made, and `table_of` makes the schema of a TOML table that overrides some of their fields.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
+import os
 import re
+import stat
+import sys
+import tomllib
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import MISSING as NO_DEFAULT
+from dataclasses import dataclass, field, fields
 from enum import Enum
+from functools import lru_cache
 from pathlib import Path
-from types import GenericAlias
-from typing import Annotated, Any, Literal, TypeVar, Union
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import msgspec
-from msgspec import Meta
+from msgspec import NODEFAULT, UNSET, Meta, UnsetType
 from msgspec import inspect as types
 
-from tactile_core.toml_lines import Path as KeyPath
-from tactile_core.toml_lines import key_lines
-from tactile_core.toml_text import (
-    SHOWN,
-    TomlError,
-    dotted,
-    leaves,
-    line_of,
-    parse,
-    printable,
-    read_text,
-)
-
 T = TypeVar("T")
+KeyPath = tuple[str | int, ...]
+"""Keys of the tables and indices of the arrays that lead to a value."""
 
-Positive = Annotated[float, Meta(gt=0, description="a finite number above 0")]
-Fraction = Annotated[float, Meta(ge=0, le=1, description="a number from 0 to 1")]
-Duration = Annotated[float, Meta(gt=0, le=1e9, description="seconds, finite and above 0")]
-FlushPeriod = Annotated[float, Meta(gt=0, le=0.5, description="seconds, above 0, at most 0.5")]
-Rate = Annotated[float, Meta(gt=0, le=1e6, description="Hz, finite and above 0")]
-Count = Annotated[int, Meta(gt=0, description="a whole number above 0")]
-Size = Annotated[int, Meta(ge=0, description="a whole number, 0 or more")]
+
+class ConfigError(ValueError):
+    """A configuration, or one value, that is refused; the message says where and why.
+
+    ``keys``: where the value is, as far as whoever raised it knows.
+    """
+
+    def __init__(self, message: str, keys: KeyPath = ()) -> None:
+        super().__init__(message)
+        self.keys = keys
+
+
+# --- Types of fields: unit and range. Narrow them, and say what a key means, with another Meta. ---
+
+
+def unit(name: str) -> Meta:
+    """A unit, for messages and the reference."""
+    return Meta(extra={"unit": name})
+
+
+def allowed_values(words: str) -> Meta:
+    """What is allowed, in words, where the type and its range do not say it well."""
+    return Meta(extra={"allowed": words})
+
+
+Seconds = Annotated[float, unit("s")]
+Hertz = Annotated[float, unit("Hz")]
+Metres = Annotated[float, unit("m")]
+MetresPerSecond = Annotated[float, unit("m/s")]
+MetresPerSecond2 = Annotated[float, unit("m/s²")]
+Radians = Annotated[float, unit("rad")]
+RadiansPerSecond = Annotated[float, unit("rad/s")]
+RadiansPerSecond2 = Annotated[float, unit("rad/s²")]
+Degrees = Annotated[float, unit("°")]
+Newtons = Annotated[float, unit("N")]
+NewtonMetres = Annotated[float, unit("N·m")]
+Millimetres = Annotated[float, unit("mm")]
+Microtesla = Annotated[float, unit("µT")]
+Celsius = Annotated[float, unit("°C")]
+Bytes = Annotated[int, unit("bytes")]
+
+Positive = Annotated[float, Meta(gt=0)]
+Fraction = Annotated[float, Meta(ge=0, le=1)]
+Duration = Annotated[Seconds, Meta(gt=0, le=1e9)]
+Rate = Annotated[Hertz, Meta(gt=0, le=1e6)]
+Count = Annotated[int, Meta(gt=0)]
+Size = Annotated[int, Meta(ge=0)]
+
+MinusInfinity = Annotated[
+    float,
+    Meta(le=sys.float_info.max, extra={"infinite": True, "allowed": "a finite number or -inf"}),
+]
+"""A lower bound that may be left open."""
+
+
+# --- Reading a file in bounded time and memory. `tomllib` parses; what it leaves to its caller ---
+# --- is done here: what is not a plain file, numbers no program can hold, endless nesting. -------
 
 MAX_CONFIG = 1 << 20
 """Bytes of a configuration file: real ones have a few kB, a mistaken path may be a log of GBs."""
 
-LOCATION = re.compile(r" - at `(key in )?\$(.*)`$")
-STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+|\.\.\.)\]")
+MAX_DEPTH = 32
+"""Tables and arrays within one another; the deepest of our own files have five."""
 
+MAX_PARTS = 256
+"""Parts of a dotted key that are worth parsing, which takes time with the square of them."""
 
-class ConfigError(Exception):
-    """A configuration that is refused; the message says where and why."""
+INTEGERS = range(-(1 << 63), 1 << 63)
+"""What TOML asks of every reader; longer ones Python would take, up to 4300 digits."""
+
+SHOWN = 60
+"""Characters that a message quotes."""
+
+TOML_LINE = re.compile(r" \(at line (\d+), column \d+\)$")
+LONG_NUMBER = re.compile(r"[0-9_]{1000,}")
+_PART = r"(?:[A-Za-z0-9_-]++|\"[^\"\n]*+\"|'[^'\n]*+')"
+# Possessive, and begun only where a key may begin: else a line is read again from each part on.
+DEEP_KEY = re.compile(
+    rf"(?:^|[\[{{,])[ \t]*+{_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_PARTS}}}", re.MULTILINE
+)
+
+KINDS = (
+    (stat.S_ISDIR, "Is a directory"),
+    (stat.S_ISFIFO, "it is a pipe, not a file"),
+    (lambda _: True, "it is a device, not a file"),
+)
+"""What is not a plain file, in words."""
 
 
 def load_toml(path: Path | str, kind: type[T]) -> T:
     """Read ``path`` as a ``kind`` (a msgspec struct). `ConfigError` for anything wrong with it."""
-    path = Path(path)
-    try:
-        return parse_toml(read_text(path, MAX_CONFIG), kind, str(path))
-    except TomlError as error:
-        raise ConfigError(str(error)) from error
+    return Document.read(path).convert(kind)
 
 
 def parse_toml(text: str, kind: type[T], name: str = "configuration") -> T:
     """Like `load_toml`, from a text; ``name`` stands for the file in messages."""
-    try:
-        data = parse(text, name)
-    except TomlError as error:
-        raise ConfigError(str(error)) from error
-    lines = key_lines(text)
-    for keys, value in leaves(data):
-        if isinstance(value, float) and not math.isfinite(value):
-            allowed = _allowed(_type_at(types.type_info(kind), keys))
-            raise ConfigError(_message(name, lines, keys, value, allowed))
-    unknown = _unknown(data, types.type_info(kind), ())
-    if unknown is not None:
-        raise ConfigError(_unknown_message(name, lines, *unknown))
-    try:
-        return msgspec.convert(data, kind, strict=True)
-    except msgspec.ValidationError as error:
-        raise ConfigError(_explain(error, name, lines, data, kind)) from error
+    return Document.parse(text, name).convert(kind)
 
 
-def _explain(
-    error: msgspec.ValidationError, name: str, lines: dict[KeyPath, int], data: Any, kind: Any
-) -> str:
-    """Our words for what msgspec found."""
-    text = str(error)
-    match = LOCATION.search(text)
-    reason = LOCATION.sub("", text)
-    keys: KeyPath = ()
-    if match is not None:
-        for key, index in STEP.findall(match.group(2)):
-            keys = (*keys, key or (int(index) if index.isdigit() else index))
-    missing = re.fullmatch(r"Object missing required field `(.+)`", reason)
-    if missing is not None:
-        wanted = _allowed(_type_at(types.type_info(kind), (*keys, missing.group(1))))
-        where = f"{name}:{line_of(lines, keys)}"
-        return f"{where}: {dotted((*keys, missing.group(1)))} is missing; it must be {wanted}"
-    keys = _resolve(keys, data, kind)
-    value = _value_at(data, keys)
-    allowed = _allowed(_type_at(types.type_info(kind), keys))
-    return _message(name, lines, keys, value, allowed or reason)
+def convert(values: Mapping[str, Any], kind: type[T]) -> T:
+    """Like `load_toml`, from plain values that came from no file."""
+    return Document(dict(values)).convert(kind)
 
 
-def _resolve(keys: KeyPath, data: Any, kind: Any) -> KeyPath:
-    """Path of the offending value; msgspec writes ``[...]`` for any key of a table of tables."""
-    if "..." not in keys:
-        return keys
-    at = keys.index("...")
-    table = _value_at(data, keys[:at])
-    for key in table if isinstance(table, dict) else range(len(table)):
-        found = (*keys[:at], key)
-        wanted = _python_type(_type_at(types.type_info(kind), found))
+@dataclass(frozen=True, slots=True, eq=False)
+class Document:
+    """Plain values of a file, and what is needed to say where in it something is wrong.
+
+    ``name`` and ``text``: of the file, empty for values that came from none. `ConfigError` for
+    what no schema allows: nesting without end, numbers that do not fit into 64 bits.
+    """
+
+    data: dict[str, Any]
+    name: str = ""
+    text: str = field(default="", repr=False)
+    not_finite: tuple[tuple[KeyPath, float], ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Look at every value once."""
+        found = []
+        for keys, value in leaves(self.data):
+            if len(keys) > MAX_DEPTH:
+                raise ConfigError(_too_deep(self.name, None))
+            if isinstance(value, int) and value not in INTEGERS:
+                digits = max(20, value.bit_length() * 3 // 10)
+                raise self.error(keys, f"{dotted(keys)} is {_too_long(digits)}")
+            if isinstance(value, float) and not math.isfinite(value):
+                found.append((keys, value))
+        object.__setattr__(self, "not_finite", tuple(found))
+
+    @classmethod
+    def read(cls, path: Path | str, limit: int = MAX_CONFIG) -> Document:
+        """Parse a file of at most ``limit`` bytes; `ConfigError`."""
+        return cls.parse(read_text(path, limit), str(path))
+
+    @classmethod
+    def parse(cls, text: str, name: str) -> Document:
+        """Parse a text; ``name`` stands for the file in messages. `ConfigError`."""
+        return cls(_tables(text, name), name, text)
+
+    def convert(self, kind: type[T]) -> T:
+        """The values as a ``kind``; `ConfigError` for what it does not allow."""
+        for keys, value in self.not_finite:
+            info = _type_at(types.type_info(kind), keys)
+            if math.isnan(value) or not _extra(info).get("infinite"):
+                raise self.wrong(keys, allowed(info))
         try:
-            msgspec.convert(_value_at(data, found), wanted, strict=True)
-        except msgspec.ValidationError:
-            return _resolve((*found, *keys[at + 1 :]), data, kind)
-    return keys[:at]
+            return msgspec.convert(self.data, kind, strict=True)
+        except msgspec.ValidationError as error:
+            raise self._explained(error, kind) from error
+
+    def error(self, keys: KeyPath, problem: str) -> ConfigError:
+        """What to raise about the value at ``keys``, with its file and line in front."""
+        if not self.name:
+            return ConfigError(problem, keys)
+        line = f":{line_of(key_lines(self.text), keys)}" if self.text else ""
+        return ConfigError(f"{self.name}{line}: {problem}", keys)
+
+    def wrong(self, keys: KeyPath, wanted: str, found: str | None = None) -> ConfigError:
+        """What to raise about a value that is not one of the ``wanted``; ``found``: in words."""
+        given = _shown(self.value(keys)) if found is None else found
+        return self.error(keys, f"{dotted(keys)} = {given}; allowed: {wanted}")
+
+    def missing(self, keys: KeyPath, wanted: str) -> ConfigError:
+        """What to raise about a key that is not there; the line is that of its table."""
+        problem = f"{dotted(keys)} is missing; it must be {wanted}"
+        return self.error(keys[:-1], problem)
+
+    def value(self, keys: KeyPath) -> Any:
+        """The plain value at ``keys``."""
+        found: Any = self.data
+        for key in keys:
+            found = found[key]
+        return found
+
+    def _explained(self, error: msgspec.ValidationError, kind: Any) -> ConfigError:
+        """Our words for what msgspec found."""
+        reason, keys = self._place(error, kind)
+        info = types.type_info(kind)
+        if (match := MISSING.fullmatch(reason)) is not None:
+            wanted = (*keys, match.group(1))
+            return self.missing(wanted, allowed(_type_at(info, wanted)))
+        if (match := UNKNOWN.fullmatch(reason)) is not None:
+            known = [f.encode_name for f in _fields(_type_at(info, keys)) or ()]
+            return self._unknown((*keys, match.group(1)), known)
+        if REFUSED.match(reason) is not None:
+            return self.wrong(keys, allowed(_type_at(info, keys)) or reason)
+        more = getattr(error.__cause__, "keys", ())  # a check of the schema's own
+        return self.error((*keys, *more), f"{dotted(keys)}: {reason}" if keys else reason)
+
+    def _unknown(self, keys: KeyPath, known: Sequence[str]) -> ConfigError:
+        near = difflib.get_close_matches(str(keys[-1])[:SHOWN], known, 1)
+        hint = f" (did you mean {near[0]}?)" if near else ""
+        return self.error(
+            keys, f"unknown key {dotted(keys)}{hint}; allowed: {', '.join(sorted(known))}"
+        )
+
+    def _place(self, error: msgspec.ValidationError, kind: Any) -> tuple[str, KeyPath]:
+        """What msgspec says, and where."""
+        text = str(error)
+        match = LOCATION.search(text)
+        if match is None:
+            return text, ()
+        keys: KeyPath = ()
+        for key, index in STEP.findall(match.group(1)):
+            keys = (*keys, key or (int(index) if index.isdigit() else index))
+        return LOCATION.sub("", text), self._resolved(keys, kind)
+
+    def _resolved(self, keys: KeyPath, kind: Any) -> KeyPath:
+        """``keys`` with the key for ``...``, which stands for any key of a table of tables."""
+        if "..." not in keys:
+            return keys
+        at = keys.index("...")
+        for key, value in self.value(keys[:at]).items():
+            try:
+                msgspec.convert(_with(self.data, keys[:at], {key: value}), kind, strict=True)
+            except msgspec.ValidationError:
+                return self._resolved((*keys[:at], key, *keys[at + 1 :]), kind)
+        return keys[:at]
 
 
-def _python_type(info: Any) -> Any:
-    """The type that msgspec described, for the kinds of types that TOML can fill."""
-    match info:
-        case types.Metadata():
-            return _python_type(info.type)
-        case types.StructType() | types.EnumType():
-            return info.cls
-        case types.LiteralType():
-            return Literal[tuple(info.values)]
-        case types.UnionType():
-            return Union[tuple(_python_type(t) for t in info.types)]  # noqa: UP007 - made at run time
-        case types.DictType():
-            return GenericAlias(dict, (str, _python_type(info.value_type)))
-        case types.ListType() | types.VarTupleType() | types.SetType():
-            return GenericAlias(list, (_python_type(info.item_type),))
-        case types.NoneType():
-            return None
-    base = SIMPLE.get(type(info), Any)
-    limits = {name: getattr(info, name) for name in LIMITS if getattr(info, name, None) is not None}
-    return Annotated[base, Meta(**limits)] if limits else base
+LOCATION = re.compile(r" - at `\$(.*)`$")
+STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+|\.\.\.)\]")
+MISSING = re.compile(r"Object missing required field `(.+)`")
+UNKNOWN = re.compile(r"Object contains unknown field `(.+)`", re.DOTALL)
+REFUSED = re.compile(r"Expected |Invalid ")
 
 
-SIMPLE: dict[type, Any] = {
-    types.FloatType: float,
-    types.IntType: int,
-    types.StrType: str,
-    types.BoolType: bool,
-}
-LIMITS = ("gt", "ge", "lt", "le", "multiple_of", "pattern", "min_length", "max_length")
+def _with(data: Any, keys: KeyPath, value: Any) -> Any:
+    """Copy of tables and arrays with ``value`` at ``keys``."""
+    if not keys:
+        return value
+    copy: Any = dict(data) if isinstance(data, dict) else list(data)
+    copy[keys[0]] = _with(data[keys[0]], keys[1:], value)
+    return copy
 
 
-def _message(name: str, lines: dict[KeyPath, int], keys: KeyPath, value: Any, allowed: str) -> str:
-    given = str(value).lower() if isinstance(value, bool | float) else _shown(value)
-    return f"{name}:{line_of(lines, keys)}: {dotted(keys)} = {given}; allowed: {allowed}"
+def read_text(path: Path | str, limit: int) -> str:
+    """Text of a file of at most ``limit`` bytes. Never waits: a pipe or a device is refused."""
+    path = Path(path)
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
+        why = str(error.strerror) if isinstance(error, OSError) else str(error)
+        raise ConfigError(_unreadable(path, why)) from error
+    mode = os.fstat(fd).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(fd)
+        raise ConfigError(_unreadable(path, next(name for test, name in KINDS if test(mode))))
+    try:
+        with os.fdopen(fd, "rb") as file:
+            raw = file.read(limit + 1)
+    except OSError as error:
+        raise ConfigError(_unreadable(path, str(error.strerror))) from error
+    if len(raw) > limit:
+        raise ConfigError(f"{path}: over {limit} bytes, too large for a file of this kind")
+    try:
+        return raw.decode()
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise ConfigError(f"{path}:{line}: not UTF-8 text; TOML must be") from error
+
+
+def _tables(text: str, source: str) -> dict[str, Any]:
+    deep = DEEP_KEY.search(text)
+    if deep is not None:
+        raise ConfigError(_too_deep(source, text.count("\n", 0, deep.start()) + 1))
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        message = str(error)
+        match = TOML_LINE.search(message)
+        line = match.group(1) if match else str(text.count("\n") + 1)
+        shown = printable(TOML_LINE.sub("", message), 200)
+        raise ConfigError(f"{source}:{line}: {shown}") from error
+    except RecursionError:
+        raise ConfigError(_too_deep(source, None)) from None
+    except ValueError as error:  # of int(), which reads no more than 4300 digits
+        number = LONG_NUMBER.search(text)
+        if number is None:
+            raise ConfigError(f"{source}: {printable(str(error), 200)}") from error
+        line = str(text.count("\n", 0, number.start()) + 1)
+        raise ConfigError(f"{source}:{line}: {_too_long(len(number.group()))}") from None
+
+
+def leaves(data: Any) -> Iterator[tuple[KeyPath, Any]]:
+    """Every value that is not a table or an array, with its path, in the order of the file.
+
+    Of what is nested too deeply, the first thing too deep.
+    """
+    waiting: list[tuple[KeyPath, Any]] = [((), data)]
+    while waiting:
+        keys, value = waiting.pop()
+        if len(keys) <= MAX_DEPTH and isinstance(value, dict):
+            waiting += [((*keys, key), value[key]) for key in reversed(value)]
+        elif len(keys) <= MAX_DEPTH and isinstance(value, list):
+            waiting += [((*keys, at), value[at]) for at in reversed(range(len(value)))]
+        else:
+            yield keys, value
+
+
+def printable(text: str, limit: int = SHOWN) -> str:
+    """A text for a message: what a terminal would act on is escaped, and the rest kept short."""
+    if len(text) > limit:
+        text = text[: limit - 3] + "..."
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text
+    )
+
+
+def _unreadable(path: Path, why: str) -> str:
+    return f"{printable(str(path), 200)}: cannot be read ({why}); name a TOML file that can"
+
+
+def _too_long(digits: int) -> str:
+    return (
+        f"a whole number of about {digits} digits; allowed: finite numbers, whole ones of at most "
+        "64 bits"
+    )
+
+
+def _too_deep(source: str, line: int | None) -> str:
+    where = source if line is None else f"{source}:{line}"
+    return f"{where}: nested too deeply; allowed: {MAX_DEPTH} tables and arrays in one another"
+
+
+# --- Values and types in words. -------------------------------------------------------------------
+
+
+def dotted(keys: KeyPath) -> str:
+    """A path of keys as people write it."""
+    text = ""
+    for key in keys:
+        shown = printable(str(key))
+        text += f"[{key}]" if isinstance(key, int) else f".{shown}" if text else shown
+    return text
 
 
 def _shown(value: Any) -> str:
+    if isinstance(value, bool | float):
+        return str(value).lower()
     return printable(f'"{value}"' if isinstance(value, str) else str(value))
-
-
-def _value_at(data: Any, keys: KeyPath) -> Any:
-    for key in keys:
-        data = data[key]
-    return data
-
-
-def _unknown_message(
-    name: str, lines: dict[KeyPath, int], keys: KeyPath, allowed: list[str]
-) -> str:
-    key = str(keys[-1])
-    near = difflib.get_close_matches(key[:SHOWN], allowed, 1)
-    hint = f" (did you mean {near[0]}?)" if near else ""
-    where = f"{name}:{line_of(lines, keys)}"
-    return f"{where}: unknown key {dotted(keys)}{hint}; allowed: {', '.join(sorted(allowed))}"
-
-
-def _unknown(data: Any, info: types.Type | None, keys: KeyPath) -> tuple[KeyPath, list[str]] | None:
-    """First key that its struct does not have, with those it has."""
-    if isinstance(data, dict):
-        struct = _of_kind(info, types.StructType)
-        fields = {f.encode_name: f.type for f in struct.fields} if struct is not None else None
-        for key, value in data.items():
-            if fields is not None and key not in fields and not _of_kind(info, types.DictType):
-                return (*keys, key), list(fields)
-            found = _unknown(value, _step(info, key), (*keys, key))
-            if found is not None:
-                return found
-    elif isinstance(data, list):
-        for index, value in enumerate(data):
-            found = _unknown(value, _step(info, index), (*keys, index))
-            if found is not None:
-                return found
-    return None
-
-
-def _of_kind(info: types.Type | None, kind: type[T]) -> T | None:
-    """``info``, or the member of a union, that is of ``kind``; None when there is none."""
-    if isinstance(info, types.Metadata):
-        return _of_kind(info.type, kind)
-    if isinstance(info, types.UnionType):
-        return next((found for t in info.types if (found := _of_kind(t, kind))), None)
-    return info if isinstance(info, kind) else None
-
-
-def _step(info: types.Type | None, key: str | int) -> types.Type | None:
-    """Type of one member of a struct, table or array."""
-    struct = _of_kind(info, types.StructType)
-    if struct is not None and isinstance(key, str):
-        return next((f.type for f in struct.fields if f.encode_name == key), None)
-    table = _of_kind(info, types.DictType)
-    if table is not None and isinstance(key, str):
-        return table.value_type
-    fixed = _of_kind(info, types.TupleType)
-    if fixed is not None and isinstance(key, int) and key < len(fixed.item_types):
-        return fixed.item_types[key]
-    array = _of_kind(info, types.CollectionType)
-    return array.item_type if array is not None else None
-
-
-def _type_at(info: types.Type | None, keys: KeyPath) -> types.Type | None:
-    for key in keys:
-        info = _step(info, key)
-    return info
 
 
 NAMES: dict[type, str] = {
@@ -231,32 +390,409 @@ NAMES: dict[type, str] = {
     types.FloatType: "a finite number",
     types.DictType: "a table",
     types.StructType: "a table",
+    types.DataclassType: "a table",
 }
-BOUNDS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
+LISTS = types.ListType | types.VarTupleType | types.SetType | types.FrozenSetType
 
 
-def _allowed(info: Any) -> str:
-    """What a type allows, in words."""
-    if isinstance(info, types.Metadata):
-        schema = info.extra_json_schema or {}
-        return str(schema.get("description") or _allowed(info.type))
-    if isinstance(info, types.UnionType):
-        parts = [_allowed(t) for t in info.types if not isinstance(t, types.NoneType)]
-        return " or ".join(dict.fromkeys(part for part in parts if part))
-    if isinstance(info, types.LiteralType):
-        return ", ".join(str(value) for value in info.values)
-    if isinstance(info, types.EnumType):
-        members: list[Enum] = list(info.cls)
-        return ", ".join(str(member.value) for member in members)
-    if isinstance(info, types.TupleType):
-        inner = ", ".join(_allowed(t) for t in info.item_types)
-        return f"an array of {len(info.item_types)}: {inner}"
-    if isinstance(info, types.ListType | types.VarTupleType | types.SetType):
-        return f"an array, each element {_allowed(info.item_type)}"
+def allowed(info: Any, unit: str = "") -> str:
+    """What a type (of `msgspec.inspect`) allows, in words."""
+    match info:
+        case types.Metadata():
+            own = info.extra or {}
+            return str(own.get("allowed") or allowed(info.type, own.get("unit", unit)))
+        case types.UnionType():
+            parts = [allowed(t, unit) for t in info.types]
+            return " or ".join(dict.fromkeys(part for part in parts if part))
+        case types.LiteralType():
+            return ", ".join(_plain(value) for value in info.values)
+        case types.EnumType():
+            members: list[Enum] = list(info.cls)
+            return ", ".join(str(member.value) for member in members)
+        case types.TupleType():
+            each = [allowed(t, unit) for t in info.item_types]
+            if len(set(each)) == 1:
+                return f"an array of {len(each)}, each {each[0]}"
+            return f"an array of {len(each)}: {', '.join(each)}"
+        case _ if isinstance(info, LISTS):
+            count = _bounds(info.min_length, info.max_length)
+            of = f" of {count} elements" if count else ""
+            return f"an array{of}, each element {allowed(info.item_type, unit)}"
     text = NAMES.get(type(info), "")
-    for bound, word in BOUNDS.items():
-        limit = getattr(info, bound, None)
-        if limit is not None:
-            text += f" {word} {limit:g}"
-    pattern = getattr(info, "pattern", None)
-    return f"{text} that matches {pattern}" if pattern else text
+    if isinstance(info, types.StrType):
+        text += " that is not empty" if info.min_length else ""
+        text += f" that matches {info.pattern}" if info.pattern else ""
+    bounds = allowed_range(info)
+    if bounds and unit:
+        return f"{text} {bounds} {unit}"
+    return " ".join(part for part in (text, bounds, f"({unit})" if unit else "") if part)
+
+
+def allowed_range(info: Any) -> str:
+    """Range of a number's type, in words; empty where there is none."""
+    gt, ge, lt, le = (getattr(info, name, None) for name in ("gt", "ge", "lt", "le"))
+    if ge is not None and le is not None:
+        return f"from {_plain(ge)} to {_plain(le)}"
+    words = (("above", gt), ("of at least", ge), ("below", lt), ("at most", le))
+    return " and ".join(f"{word} {_plain(bound)}" for word, bound in words if bound is not None)
+
+
+def _bounds(least: int | None, most: int | None) -> str:
+    if least == most:
+        return "" if least is None else str(least)
+    if least is None or most is None:
+        return f"at most {most}" if least is None else f"at least {least}"
+    return f"{least} to {most}"
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, int) and not isinstance(value, bool):
+        return str(value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _extra(info: Any) -> dict[str, Any]:
+    return info.extra or {} if isinstance(info, types.Metadata) else {}
+
+
+def _fields(info: Any) -> tuple[types.Field, ...] | None:
+    """Fields of a schema, or of the schema in a union; None where there is none."""
+    if isinstance(info, types.Metadata):
+        return _fields(info.type)
+    if isinstance(info, types.UnionType):
+        return next((found for t in info.types if (found := _fields(t)) is not None), None)
+    return info.fields if isinstance(info, types.StructType | types.DataclassType) else None
+
+
+def _step(info: Any, key: str | int) -> Any:
+    """Type of one member of a schema, table or array; None where it has none."""
+    match info:
+        case types.Metadata():
+            return _step(info.type, key)
+        case types.UnionType():
+            return next((found for t in info.types if (found := _step(t, key))), None)
+        case types.StructType() | types.DataclassType():
+            return next((f.type for f in info.fields if f.encode_name == key), None)
+        case types.DictType():
+            return info.value_type
+        case types.TupleType() if isinstance(key, int):
+            return info.item_types[key] if key < len(info.item_types) else None
+        case types.CollectionType():
+            return info.item_type
+    return None
+
+
+def _type_at(info: Any, keys: KeyPath) -> Any:
+    for key in keys:
+        info = _step(info, key)
+    return info
+
+
+# --- Settings as frozen dataclasses, and tables that override some of them. -----------------------
+
+
+@lru_cache(maxsize=64)
+def _hints(kind: Any) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
+
+
+def check_fields(settings: object) -> None:
+    """Check every field of a frozen dataclass against its type, as the file would be.
+
+    `ConfigError` names the first field that is out of its range. Meant for ``__post_init__``.
+    """
+    made: Any = type(settings)
+    for name, kind in _hints(made).items():
+        value = getattr(settings, name)
+        try:
+            msgspec.convert(_finite(value), kind, strict=True)
+        except ValueError as error:  # a ValidationError is one
+            words = allowed(types.type_info(kind)) or kind.__name__
+            problem = f"{name} = {_shown(value)}; allowed: {words}"
+            raise ConfigError(problem, (name,)) from error
+
+
+def _finite(value: Any) -> Any:
+    """``value`` as msgspec takes it, which knows no floats of numpy; ValueError for nan and inf."""
+    if isinstance(value, tuple):
+        return tuple(_finite(item) for item in value)
+    if not isinstance(value, float):
+        return value
+    if not math.isfinite(value):
+        raise ValueError(value)
+    return float(value)
+
+
+def table_of(
+    name: str,
+    settings: type,
+    *,
+    only: Iterable[str] | None = None,
+    without: Iterable[str] = (),
+    rename: Mapping[str, str] | None = None,
+    **others: Any,
+) -> type[Any]:
+    """Schema of a table in which any field of a dataclass may be given, and none must.
+
+    ``only``, ``without``: which fields. ``rename``: keys by field. ``others``: types of fields
+    that a file writes in another way. What a file left out is `msgspec.UNSET`; see `given`.
+    """
+    hints = _hints(settings)
+    chosen = [key for key in (hints if only is None else only) if key not in set(without)]
+    members = []
+    for key in chosen:
+        default = others[key]() if isinstance(others.get(key), type) else UNSET
+        members.append((key, others.get(key, hints[key]) | UnsetType, default))
+    return msgspec.defstruct(
+        name,
+        members,
+        frozen=True,
+        kw_only=True,
+        forbid_unknown_fields=True,
+        rename=dict(rename or {}),
+        namespace={"overrides": settings},
+    )
+
+
+def given(table: Any) -> dict[str, Any]:
+    """What a file says in a table made by `table_of`, by field."""
+    values = ((name, getattr(table, name)) for name in table.__struct_fields__)
+    return {name: value for name, value in values if value is not UNSET}
+
+
+# --- What a schema allows, for the reference. -----------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """One key of a file: its path, what it holds, and what it means.
+
+    ``default``: as it is written in the file; empty for none, None where the key must be given.
+    """
+
+    path: str
+    allowed: str
+    unit: str
+    default: str | None
+    meaning: str
+
+
+def describe(kind: type) -> list[Key]:
+    """Every key of a schema, tables within tables included, in the order of the schema."""
+    return list(_keys(types.type_info(kind), ""))
+
+
+def _keys(info: Any, prefix: str) -> Iterator[Key]:
+    for each in _fields(info) or ():
+        path = f"{prefix}{each.encode_name}"
+        inner, plural = _table_in(each.type)
+        if inner is not None:
+            yield from _keys(inner, f"{path}[]." if plural else f"{path}.")
+            continue
+        meta = each.type
+        schema = (meta.extra_json_schema or {}) if isinstance(meta, types.Metadata) else {}
+        yield Key(
+            path,
+            allowed(meta),
+            str(_extra(meta).get("unit", "")),
+            _default(each, getattr(info, "cls", None)),
+            str(schema.get("description", "")),
+        )
+
+
+def _table_in(info: Any) -> tuple[Any, bool]:
+    """The schema of a table or of an array of tables, and whether it is an array."""
+    if isinstance(info, types.Metadata):
+        return _table_in(info.type)
+    if isinstance(info, types.UnionType):
+        found = (_table_in(t) for t in info.types)
+        return next((each for each in found if each[0] is not None), (None, False))
+    if isinstance(info, types.StructType):
+        return info, False
+    if isinstance(info, LISTS):
+        inner, _ = _table_in(info.item_type)
+        return inner, True
+    return None, False
+
+
+def _default(each: types.Field, kind: Any) -> str | None:
+    if each.required:
+        return None
+    value = each.default if each.default is not NODEFAULT else each.default_factory()
+    if value is UNSET and hasattr(kind, "overrides"):
+        value = {f.name: f.default for f in fields(kind.overrides)}[each.name]
+        value = UNSET if value is NO_DEFAULT else value
+    return "" if value is None or value is UNSET else written(value)
+
+
+def written(value: Any) -> str:
+    """A plain value as TOML."""
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case str():
+            return quoted(str(value))
+        case float():
+            return f"{value:g}"
+        case tuple() | list() | frozenset():
+            return f"[{', '.join(written(item) for item in value)}]"
+    return str(value)
+
+
+def quoted(value: str) -> str:
+    """A text as TOML: quoted and escaped."""
+    escaped = "".join(
+        f"\\u{ord(c):04x}" if c in '"\\' or ord(c) < 32 or ord(c) == 127 else c for c in value
+    )
+    return f'"{escaped}"'
+
+
+# --- On which line of a TOML text each key stands; `tomllib` has checked the syntax. --------------
+
+BARE = re.compile(r"[A-Za-z0-9_-]+")
+SPACE = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
+SCALAR = re.compile(r"[^,\]}\s#]+(?:[ ]\d[^,\]}\s#]*)?")  # a date may have a space before its time
+MULTILINE_QUOTES = ('"""', "'''")
+
+
+def key_lines(text: str) -> dict[KeyPath, int]:
+    """Line (from 1) of every key, table and array element of a valid TOML text, by its path."""
+    scanner = _Scanner(text)
+    scanner.run()
+    return scanner.lines
+
+
+def line_of(lines: dict[KeyPath, int], keys: KeyPath) -> int:
+    """Line of a key, or of the nearest thing around it."""
+    while keys and keys not in lines:
+        keys = keys[:-1]
+    return lines.get(keys, 1)
+
+
+class _Scanner:
+    """Walks over valid TOML, noting the line of each key, table and element of an array."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.at = 0
+        self.lines: dict[KeyPath, int] = {}
+        self.arrays: dict[KeyPath, int] = {}  # tables so far in each array of tables
+        self._breaks = [match.start() for match in re.finditer("\n", text)]
+
+    def note(self, path: KeyPath, at: int) -> None:
+        self.lines.setdefault(path, bisect_left(self._breaks, at) + 1)
+
+    def skip_space(self) -> None:
+        match = SPACE.match(self.text, self.at)
+        if match is not None:
+            self.at = match.end()
+
+    def looking_at(self, token: str) -> bool:
+        return self.text.startswith(token, self.at)
+
+    def string(self) -> str:
+        """A quoted string; its raw text, which is the key itself unless it has escapes."""
+        quote = self.text[self.at]
+        if self.text[self.at : self.at + 3] in MULTILINE_QUOTES:
+            quote = self.text[self.at : self.at + 3]
+        start = self.at + len(quote)
+        end = start
+        while not self.text.startswith(quote, end):
+            end += 2 if quote[0] == '"' and self.text[end] == "\\" else 1
+        while len(quote) == 3 and self.text[end + 3 : end + 4] == quote[0]:
+            end += 1  # quotes right before the closing ones belong to the text
+        self.at = end + len(quote)
+        return self.text[start:end]
+
+    def key(self) -> tuple[str, ...]:
+        """A key, maybe dotted."""
+        parts = []
+        while True:
+            self.skip_space()
+            match = BARE.match(self.text, self.at)
+            if match is None:
+                parts.append(self.string())
+            else:
+                parts.append(match.group())
+                self.at = match.end()
+            self.skip_space()
+            if not self.looking_at("."):
+                return tuple(parts)
+            self.at += 1
+
+    def absolute(self, key: tuple[str, ...]) -> KeyPath:
+        """Full path of a table's key: within arrays of tables, that of the last table."""
+        path: KeyPath = ()
+        for part in key:
+            path = (*path, part)
+            if path in self.arrays:
+                path = (*path, self.arrays[path] - 1)
+        return path
+
+    def pair(self, table: KeyPath) -> None:
+        """``key = value``."""
+        start = self.at
+        path: KeyPath = table
+        for part in self.key():
+            path = (*path, part)
+            self.note(path, start)
+        self.at += 1  # the equals sign
+        self.skip_space()
+        self.value(path)
+
+    def value(self, path: KeyPath) -> None:
+        if self.looking_at("["):
+            self.at += 1
+            index = 0
+            while True:
+                self.skip_space()
+                if self.looking_at(","):
+                    self.at += 1
+                elif self.looking_at("]"):
+                    self.at += 1
+                    return
+                else:
+                    self.note((*path, index), self.at)
+                    self.value((*path, index))
+                    index += 1
+        elif self.looking_at("{"):
+            self.at += 1
+            while True:
+                self.skip_space()
+                if self.looking_at(","):
+                    self.at += 1
+                elif self.looking_at("}"):
+                    self.at += 1
+                    return
+                else:
+                    self.pair(path)
+        elif self.text[self.at] in "\"'":
+            self.string()
+        else:
+            match = SCALAR.match(self.text, self.at)
+            if match is not None:
+                self.at = match.end()
+
+    def run(self) -> None:
+        table: KeyPath = ()
+        while True:
+            self.skip_space()
+            if self.at >= len(self.text):
+                return
+            start = self.at
+            if not self.looking_at("["):
+                self.pair(table)
+                continue
+            double = self.looking_at("[[")
+            self.at += 2 if double else 1
+            *parents, last = self.key()
+            table = (*self.absolute(tuple(parents)), last)
+            for depth in range(1, len(table) + 1):
+                self.note(table[:depth], start)
+            if double:
+                self.arrays[table] = self.arrays.get(table, 0) + 1
+                table = (*table, self.arrays[table] - 1)
+                self.note(table, start)
+            elif table in self.arrays:
+                table = (*table, self.arrays[table] - 1)
+            self.at += 2 if double else 1

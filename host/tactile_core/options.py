@@ -6,13 +6,15 @@ import argparse
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
+from msgspec import Meta
 
 from tactile_core.bus.keys import TlsConfig
 from tactile_core.bus.session import PORTS, BusConfig, Role
+from tactile_core.config import printable
 from tactile_core.log.recorder import RecorderSettings
-from tactile_core.toml_text import printable
 
 DEFAULT_LOG = "tactile-logs"
 """Folder of the logs, below the folder a daemon was started in."""
@@ -23,21 +25,34 @@ board at 100 Hz."""
 
 
 class LogTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[log]``: a folder, or a file that ends in .mcap; ``[log.recorder]``: how it is cut."""
+    """``[log]``: where the log is written; ``[log.recorder]``: how it is cut."""
 
-    enabled: bool = True
-    destination: str = DEFAULT_LOG
+    enabled: Annotated[bool, Meta(description="whether a log is written")] = True
+    destination: Annotated[
+        str, Meta(description="a folder for dated files, or a file that ends in .mcap")
+    ] = DEFAULT_LOG
     recorder: RecorderSettings = RecorderSettings(max_bytes=DEFAULT_LOG_BYTES)
 
 
 class BusTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[bus]``: zenoh endpoints."""
+    """``[bus]``: zenoh endpoints, and who is let in (see security.md)."""
 
-    listen: tuple[str, ...] | None = None
-    connect: tuple[str, ...] | None = None
-    keys: str | None = None
+    listen: Annotated[
+        tuple[str, ...] | None,
+        Meta(description="endpoints to listen at; left out: a socket in the runtime folder"),
+    ] = None
+    connect: Annotated[
+        tuple[str, ...] | None,
+        Meta(description="endpoints of peers; left out: the others in the runtime folder"),
+    ] = None
+    keys: Annotated[
+        str | None, Meta(description="folder of keys of `tactile bus keys`: join over TLS")
+    ] = None
     tls: TlsConfig | None = None
-    insecure: bool = False
+    insecure: Annotated[
+        bool,
+        Meta(description="ask nobody for a proof; whoever reaches an endpoint may command"),
+    ] = False
 
 
 def add_log_and_bus(parser: argparse.ArgumentParser, role: Role) -> None:

@@ -10,7 +10,7 @@ import argparse
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -21,7 +21,7 @@ from tactile_core.bus.topics import NAME
 from tactile_core.calibration import CalibrationError, load
 from tactile_core.calibration.nominal import MAX_ANYSKIN_MAGNETOMETERS
 from tactile_core.can_bus import CanSpec
-from tactile_core.config import ConfigError, Count, Duration, Positive, Rate, load_toml
+from tactile_core.config import ConfigError, Count, Rate, given, load_toml, table_of, unit
 from tactile_core.log.recorder import RecorderSettings
 from tactile_core.options import BusTable, LogTable, bus_config, log_destination
 from tactiled.boards.line import KINDS, board_kind
@@ -36,21 +36,20 @@ REPLAY_PREFIX = "replay"
 
 T = TypeVar("T")
 
-Node = Annotated[int, Meta(ge=0, le=126, description="a node number from 0 to 126")]
-
-
 BoardKind = Annotated[
     str,
     Meta(
         pattern=rf"^({'|'.join(KINDS)}|({'|'.join(Kind)}):.*)$",
-        description=f"one of {', '.join(KINDS)}, or a layout such as floats:5xyz",
+        description="protocol of a serial board; auto: found out",
+        extra={"allowed": f"one of {', '.join(KINDS)}, or a layout such as floats:5xyz"},
     ),
 ]
 Arrays = Annotated[
     str,
     Meta(
         pattern=r"^[0-9]+([+][0-9]+)*$",
-        description="numbers of magnetometers joined by +, as in 5+5",
+        description="magnetometers of each array of a controller that does not say it",
+        extra={"allowed": "numbers of magnetometers joined by +, as in 5+5"},
     ),
 ]
 
@@ -62,43 +61,69 @@ class SettingsError(Exception):
 class BoardTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``[[board]]``: one board, on a serial port or a CAN bus."""
 
-    name: str | None = None
-    port: str | None = None
-    can: str | None = None
-    node: Node | None = None
+    name: Annotated[
+        str | None, Meta(description="of the board in keys and logs; left out: board0, board1, …")
+    ] = None
+    port: Annotated[
+        str | None, Meta(description="serial port: a path, or usb:SERIAL; either this or can")
+    ] = None
+    can: Annotated[
+        str | None, Meta(description="CAN bus, such as socketcan:can0; either this or port")
+    ] = None
+    node: Annotated[
+        Annotated[int, Meta(ge=0, le=126)] | None,
+        Meta(description="node of the board, where several are on one bus"),
+    ] = None
     kind: BoardKind = "auto"
     arrays: Arrays | None = None
-    baud: Count = DEFAULT_BAUD
-    calibration: str | None = None
+    baud: Annotated[Count, unit("baud"), Meta(description="rate of a serial port")] = DEFAULT_BAUD
+    calibration: Annotated[
+        str | None,
+        Meta(description="calibration of this board, relative to the file; left out: nominal"),
+    ] = None
 
 
-class CompensationTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[compensation]`` of the ambient field; ``rate`` in Hz."""
+_SENSING = (
+    "feature_rate_hz",
+    "contact_minimum_n",
+    "contact_sigmas",
+    "tip_light_n",
+    "frozen_after_s",
+    "range_limit_ut",
+    "tare_s",
+    "auto_tare",
+    "rest_tracking_s",
+    "hold_s",
+)
+if TYPE_CHECKING:
 
-    method: Literal["off", "ransac", "consensus"] = "consensus"
-    rate: Rate | None = None
+    class CompensationTable(msgspec.Struct, frozen=True):
+        """``[compensation]`` of the ambient field."""
 
-
-class SensingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[sensing]``: thresholds of contact, health and taring; see `PipelineSettings`."""
-
-    feature_rate: Rate | None = None
-    contact_minimum_n: Positive = 0.1
-    contact_sigmas: Positive = 4.5
-    tip_light_n: tuple[float, float] = (0.5, 7.5)
-    frozen_after_s: Duration = 0.5
-    range_limit_ut: Positive = 50_000.0
-    tare_s: Duration = 0.5
-    auto_tare: bool | None = None
-    rest_tracking_s: Duration | None = None
-    hold_s: Duration = 1.5
+    class SensingTable(msgspec.Struct, frozen=True):
+        """``[sensing]``: thresholds of contact, health and taring."""
+else:
+    CompensationTable = table_of(
+        "CompensationTable",
+        PipelineSettings,
+        only=("method", "compensation_rate_hz"),
+        rename={"compensation_rate_hz": "rate"},
+    )
+    SensingTable = table_of(
+        "SensingTable", PipelineSettings, only=_SENSING, rename={"feature_rate_hz": "feature_rate"}
+    )
 
 
 class ConfigFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The whole file."""
+    """Configuration of tactiled."""
 
-    rate: Rate | None = None
-    calibration: tuple[str, ...] = ()
+    rate: Annotated[
+        Rate | None, Meta(description="sample rate asked of every board; left out: its own")
+    ] = None
+    calibration: Annotated[
+        tuple[str, ...],
+        Meta(description="calibration files, matched to boards by serial number"),
+    ] = ()
     board: tuple[BoardTable, ...] = ()
     compensation: CompensationTable = CompensationTable()
     sensing: SensingTable = SensingTable()
@@ -335,22 +360,8 @@ def _calibrations(
 
 
 def pipeline_settings(file: ConfigFile) -> PipelineSettings:
-    """Settings of the sensing core in a file; ValueError names the first that cannot be used."""
-    s, c = file.sensing, file.compensation
-    return PipelineSettings(
-        method=c.method,
-        compensation_rate_hz=c.rate,
-        feature_rate_hz=s.feature_rate,
-        contact_minimum_n=s.contact_minimum_n,
-        contact_sigmas=s.contact_sigmas,
-        tip_light_n=s.tip_light_n,
-        frozen_after_s=s.frozen_after_s,
-        range_limit_ut=s.range_limit_ut,
-        tare_s=s.tare_s,
-        auto_tare=s.auto_tare,
-        rest_tracking_s=s.rest_tracking_s,
-        hold_s=s.hold_s,
-    )
+    """Settings of the sensing core in a file; `ConfigError` for what does not fit together."""
+    return PipelineSettings(**given(file.compensation), **given(file.sensing))
 
 
 def _pipeline(options: argparse.Namespace, file: ConfigFile, path: Path | None) -> PipelineSettings:

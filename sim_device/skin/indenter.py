@@ -5,12 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from sim_device.scripts import ScriptError, Table, key_lines, read_toml
 from sim_device.skin.elastomer import Contact
+from tactile_core.config import (
+    Document,
+    KeyPath,
+    Millimetres,
+    Newtons,
+    Seconds,
+    allowed_values,
+    dotted,
+    unit,
+)
 from tactile_core.geometry import ArrayGeometry, SkinGeometry, finger
 
 Float = NDArray[np.float64]
@@ -28,6 +40,11 @@ MAX_OFF_SKIN_MM = 12.0
 
 MAX_PAST_EDGE_MM = 7.0
 """mm past the outermost taxels along each axis: so that a corner is within the same reach."""
+
+
+Place = Annotated[Millimetres, Meta(ge=-1000, le=1000)]
+Shear = Annotated[Newtons, Meta(ge=-MAX_NORMAL_N, le=MAX_NORMAL_N)]
+Time = Annotated[Seconds, Meta(ge=0, le=MAX_SECONDS)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,84 +111,119 @@ class Indenter:
         return self.contacts(seconds)
 
 
+class PressTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[[press]]``: one force on the skin. Where: either ``array`` or ``position_mm``."""
+
+    array: Annotated[str | None, Meta(description="array of the skin: left, right, tip; skin")] = (
+        None
+    )
+    u_mm: Annotated[
+        Millimetres | None,
+        Meta(description="point on the unrolled skin, from the array's middle, along it"),
+    ] = None
+    v_mm: Annotated[
+        Millimetres | None, Meta(description="the same, up; both are 0 if left out")
+    ] = None
+    position_mm: Annotated[
+        tuple[Place, Place, Place] | None,
+        unit("mm"),
+        Meta(description="or a point in `ee`; the press is along the nearest taxel's normal"),
+    ] = None
+    normal_n: Annotated[Newtons, Meta(gt=0, le=MAX_NORMAL_N, description="force into the skin")]
+    shear_n: Annotated[
+        tuple[Shear, Shear], unit("N"), Meta(description="force along the skin, along u and v")
+    ] = (0.0, 0.0)
+    radius_mm: Annotated[
+        Millimetres, Meta(gt=0, le=50, description="radius of the patch of contact")
+    ] = 4.0
+    start_s: Annotated[Time, Meta(description="when it begins, after power-on")] = 0.0
+    ramp_s: Annotated[Time, Meta(description="how long the force rises, and falls")] = 0.2
+    hold_s: Annotated[Time, Meta(description="how long it stays")] = 1.0
+    repeat: Annotated[int, Meta(ge=1, le=MAX_REPEATS, description="how often")] = 1
+    every_s: Annotated[
+        Time | None,
+        Meta(description="from one beginning to the next; left out: 1 s after the last has ended"),
+    ] = None
+
+
+class ScriptFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A script of the simulated indenter."""
+
+    loop_s: Annotated[
+        Annotated[Seconds, Meta(gt=0, le=MAX_SECONDS)] | None,
+        Meta(description="the script starts again after this long; left out: it is played once"),
+    ] = None
+    press: Annotated[
+        tuple[PressTable, ...],
+        Meta(min_length=1),
+        allowed_values("at least one [[press]] table"),
+    ]
+
+
 def load_script(path: str | Path, geometry: SkinGeometry | None = None) -> Indenter:
-    """Indenter of the script at ``path`` for a skin (the finger when left out).
-
-    ScriptError names file, line, key, what was given and what is allowed.
-    """
-    path = Path(path)
-    values, text = read_toml(path)
+    """Indenter of the script at ``path`` for a skin (the finger when left out); `ConfigError`."""
+    document = Document.read(path)
+    file = document.convert(ScriptFile)
     geometry = geometry or finger()
-    top = Table(values, str(path), key_lines(text, "")[0])
-    presses = top.take("press")
-    loop = top.number("loop_s", low=0.0, high=MAX_SECONDS, above=True) if "loop_s" in top else None
-    top.finish()
-    if not isinstance(presses, list) or not presses:
-        top.fail("press", "there is no press; write at least one [[press]] table")
-    lines = key_lines(text, "press")
-    out = []
-    for number, press in enumerate(presses):
-        if not isinstance(press, dict):
-            top.fail("press", f"given {press!r}; allowed: [[press]] tables")
-        # Inline tables have no header of their own to point at.
-        known = lines[number] if len(lines) == len(presses) else None
-        out.append(_press(Table(press, str(path), known), geometry))
-    indenter = Indenter(out, loop)
-    longest = max(p.end for p in out)
-    if loop is not None and longest > loop:
-        top.fail("loop_s", f"given {loop:g}; allowed: at least {longest:g}, the last press's end")
-    return indenter
+    presses = [_press(document, i, press, geometry) for i, press in enumerate(file.press)]
+    longest = max(p.end for p in presses)
+    if file.loop_s is not None and longest > file.loop_s:
+        raise document.wrong(("loop_s",), f"at least {longest:g} s, the last press's end")
+    return Indenter(presses, file.loop_s)
 
 
-def _press(table: Table, geometry: SkinGeometry) -> Press:
-    normal = table.number("normal_n", low=0.0, high=MAX_NORMAL_N, above=True)
-    shear = table.vector("shear_n", 2, MAX_NORMAL_N, (0.0, 0.0))
-    radius = table.number("radius_mm", 4.0, low=0.0, high=50.0, above=True)
-    position, axes = _place(table, geometry)
-    start = table.number("start_s", 0.0, low=0.0, high=MAX_SECONDS)
-    ramp = table.number("ramp_s", 0.2, low=0.0, high=MAX_SECONDS)
-    hold = table.number("hold_s", 1.0, low=0.0, high=MAX_SECONDS)
-    length = 2 * ramp + hold
+def _press(document: Document, number: int, table: PressTable, geometry: SkinGeometry) -> Press:
+    at: KeyPath = ("press", number)
+    position, axes = _place(document, at, table, geometry)
+    length = 2 * table.ramp_s + table.hold_s
     if length == 0:
-        table.fail("hold_s", "ramp_s and hold_s are both 0; allowed: one of them above 0")
-    repeat = table.integer("repeat", 1, 1, MAX_REPEATS)
-    every = table.number("every_s", length + 1.0, low=length, high=MAX_SECONDS)
-    table.finish()
-    force = axes @ np.array([shear[0], shear[1], -normal])
-    return Press(Contact(position, force, radius / 1000), start, ramp, hold, repeat, every)
+        problem = "ramp_s and hold_s are both 0; allowed: one of them above 0"
+        raise document.error((*at, "hold_s"), f"{dotted(at)}: {problem}")
+    every = length + 1.0 if table.every_s is None else table.every_s
+    if every < length:
+        raise document.wrong((*at, "every_s"), f"at least {length:g} s, the length of the press")
+    force = axes @ np.array([*table.shear_n, -table.normal_n])
+    contact = Contact(position, force, table.radius_mm / 1000)
+    return Press(contact, table.start_s, table.ramp_s, table.hold_s, table.repeat, every)
 
 
-def _place(table: Table, geometry: SkinGeometry) -> tuple[Float, Float]:
+def _place(
+    document: Document, at: KeyPath, table: PressTable, geometry: SkinGeometry
+) -> tuple[Float, Float]:
     """Position (3,) m in ``ee`` and the axes (3, 3) of the skin there."""
-    by_array = [k for k in ("array", "u_mm", "v_mm") if k in table]
-    if "position_mm" in table:
-        if by_array:
-            table.fail(by_array[0], "allowed: either position_mm or array with u_mm and v_mm")
-        position = np.array(table.vector("position_mm", 3, 1000.0)) / 1000
+    if table.position_mm is not None:
+        for key in ("array", "u_mm", "v_mm"):
+            if getattr(table, key) is not None:
+                raise document.wrong((*at, key), "either position_mm, or array with u_mm and v_mm")
+        position = np.array(table.position_mm) / 1000
         taxels = np.concatenate([a.position for a in geometry.arrays])
         rotations = np.concatenate([a.rotation for a in geometry.arrays])
         distance = np.linalg.norm(taxels - position, axis=1)
         nearest = int(distance.argmin())
         if distance[nearest] * 1000 > MAX_OFF_SKIN_MM:
-            at = ", ".join(f"{1000 * v:.1f}" for v in taxels[nearest])
-            table.fail(
-                "position_mm",
-                f"is {1000 * distance[nearest]:.0f} mm from the nearest taxel, at [{at}]; "
-                f"allowed: up to {MAX_OFF_SKIN_MM:g} mm",
+            taxel = ", ".join(f"{1000 * v:.1f}" for v in taxels[nearest])
+            raise document.wrong(
+                (*at, "position_mm"),
+                f"up to {MAX_OFF_SKIN_MM:g} mm from the nearest taxel, at [{taxel}]",
+                f"{1000 * distance[nearest]:.0f} mm from it",
             )
         return position, rotations[nearest]
-    names = tuple(a.name for a in geometry.arrays)
-    array = geometry.arrays[names.index(table.choice("array", names))]
-    u = _along(table, "u_mm", array, 0)
-    v = _along(table, "v_mm", array, 1)
-    return on_surface(array, u, v)
-
-
-def _along(table: Table, key: str, array: ArrayGeometry, axis: int) -> float:
-    """Coordinate in m along one axis of the unrolled skin."""
-    edge = array.surface[:, axis]
-    low, high = 1000 * edge.min() - MAX_PAST_EDGE_MM, 1000 * edge.max() + MAX_PAST_EDGE_MM
-    return table.number(key, 0.0, low=float(low), high=float(high)) / 1000
+    arrays = {a.name: a for a in geometry.arrays}
+    names = ", ".join(arrays)
+    if table.array is None:
+        raise document.missing((*at, "array"), f"one of {names}; or give position_mm")
+    if table.array not in arrays:
+        raise document.wrong((*at, "array"), names)
+    array = arrays[table.array]
+    place = []
+    for axis, key in enumerate(("u_mm", "v_mm")):
+        value = getattr(table, key) or 0.0
+        edge = array.surface[:, axis]
+        low, high = 1000 * edge.min() - MAX_PAST_EDGE_MM, 1000 * edge.max() + MAX_PAST_EDGE_MM
+        if not low <= value <= high:
+            raise document.wrong((*at, key), f"a number from {low:g} to {high:g} mm")
+        place.append(value / 1000)
+    return on_surface(array, *place)
 
 
 def on_surface(array: ArrayGeometry, u: float, v: float) -> tuple[Float, Float]:
@@ -184,6 +236,3 @@ def on_surface(array: ArrayGeometry, u: float, v: float) -> tuple[Float, Float]:
     axes = array.rotation[nearest]
     point: Float = array.position[nearest] + axes[:, :2] @ step[nearest]
     return point, axes
-
-
-__all__ = ["Indenter", "Press", "ScriptError", "load_script", "on_surface"]

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from reachd.fields import SettingError
+from tactile_core.config import ConfigError
 from tactile_tools.experiments.axes import AXES, levels_of
 from tactile_tools.experiments.conditions import parameters_of, scene_of, world_of
 from tactile_tools.experiments.runner import StudyError, check, memory_of, summarize
@@ -112,7 +112,7 @@ def test_conditions_survive_their_text() -> None:
     conditions = Conditions(objects=(12, 16), noise=0.25, finger_width=0.05)
     assert Conditions.from_json(conditions.to_json()) == conditions
     assert Conditions().to_json() == "{}"
-    with pytest.raises(SettingError, match="least first"):
+    with pytest.raises(ConfigError, match="least first"):
         Conditions(objects=(20, 10))
 
 

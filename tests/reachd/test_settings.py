@@ -90,7 +90,7 @@ def test_the_file_says_it_all_and_flags_win(tmp_path: Path) -> None:
         ("set = 'x'", 0, "authors_sim"),
         ("\nbord = 'a'", 2, "did you mean board?"),
         ("\n\n[parameters]\n\nv_max = -1.0", 5, "v_max"),
-        ("[parameters]\nv_mx = 1.0", 2, "did you mean 'v_max'"),
+        ("[parameters]\nv_mx = 1.0", 2, "did you mean v_max"),
         ("[parameters.safety]\narm_age = 0.1\nforce = 0", 3, "force"),
         ("[parameters]\nsafety.command_expiry = 0.5", 2, "command_expiry"),
         ("[parameters.safety]\ndisabled = ['not_armed']", 2, "cannot be switched off"),

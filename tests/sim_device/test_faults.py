@@ -1,4 +1,4 @@
-"""Fault plans from text and tables."""
+"""Fault plans from text."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import pytest
 
 from sim_device.faults import ALL_TAXELS, FaultPlan, TaxelFault, TaxelFaultKind, Window
-from sim_device.scripts import ScriptError
+from tactile_core.config import ConfigError
 
 
 def test_plan_from_text() -> None:
@@ -30,19 +30,6 @@ def test_plan_from_text() -> None:
             TaxelFault(TaxelFaultKind.SATURATED, "right", 31, Window(0)),
         ),
     )
-
-
-def test_plan_from_a_table_is_that_from_text() -> None:
-    table = {
-        "seed": 7,
-        "flip": 1e-5,
-        "delay": "0.5:0.1s",
-        "silence": ["5s+2s", "9s+1s"],
-        "reset": "8s",
-        "stuck": ["left:3@2s"],
-    }
-    text = "seed=7,flip=1e-5,delay=0.5:0.1s,silence@5s+2s,silence@9s+1s,reset@8s,stuck=left:3@2s"
-    assert FaultPlan.from_table(table, "board.toml: [faults]") == FaultPlan.parse(text)
 
 
 def test_nan_is_a_failed_read() -> None:
@@ -93,15 +80,8 @@ def test_no_text_is_no_fault() -> None:
     ],
 )
 def test_bad_text_names_the_entry_and_what_is_allowed(text: str, message: str) -> None:
-    with pytest.raises(ScriptError, match=message):
+    with pytest.raises(ConfigError, match=message):
         FaultPlan.parse(text)
-
-
-def test_bad_table_names_file_and_key() -> None:
-    with pytest.raises(ScriptError, match=r"board.toml: \[faults\]: flip: 2: allowed"):
-        FaultPlan.from_table({"flip": 2}, "board.toml: [faults]")
-    with pytest.raises(ScriptError, match="loss: given True; allowed"):
-        FaultPlan.from_table({"loss": True}, "board.toml: [faults]")
 
 
 def test_plan_refuses_figures_out_of_range() -> None:

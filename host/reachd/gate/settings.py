@@ -6,9 +6,23 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
+from typing import Annotated
 
-from reachd.fields import SettingError, check_fields, number
+from msgspec import Meta
+
 from reachd.gate.workspace import Region
+from tactile_core.config import (
+    ConfigError,
+    Metres,
+    MetresPerSecond,
+    MetresPerSecond2,
+    NewtonMetres,
+    Newtons,
+    RadiansPerSecond,
+    RadiansPerSecond2,
+    Seconds,
+    check_fields,
+)
 from tactile_core.types import ArmLimits
 
 
@@ -102,64 +116,128 @@ operator's stop is "estop" or "fault", which latch."""
 class SafetySettings:
     """Limits of the safety gate. Speeds are those of the pivot, SI units."""
 
-    speed: float = number("m/s", "greatest speed of the pivot")
-    turn_rate: float = number("rad/s", "greatest turn rate")
-    acceleration: float = number("m/s²", "greatest acceleration of the pivot")
-    turn_acceleration: float = number("rad/s²", "greatest angular acceleration")
-    slow_radius: float = number("m", "distance of tip and goal within which motion is slowed")
-    slow_fraction: float = number("", "part of speed and turn rate left within it", 0.0, 1.0)
-    force: float = number("N", "in-plane force at which motion against it ends")
-    torque: float = number("N·m", "torque about the pivot at which motion against it ends")
-    soft_fraction: float = number(
-        "", "part of force or torque from which such motion is slowed", 0.0, 1.0, below=True
-    )
-    free_air_force: float = number("N", "force at arming that shows a bias or a wrong tool")
-    free_air_torque: float = number("N·m", "torque at arming that shows a bias or a wrong tool")
-    overload: float = number("", "part of force or torque at which it latches", 1.0)
-    overload_passes: float = number("", "passes of force or torque that latch it", 1.0, above=False)
-    overload_within: float = number("s", "time within which so many passes count")
-    skin_force: float = number("N", "sum of normal forces on the skin at which motion ends")
-    touch_light: float = number("N", "force on the skin from which the finger touches something")
-    touch_speed: float = number("m/s", "greatest speed against what it touches")
-    touch_soft: float = number("N", "force foreseen from which motion against it is slowed")
-    touch_hard: float = number("N", "force foreseen at which such motion ends")
-    touch_lead: float = number("s", "how far ahead a rising force is foreseen", above=False)
-    features_age: float = number("s", "age of the last valid features at which motion ends")
-    features_latch: float = number("s", "age of the last valid features at which the gate latches")
-    arm_age: float = number("s", "age of the arm's state at which motion ends")
-    arm_latch: float = number("s", "age of the arm's state at which the gate latches")
-    echo_age: float = number("s", "age at which a command must be in force at the arm")
-    frozen_after: float = number("s", "motion commanded but none reported, at which it latches")
-    future: float = number("s", "how far ahead of now an input may be stamped", 0, 1, above=False)
-    lateness: float = number("s", "lateness of the control loop at which motion ends")
-    period: float = number("s", "period of the control loop", 0.0, 0.1)
-    command_expiry: float = number("s", "how long the arm may follow a command", 0.0, 0.1)
-    request_age: float = number("s", "how old an operator's request to arm may be")
-    arm_v_max: float = number("m/s", "speed limit the arm must confirm")
-    arm_omega_max: float = number("rad/s", "turn rate limit the arm must confirm")
-    arm_f_max: float = number("N", "force limit the arm must confirm")
-    arm_m_max: float = number("N·m", "torque limit the arm must confirm")
-    tip_length: float = number("m", "from the pivot to the tip")
-    tip_region: Region
-    pivot_region: Region
-    disabled: frozenset[Check] = frozenset()
+    speed: Annotated[MetresPerSecond, Meta(gt=0, description="greatest speed of the pivot")]
+    turn_rate: Annotated[RadiansPerSecond, Meta(gt=0, description="greatest turn rate")]
+    acceleration: Annotated[
+        MetresPerSecond2, Meta(gt=0, description="greatest acceleration of the pivot")
+    ]
+    turn_acceleration: Annotated[
+        RadiansPerSecond2, Meta(gt=0, description="greatest angular acceleration")
+    ]
+    slow_radius: Annotated[
+        Metres, Meta(gt=0, description="distance of tip and goal within which motion is slowed")
+    ]
+    slow_fraction: Annotated[
+        float, Meta(gt=0, le=1, description="part of speed and turn rate left within it")
+    ]
+    force: Annotated[
+        Newtons, Meta(gt=0, description="in-plane force at which motion against it ends")
+    ]
+    torque: Annotated[
+        NewtonMetres,
+        Meta(gt=0, description="torque about the pivot at which motion against it ends"),
+    ]
+    soft_fraction: Annotated[
+        float,
+        Meta(gt=0, lt=1, description="part of force or torque from which such motion is slowed"),
+    ]
+    free_air_force: Annotated[
+        Newtons, Meta(gt=0, description="force at arming that shows a bias or a wrong tool")
+    ]
+    free_air_torque: Annotated[
+        NewtonMetres, Meta(gt=0, description="torque at arming that shows a bias or a wrong tool")
+    ]
+    overload: Annotated[
+        float, Meta(gt=1, description="part of force or torque at which it latches")
+    ]
+    overload_passes: Annotated[
+        float, Meta(ge=1, description="passes of force or torque that latch it")
+    ]
+    overload_within: Annotated[
+        Seconds, Meta(gt=0, description="time within which so many passes count")
+    ]
+    skin_force: Annotated[
+        Newtons, Meta(gt=0, description="sum of normal forces on the skin at which motion ends")
+    ]
+    touch_light: Annotated[
+        Newtons, Meta(gt=0, description="force on the skin from which the finger touches something")
+    ]
+    touch_speed: Annotated[
+        MetresPerSecond, Meta(gt=0, description="greatest speed against what it touches")
+    ]
+    touch_soft: Annotated[
+        Newtons, Meta(gt=0, description="force foreseen from which motion against it is slowed")
+    ]
+    touch_hard: Annotated[
+        Newtons, Meta(gt=0, description="force foreseen at which such motion ends")
+    ]
+    touch_lead: Annotated[
+        Seconds, Meta(ge=0, description="how far ahead a rising force is foreseen")
+    ]
+    features_age: Annotated[
+        Seconds, Meta(gt=0, description="age of the last valid features at which motion ends")
+    ]
+    features_latch: Annotated[
+        Seconds, Meta(gt=0, description="age of the last valid features at which the gate latches")
+    ]
+    arm_age: Annotated[
+        Seconds, Meta(gt=0, description="age of the arm's state at which motion ends")
+    ]
+    arm_latch: Annotated[
+        Seconds, Meta(gt=0, description="age of the arm's state at which the gate latches")
+    ]
+    echo_age: Annotated[
+        Seconds, Meta(gt=0, description="age at which a command must be in force at the arm")
+    ]
+    frozen_after: Annotated[
+        Seconds, Meta(gt=0, description="motion commanded but none reported, at which it latches")
+    ]
+    future: Annotated[
+        Seconds, Meta(ge=0, le=1, description="how far ahead of now an input may be stamped")
+    ]
+    lateness: Annotated[
+        Seconds, Meta(gt=0, description="lateness of the control loop at which motion ends")
+    ]
+    period: Annotated[Seconds, Meta(gt=0, le=0.1, description="period of the control loop")]
+    command_expiry: Annotated[
+        Seconds, Meta(gt=0, le=0.1, description="how long the arm may follow a command")
+    ]
+    request_age: Annotated[
+        Seconds, Meta(gt=0, description="how old an operator's request to arm may be")
+    ]
+    arm_v_max: Annotated[
+        MetresPerSecond, Meta(gt=0, description="speed limit the arm must confirm")
+    ]
+    arm_omega_max: Annotated[
+        RadiansPerSecond, Meta(gt=0, description="turn rate limit the arm must confirm")
+    ]
+    arm_f_max: Annotated[Newtons, Meta(gt=0, description="force limit the arm must confirm")]
+    arm_m_max: Annotated[NewtonMetres, Meta(gt=0, description="torque limit the arm must confirm")]
+    tip_length: Annotated[Metres, Meta(gt=0, description="from the pivot to the tip")]
+    tip_region: Annotated[Region, Meta(description="where the tip may go, in `cupboard`")]
+    pivot_region: Annotated[Region, Meta(description="where the pivot may go, in `cupboard`")]
+    disabled: Annotated[
+        frozenset[Check], Meta(description="checks that are switched off, by reason code")
+    ] = frozenset()
 
     def __post_init__(self) -> None:
         """Refuse values out of range, limits that contradict one another, checks that must stay."""
         check_fields(self)
-        for name, region in (("tip_region", self.tip_region), ("pivot_region", self.pivot_region)):
-            if not isinstance(region, Region):
-                raise SettingError(f"{name} is a list of corners [x, y] in m, not {region!r}")
         for soon, late in (("features_age", "features_latch"), ("arm_age", "arm_latch")):
-            if getattr(self, late) < getattr(self, soon):
-                raise SettingError(f"{late} must be at least {soon} ({getattr(self, soon):g} s)")
-            if getattr(self, soon) <= self.period:
-                raise SettingError(f"{soon} must exceed the loop's period ({self.period:g} s)")
+            age = getattr(self, soon)
+            if getattr(self, late) < age:
+                raise ConfigError(f"{late} must be at least {soon} ({age:g} s)", (soon,))
+            if age <= self.period:
+                raise ConfigError(
+                    f"{soon} must exceed the loop's period ({self.period:g} s)", (soon,)
+                )
         if self.touch_hard <= self.touch_soft:
-            raise SettingError(f"touch_hard must exceed touch_soft ({self.touch_soft:g} N)")
+            raise ConfigError(
+                f"touch_hard must exceed touch_soft ({self.touch_soft:g} N)", ("touch_hard",)
+            )
         kept = sorted(self.disabled & ALWAYS_ON)
         if kept:
-            raise SettingError(f"the check {kept[0]!s} cannot be switched off")
+            raise ConfigError(f"the check {kept[0]!s} cannot be switched off", ("disabled",))
 
     @property
     def cautions(self) -> tuple[str, ...]:

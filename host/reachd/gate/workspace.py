@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from reachd.fields import SettingError
+from tactile_core.config import ConfigError
 
 MAX_CORNERS = 16
 """Corners of a region: each is two constraints a control cycle, and no lab's shelf needs more."""
@@ -29,21 +28,21 @@ class Region:
     borders: tuple[Border, ...] = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Work out the borders; SettingError for what is no counter-clockwise convex polygon."""
+        """Work out the borders; ConfigError for what is no counter-clockwise convex polygon."""
         corners = self.corners
         if not 3 <= len(corners) <= MAX_CORNERS:
-            raise SettingError(f"a region has 3 to {MAX_CORNERS} corners, not {len(corners)}")
+            raise ConfigError(f"a region has 3 to {MAX_CORNERS} corners, not {len(corners)}")
         if any(len(c) != 2 or not all(math.isfinite(v) for v in c) for c in corners):
-            raise SettingError(f"corners of a region are pairs of finite numbers in m: {corners}")
+            raise ConfigError(f"corners of a region are pairs of finite numbers in m: {corners}")
         borders = []
         for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
             length = math.hypot(bx - ax, by - ay)
             if length == 0.0:
-                raise SettingError(f"a region has the corner ({ax:g}, {ay:g}) twice in a row")
+                raise ConfigError(f"a region has the corner ({ax:g}, {ay:g}) twice in a row")
             nx, ny = (by - ay) / length, (ax - bx) / length
             borders.append(Border(nx, ny, nx * ax + ny * ay))
         if any(b.nx * x + b.ny * y > b.offset + 1e-9 for b in borders for x, y in corners):
-            raise SettingError(f"a region must be convex, corners counter-clockwise: {corners}")
+            raise ConfigError(f"a region must be convex, corners counter-clockwise: {corners}")
         object.__setattr__(self, "borders", tuple(borders))
 
     def depth(self, x: float, y: float) -> float:
@@ -54,13 +53,3 @@ class Region:
 def box(x_min: float, x_max: float, y_min: float, y_max: float) -> Region:
     """Rectangle along the axes, m in ``cupboard``."""
     return Region(((x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)))
-
-
-def region(corners: Iterable[Iterable[float]]) -> Region:
-    """Region from lists of numbers, as a configuration file holds them."""
-    try:
-        return Region(tuple((float(x), float(y)) for x, y in corners))
-    except (TypeError, ValueError) as error:
-        if isinstance(error, SettingError):
-            raise
-        raise SettingError(f"a region is a list of corners [x, y] in m, not {corners!r}") from error

@@ -5,11 +5,22 @@ The symbols in the descriptions are the paper's.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Literal
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
-from reachd.fields import SettingError, check_fields, choice, flag, number
+from msgspec import Meta
+
 from reachd.gate.settings import SafetySettings
+from tactile_core.config import (
+    ConfigError,
+    Metres,
+    MetresPerSecond,
+    Newtons,
+    Radians,
+    RadiansPerSecond,
+    Seconds,
+    check_fields,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -18,65 +29,104 @@ class Parameters:
 
     name: str
 
-    v_max: float = number("m/s", "v_max, speed of every primitive")
-    omega_max: float = number("rad/s", "ω_max, turn rate of straight and burrow")
-    time_limit: float = number("s", "t_tot, time a reach may take")
-    goal_radius: float = number("m", "distance of tip and goal that counts as success")
-    success_during_excavation: bool = flag("whether success is tested during an excavation")
-    tip_length: float = number("m", "L, from the pivot to the tip")
+    v_max: Annotated[MetresPerSecond, Meta(gt=0, description="v_max, speed of every primitive")]
+    omega_max: Annotated[
+        RadiansPerSecond, Meta(gt=0, description="ω_max, turn rate of straight and burrow")
+    ]
+    time_limit: Annotated[Seconds, Meta(gt=0, description="t_tot, time a reach may take")]
+    goal_radius: Annotated[
+        Metres, Meta(gt=0, description="distance of tip and goal that counts as success")
+    ]
+    success_during_excavation: Annotated[
+        bool, Meta(description="whether success is tested during an excavation")
+    ]
+    tip_length: Annotated[Metres, Meta(gt=0, description="L, from the pivot to the tip")]
 
-    commanded_point: Literal["tip", "pivot"] = choice(
-        ("tip", "pivot"), "point that gets the velocity of equations (1) and (3)"
-    )
-    slow_radius: float = number("m", "distance to the goal within which a strategy slows", 0.0)
-    slow_fraction: float = number("", "part of the speed left within it", 0.0, 1.0)
-    slow_for: Literal["every", "straight"] = choice(
-        ("every", "straight"), "which motion is slowed near the goal"
-    )
-    turn_tolerance: float = number("rad", "|φ − θ| within which turning tapers", 0, 1, above=False)
-    straight_turn_within: float = number("rad/s", "turn rate of straight within it", above=False)
-    burrow_turn_within: float = number("rad/s", "turn rate of burrow within it", above=False)
+    commanded_point: Annotated[
+        Literal["tip", "pivot"],
+        Meta(description="point that gets the velocity of equations (1) and (3)"),
+    ]
+    slow_radius: Annotated[
+        Metres, Meta(gt=0, description="distance to the goal within which a strategy slows")
+    ]
+    slow_fraction: Annotated[
+        float, Meta(gt=0, le=1, description="part of the speed left within it")
+    ]
+    slow_for: Annotated[
+        Literal["every", "straight"], Meta(description="which motion is slowed near the goal")
+    ]
+    turn_tolerance: Annotated[
+        Radians, Meta(ge=0, le=1, description="|φ − θ| within which turning tapers")
+    ]
+    straight_turn_within: Annotated[
+        RadiansPerSecond, Meta(ge=0, description="turn rate of straight within it")
+    ]
+    burrow_turn_within: Annotated[
+        RadiansPerSecond, Meta(ge=0, description="turn rate of burrow within it")
+    ]
 
-    burrow_amplitude: float = number(
-        "", "A_bur, 0 straight to 1 sideways", 0.0, 1.0, above=False, below=True
-    )
-    burrow_frequency: float = number("rad/s", "f_bur, as it multiplies t in the sine")
-    burrow_law: Literal["unit", "literal"] = choice(
-        ("unit", "literal"), "whether d̂ or v_max·d̂ is added to the sine in equation (3)"
-    )
+    burrow_amplitude: Annotated[
+        float, Meta(ge=0, lt=1, description="A_bur, 0 straight to 1 sideways")
+    ]
+    burrow_frequency: Annotated[
+        RadiansPerSecond, Meta(gt=0, description="f_bur, as it multiplies t in the sine")
+    ]
+    burrow_law: Annotated[
+        Literal["unit", "literal"],
+        Meta(description="whether d̂ or v_max·d̂ is added to the sine in equation (3)"),
+    ]
 
-    excavate_duration: float = number("s", "t_excv, time an excavation takes")
-    trigger_interval: float = number("s", "t_trig, time between excavations by the clock")
-    excavate_omega_max: float = number("rad/s", "ω_max of equation (7)")
-    spiral_growth: float = number("", "s_excv, by how much the spiral grows", 1.0, above=False)
-    excavate_law: Literal["tip_spiral", "literal"] = choice(
-        ("tip_spiral", "literal"), "whether the tip traces the spiral of equation (5)"
-    )
-    excavate_heading: Literal["start", "current"] = choice(
-        ("start", "current"), "which heading turns the spiral, R_θ"
-    )
-    excavate_needs_time: bool = flag("whether an excavation starts only if it can be finished")
-    ccw_chance: float = number("", "chance of CCW by the clock", 0.0, 1.0, above=False)
+    excavate_duration: Annotated[
+        Seconds, Meta(gt=0, description="t_excv, time an excavation takes")
+    ]
+    trigger_interval: Annotated[
+        Seconds, Meta(gt=0, description="t_trig, time between excavations by the clock")
+    ]
+    excavate_omega_max: Annotated[RadiansPerSecond, Meta(gt=0, description="ω_max of equation (7)")]
+    spiral_growth: Annotated[float, Meta(ge=1, description="s_excv, by how much the spiral grows")]
+    excavate_law: Annotated[
+        Literal["tip_spiral", "literal"],
+        Meta(description="whether the tip traces the spiral of equation (5)"),
+    ]
+    excavate_heading: Annotated[
+        Literal["start", "current"], Meta(description="which heading turns the spiral, R_θ")
+    ]
+    excavate_needs_time: Annotated[
+        bool, Meta(description="whether an excavation starts only if it can be finished")
+    ]
+    ccw_chance: Annotated[float, Meta(ge=0, le=1, description="chance of CCW by the clock")]
 
-    force_measure: Literal["peak", "sum"] = choice(
-        ("peak", "sum"), "which force F_bur and F_excv are compared with"
-    )
-    burrow_force: float = number("N", "F_bur, force above which hybrid_event burrows")
-    excavate_force: float = number("N", "F_excv, force that with a stall excavates")
-    push_force_min: float = number("N", "F_push,min of a light tip contact", above=False)
-    push_force_max: float = number("N", "F_push,max of a light tip contact")
-    push_time: float = number("s", "t_push, light tip contact that excavates")
-    push_dropout: float = number("s", "gap in a tip contact that is overlooked", above=False)
-    progress_time: float = number("s", "t_prog, lag behind v_max that is a stall")
-    progress_reference: Literal["excavation_start", "excavation_end"] = choice(
-        ("excavation_start", "excavation_end"), "distance from which progress counts anew"
-    )
-    direction_from: Literal["side", "cupboard_y"] = choice(
-        ("side", "cupboard_y"), "what tells left from right at the peak contact"
-    )
-    direction_obedience: float = number(
-        "", "chance that the direction follows the contact", 0.0, 1.0, above=False
-    )
+    force_measure: Annotated[
+        Literal["peak", "sum"], Meta(description="which force F_bur and F_excv are compared with")
+    ]
+    burrow_force: Annotated[
+        Newtons, Meta(gt=0, description="F_bur, force above which hybrid_event burrows")
+    ]
+    excavate_force: Annotated[
+        Newtons, Meta(gt=0, description="F_excv, force that with a stall excavates")
+    ]
+    push_force_min: Annotated[Newtons, Meta(ge=0, description="F_push,min of a light tip contact")]
+    push_force_max: Annotated[Newtons, Meta(gt=0, description="F_push,max of a light tip contact")]
+    push_time: Annotated[
+        Seconds, Meta(gt=0, description="t_push, light tip contact that excavates")
+    ]
+    push_dropout: Annotated[
+        Seconds, Meta(ge=0, description="gap in a tip contact that is overlooked")
+    ]
+    progress_time: Annotated[
+        Seconds, Meta(gt=0, description="t_prog, lag behind v_max that is a stall")
+    ]
+    progress_reference: Annotated[
+        Literal["excavation_start", "excavation_end"],
+        Meta(description="distance from which progress counts anew"),
+    ]
+    direction_from: Annotated[
+        Literal["side", "cupboard_y"],
+        Meta(description="what tells left from right at the peak contact"),
+    ]
+    direction_obedience: Annotated[
+        float, Meta(ge=0, le=1, description="chance that the direction follows the contact")
+    ]
 
     safety: SafetySettings
     note: str = ""
@@ -85,28 +135,26 @@ class Parameters:
         """Refuse values out of range and values that contradict one another."""
         check_fields(self)
         if self.push_force_max <= self.push_force_min:
-            raise SettingError(
+            raise ConfigError(
                 f"push_force_max ({self.push_force_max:g} N) must exceed push_force_min "
-                f"({self.push_force_min:g} N)"
+                f"({self.push_force_min:g} N)",
+                ("push_force_max",),
             )
         if self.safety.speed < self.v_max:
-            raise SettingError(
+            raise ConfigError(
                 f"v_max ({self.v_max:g} m/s) exceeds safety.speed ({self.safety.speed:g} m/s): "
-                "set both"
+                "set both",
+                ("v_max",),
             )
         fastest = max(self.omega_max, self.excavate_omega_max)
         if self.safety.turn_rate < fastest:
-            raise SettingError(
+            raise ConfigError(
                 f"omega_max ({fastest:g} rad/s) exceeds safety.turn_rate "
-                f"({self.safety.turn_rate:g} rad/s): set both"
+                f"({self.safety.turn_rate:g} rad/s): set both",
+                ("omega_max",),
             )
 
     @property
     def burrow_ratio(self) -> float:
         """A/(1 − A) of equation (4)."""
         return self.burrow_amplitude / (1.0 - self.burrow_amplitude)
-
-
-def names_of(settings: type) -> tuple[str, ...]:
-    """Names of all fields of a dataclass."""
-    return tuple(f.name for f in fields(settings))

@@ -11,12 +11,22 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from reachd.fields import SettingError, check_known, replaced
+import msgspec
+
 from reachd.gate.settings import Check, SafetySettings
-from reachd.gate.workspace import box, region
-from reachd.strategies.parameter_fields import Parameters, names_of
+from reachd.gate.workspace import MAX_CORNERS, Region, box
+from reachd.strategies.parameter_fields import Parameters
+from tactile_core.config import (
+    ConfigError,
+    Metres,
+    allowed_values,
+    convert,
+    given,
+    table_of,
+    unit,
+)
 from tactile_core.geometry import TIP_X
 
 # Ages and periods are ours, the same for every arm: rows 4, 15, 16 and 24 of the fault table.
@@ -226,66 +236,69 @@ AUTHORS_SIM = replace(
 SETS: Mapping[str, Parameters] = MappingProxyType({s.name: s for s in (HARDWARE, AUTHORS_SIM)})
 """The parameter sets by name."""
 
-_SAFETY_NAMES = names_of(SafetySettings)
-_NAMES = tuple(name for name in names_of(Parameters) if name not in ("name", "safety", "note"))
-_ALL_NAMES = (*_NAMES, *(f"safety.{name}" for name in _SAFETY_NAMES))
+Corners = Annotated[
+    tuple[tuple[Metres, Metres], ...],
+    unit("m"),
+    allowed_values(f"3 to {MAX_CORNERS} corners [x, y] of a convex region, counter-clockwise"),
+]
+if TYPE_CHECKING:
+
+    class GateTable(msgspec.Struct, frozen=True):
+        """``[parameters.safety]``: limits of the gate that differ from the set's."""
+
+    class ParameterTable(msgspec.Struct, frozen=True):
+        """``[parameters]``: values that differ from the set's."""
+
+        safety: GateTable = GateTable()
+else:
+    GateTable = table_of("GateTable", SafetySettings, tip_region=Corners, pivot_region=Corners)
+    ParameterTable = table_of(
+        "ParameterTable", Parameters, without=("name", "note"), safety=GateTable
+    )
 
 
-def parameters(name: str, overrides: Mapping[str, object] | None = None) -> Parameters:
+def parameters(
+    name: str, overrides: Mapping[str, object] | ParameterTable | None = None
+) -> Parameters:
     """Parameter set ``name`` with single values overridden.
 
-    Keys are field names, those of the gate as ``safety.force`` or in a mapping under ``safety``;
-    regions are lists of corners [x, y] in m, ``safety.disabled`` a list of reason codes. Raises
-    SettingError for an unknown set or key and for a value out of its range.
+    ``overrides``: what a file said, or a mapping of field names, those of the gate as
+    ``safety.force`` or in a mapping under ``safety``; regions are corners [x, y] in m,
+    ``safety.disabled`` reason codes. `ConfigError` for an unknown set or key and for a value out
+    of its range.
     """
     if name not in SETS:
-        raise SettingError(f"unknown parameter set {name!r}; there are: {', '.join(SETS)}")
+        raise ConfigError(f"unknown parameter set {name!r}; available: {', '.join(SETS)}")
     chosen = SETS[name]
-    given = _flat(overrides or {})
-    check_known(_ALL_NAMES, given, "parameter")
-    for_gate = {
-        key.removeprefix("safety."): _gate_value(key, value)
-        for key, value in given.items()
-        if key.startswith("safety.")
-    }
-    own = {key: value for key, value in given.items() if not key.startswith("safety.")}
+    if not isinstance(overrides, ParameterTable):
+        overrides = convert(_nested(overrides or {}), ParameterTable)
+    own = given(overrides)
+    gate = given(own.pop("safety"))
     try:
-        safety = replaced(chosen.safety, for_gate)
-    except SettingError as error:
-        raise SettingError(f"safety.{error}") from error
-    return replaced(chosen, {**own, "safety": safety})
+        for key in {"tip_region", "pivot_region"} & set(gate):
+            gate[key] = _region(key, gate[key])
+        safety = replace(chosen.safety, **gate)
+    except ConfigError as error:
+        raise ConfigError(f"safety.{error}", ("safety", *error.keys)) from error
+    return replace(chosen, safety=safety, **own)
 
 
-def _flat(given: Mapping[str, object]) -> dict[str, object]:
-    """Bring a table under ``safety`` to dotted keys."""
-    flat: dict[str, object] = {}
-    for key, value in given.items():
-        if key == "safety":
-            if not isinstance(value, Mapping):
-                raise SettingError(f"safety is a table of limits, not {value!r}")
-            flat.update({f"safety.{inner}": v for inner, v in value.items()})
+def _nested(overrides: Mapping[str, object]) -> dict[str, object]:
+    """Bring keys such as ``safety.force`` into a table under ``safety``."""
+    nested: dict[str, object] = {}
+    gate: dict[str, object] = {}
+    for key, value in overrides.items():
+        if key == "safety" and isinstance(value, Mapping):
+            gate |= value
+        elif key.startswith("safety."):
+            gate[key.removeprefix("safety.")] = value
         else:
-            flat[key] = value
-    return flat
+            nested[key] = value
+    return {"safety": gate, **nested} if gate else nested
 
 
-def _gate_value(key: str, value: object) -> object:
-    """Read the values of the gate that are no numbers."""
-    if key.endswith("_region"):
-        if not isinstance(value, Iterable):
-            raise SettingError(f"{key} is a list of corners [x, y] in m, not {value!r}")
-        return region(value)
-    if key == "safety.disabled":
-        if isinstance(value, str) or not isinstance(value, Iterable):
-            raise SettingError(f"{key} is a list of reason codes, not {value!r}")
-        return frozenset(_check(code) for code in value)
-    return value
-
-
-def _check(code: object) -> Check:
+def _region(key: str, corners: Iterable[tuple[float, float]]) -> Region:
     try:
-        return Check(str(code))
-    except ValueError as error:
-        raise SettingError(
-            f"safety.disabled: no check is called {code!r}; there are: {', '.join(Check)}"
-        ) from error
+        return Region(tuple(corners))
+    except ConfigError as error:
+        raise ConfigError(f"{key}: {error}", (key,)) from error

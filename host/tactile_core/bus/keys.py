@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import stat
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
+from msgspec import Meta
 
 from tactile_core.bus.rights import CERTIFICATE_ROLES, CertificateRole
 from tactile_core.config import ConfigError, load_toml
@@ -24,11 +26,19 @@ class KeysError(Exception):
 class Roles(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Certificate names of each role; whoever is on no list is let do nothing."""
 
-    tactiled: tuple[str, ...] = ()
-    reachd: tuple[str, ...] = ()
-    arm: tuple[str, ...] = ()
-    operator: tuple[str, ...] = ()
-    viewer: tuple[str, ...] = ()
+    tactiled: Annotated[
+        tuple[str, ...], Meta(description="certificate names of those that publish boards")
+    ] = ()
+    reachd: Annotated[
+        tuple[str, ...], Meta(description="certificate names of those that command arms")
+    ] = ()
+    arm: Annotated[tuple[str, ...], Meta(description="certificate names of arm drivers")] = ()
+    operator: Annotated[
+        tuple[str, ...], Meta(description="certificate names of those who may ask for all")
+    ] = ()
+    viewer: Annotated[
+        tuple[str, ...], Meta(description="certificate names of those who may only look")
+    ] = ()
 
     def table(self) -> dict[CertificateRole, tuple[str, ...]]:
         """Names by role."""
@@ -41,11 +51,11 @@ class TlsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     ``name``: this party's own common name, so that what it may not ask can be told at once.
     """
 
-    root_ca: str
-    certificate: str
-    private_key: str
+    root_ca: Annotated[str, Meta(description="PEM file of the lab's own authority")]
+    certificate: Annotated[str, Meta(description="PEM file of this party's certificate")]
+    private_key: Annotated[str, Meta(description="PEM file of its private key")]
     roles: Roles
-    name: str = ""
+    name: Annotated[str, Meta(description="this party's own common name")] = ""
 
     def role(self) -> CertificateRole | None:
         """Role of this party's own certificate, None where ``name`` does not say."""
@@ -57,7 +67,7 @@ class TlsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 class RolesFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``roles.toml``."""
 
-    name: str = ""
+    name: Annotated[str, Meta(description="common name of the party the folder is for")] = ""
     roles: Roles
 
 

@@ -10,13 +10,15 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from importlib.metadata import version
+from typing import Annotated
 
 import msgspec
 import zstandard
+from msgspec import Meta
 
 from tactile_core.bus.messages import codec
 from tactile_core.bus.topics import Topic
-from tactile_core.config import Count, Duration, FlushPeriod, Size
+from tactile_core.config import Bytes, Count, Duration, Seconds
 from tactile_core.log.mcap_file import ZSTD_LEVEL, ChunkBuffer, McapFile, SealedChunk, Storage
 from tactile_core.log.retention import LogSet, enforce
 
@@ -133,18 +135,40 @@ LATCHED_MAX = 64
 
 
 class RecorderSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How logs are cut, kept and bounded. Sizes in bytes, durations in s."""
+    """``[log.recorder]``: how logs are cut, kept and bounded."""
 
-    split_bytes: Count = 1 << 30
-    split_seconds: Duration = 3600.0
-    min_free_bytes: Size = 1 << 30  # logging stops, loudly, when less is free (faults.md row 30)
-    max_files: Count | None = None  # retention: the oldest go when there are more; None keeps all
-    max_bytes: Count | None = None
-    flush_period: FlushPeriod = 0.25  # what `kill -9` may cost, plus the time of one write
-    chunk_bytes: Count = 1 << 20
-    queue_messages: Count = 16384  # 27 s of one board's six streams at 100 Hz
-    queue_bytes: Count = 64 << 20
-    retry_seconds: Duration = 1.0
+    split_bytes: Annotated[
+        Bytes, Meta(gt=0, description="a new file begins when this one is larger")
+    ] = 1 << 30
+    split_seconds: Annotated[
+        Duration, Meta(description="a new file begins when this one is older")
+    ] = 3600.0
+    min_free_bytes: Annotated[
+        Bytes, Meta(ge=0, description="logging stops, loudly, when less is free on the disk")
+    ] = 1 << 30
+    max_files: Annotated[
+        Count | None,
+        Meta(description="the oldest files of a name go when there are more; left out: all stay"),
+    ] = None
+    max_bytes: Annotated[
+        Annotated[Bytes, Meta(gt=0)] | None,
+        Meta(description="the oldest files of a name go when all of them take more"),
+    ] = None
+    flush_period: Annotated[
+        Seconds,
+        Meta(gt=0, le=0.5, description="what `kill -9` may cost, plus the time of one write"),
+    ] = 0.25
+    chunk_bytes: Annotated[
+        Bytes, Meta(gt=0, description="a chunk is written when it is larger, before its time")
+    ] = 1 << 20
+    queue_messages: Annotated[
+        Count,
+        Meta(description="messages that may wait; the default is 27 s of one board at 100 Hz"),
+    ] = 16384
+    queue_bytes: Annotated[Bytes, Meta(gt=0, description="bytes that may wait")] = 64 << 20
+    retry_seconds: Annotated[
+        Duration, Meta(description="first pause before a file that failed is opened again")
+    ] = 1.0
 
 
 @dataclass(slots=True, eq=False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 
-from reachd.fields import SettingError
 from reachd.strategies.parameter_fields import Parameters
 from sim_device.world.base import World
 from sim_device.world.engines import make_world
@@ -13,6 +12,7 @@ from sim_device.world.parameters import Friction, WorldParameters, world_paramet
 from sim_device.world.scene_generation import GENERATORS, generate
 from sim_device.world.scene_loading import load_scene
 from sim_device.world.scenes import Scene
+from tactile_core.config import ConfigError
 from tactile_tools.experiments.degraded_touch import DegradedContacts, DegradedTaxels
 from tactile_tools.experiments.spec import Conditions, TrialSpec
 from tactile_tools.reach.touch_senses import Sense
@@ -32,7 +32,7 @@ def build_scene(source: str, seed: int, objects: tuple[int, int] | None) -> Scen
     if objects is None:
         return load_scene(source, seed)
     if source not in GENERATORS:
-        raise SettingError(
+        raise ConfigError(
             f"the number of objects cannot be set in {source}; it can in "
             f"{', '.join(sorted(GENERATORS))}"
         )
@@ -45,7 +45,7 @@ def scene_of(spec: TrialSpec) -> Scene:
 
 
 def world_of(spec: TrialSpec, scene: Scene) -> World:
-    """The world of ``spec``; SettingError, or ValueError where the engine is not installed."""
+    """The world of ``spec``; ConfigError, or ValueError where the engine is not installed."""
     figures = world_parameters(scene.parameters)
     changed = _figures(figures, spec.changed)
     return make_world(spec.engine, scene, changed)
@@ -73,7 +73,7 @@ def _figures(figures: WorldParameters, conditions: Conditions) -> WorldParameter
 
 
 def parameters_of(spec: TrialSpec) -> Parameters:
-    """The parameters of ``spec``; SettingError."""
+    """The parameters of ``spec``; ConfigError."""
     resolved = spec.resolved()
     rate = spec.changed.feature_rate
     if rate is None:

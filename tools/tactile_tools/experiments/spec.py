@@ -5,12 +5,25 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from reachd.fields import SettingError, check_known
+from msgspec import Meta
+
 from reachd.strategies.parameter_fields import Parameters
 from reachd.strategies.parameters import parameters
+from tactile_core.config import (
+    ConfigError,
+    Fraction,
+    Hertz,
+    Metres,
+    Newtons,
+    check_fields,
+    convert,
+    given,
+    table_of,
+)
 
+Coefficient = Annotated[float, Meta(ge=0.01, le=2)]
 Depth = Literal["contacts", "taxels"]
 
 DEPTHS: tuple[Depth, ...] = ("contacts", "taxels")
@@ -22,37 +35,41 @@ STRATEGIES = ("straight", "burrow", "excavate", "hybrid_clock", "hybrid_event")
 class Conditions:
     """How the world and the sense of touch differ from those of the parameter set.
 
-    ``objects``: least and greatest number of objects. ``friction_objects``: Coulomb coefficient
-    of object on object (other pairs at least as much); ``friction_all``: of every pair.
-    ``finger_width`` m. ``noise``: N, standard deviation added to what is felt. ``feature_rate``:
-    Hz at which touch is renewed. ``dead_taxels``: fraction that reports nothing.
+    What is None is as the set says.
     """
 
-    objects: tuple[int, int] | None = None
-    friction_objects: float | None = None
-    friction_all: float | None = None
-    finger_width: float | None = None
-    noise: float = 0.0
-    feature_rate: float | None = None
-    dead_taxels: float = 0.0
+    objects: Annotated[
+        tuple[int, int] | None, Meta(description="least and greatest number of objects")
+    ] = None
+    friction_objects: Annotated[
+        Coefficient | None,
+        Meta(description="Coulomb coefficient of object on object; other pairs at least as much"),
+    ] = None
+    friction_all: Annotated[
+        Coefficient | None, Meta(description="Coulomb coefficient of every pair")
+    ] = None
+    finger_width: Annotated[
+        Annotated[Metres, Meta(ge=0.02, le=0.12)] | None, Meta(description="width of the finger")
+    ] = None
+    noise: Annotated[
+        Newtons,
+        Meta(ge=0, le=100, description="standard deviation added to what is felt"),
+    ] = 0.0
+    feature_rate: Annotated[
+        Annotated[Hertz, Meta(ge=1, le=100)] | None, Meta(description="how often touch is renewed")
+    ] = None
+    dead_taxels: Annotated[
+        Fraction, Meta(description="part of the taxels that reports nothing")
+    ] = 0.0
 
     def __post_init__(self) -> None:
         """Refuse values that no world has."""
+        check_fields(self)
         if self.objects is not None:
             low, high = self.objects
             if not 0 <= low <= high:
-                raise SettingError(f"objects is {low} to {high}: least first, none below 0")
-        for name, low_, high_ in (
-            ("friction_objects", 0.01, 2.0),
-            ("friction_all", 0.01, 2.0),
-            ("finger_width", 0.02, 0.12),
-            ("noise", 0.0, 100.0),
-            ("feature_rate", 1.0, 100.0),
-            ("dead_taxels", 0.0, 1.0),
-        ):
-            value = getattr(self, name)
-            if value is not None and not low_ <= value <= high_:
-                raise SettingError(f"{name} is {value!r}; allowed: {low_:g} to {high_:g}")
+                problem = f"objects is {low} to {high}: least first, none below 0"
+                raise ConfigError(problem, ("objects",))
 
     def to_json(self) -> str:
         """Canonical text of what differs; "{}" when nothing does."""
@@ -63,21 +80,11 @@ class Conditions:
 
     @classmethod
     def from_json(cls, text: str) -> Conditions:
-        """Inverse of `to_json`; SettingError for unknown names."""
-        raw = table_of(text, "conditions")
-        check_known([f.name for f in fields(cls)], raw, "condition")
-        if raw.get("objects") is not None:
-            try:
-                low, high = raw["objects"]
-                raw["objects"] = (int(low), int(high))
-            except (TypeError, ValueError):
-                raise SettingError(
-                    f"objects is {raw['objects']!r}, not the least and the greatest number"
-                ) from None
-        try:
-            return cls(**raw)
-        except TypeError as error:
-            raise SettingError(f"conditions {text}: {error}") from None
+        """Inverse of `to_json`; `ConfigError` for unknown names and values out of range."""
+        return cls(**given(convert(_table(text, "conditions"), _ConditionsTable)))
+
+
+_ConditionsTable = table_of("ConditionsTable", Conditions)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,19 +106,19 @@ class TrialSpec:
     conditions: str = "{}"
 
     def resolved(self) -> Parameters:
-        """The parameters; SettingError."""
-        return parameters(self.set, table_of(self.parameters, "parameters"))
+        """The parameters; ConfigError."""
+        return parameters(self.set, _table(self.parameters, "parameters"))
 
     @property
     def changed(self) -> Conditions:
-        """The conditions; SettingError."""
+        """The conditions; ConfigError."""
         return Conditions.from_json(self.conditions)
 
     @property
     def typed_depth(self) -> Depth:
-        """The depth of sensing; SettingError."""
+        """The depth of sensing; ConfigError."""
         if self.depth not in DEPTHS:
-            raise SettingError(f"unknown depth {self.depth!r}; there are: {', '.join(DEPTHS)}")
+            raise ConfigError(f"unknown depth {self.depth!r}; there are: {', '.join(DEPTHS)}")
         return self.depth
 
 
@@ -128,12 +135,12 @@ def canonical(values: Mapping[str, Any]) -> str:
     return json.dumps(dict(values), sort_keys=True, separators=(",", ":"))
 
 
-def table_of(text: str, what: str) -> dict[str, Any]:
-    """The JSON object in ``text``; SettingError."""
+def _table(text: str, what: str) -> dict[str, Any]:
+    """The JSON object in ``text``; ConfigError."""
     try:
         raw = json.loads(text)
     except json.JSONDecodeError as error:
-        raise SettingError(f"{what} {text!r} is no JSON: {error}") from None
+        raise ConfigError(f"{what} {text!r} is not JSON: {error}") from None
     if not isinstance(raw, dict):
-        raise SettingError(f"{what} {text!r} is no table of names and values")
+        raise ConfigError(f"{what} {text!r} is not a table of names and values")
     return raw

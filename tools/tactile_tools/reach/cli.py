@@ -65,9 +65,9 @@ def _seed(text: str) -> int:
 def run(options: argparse.Namespace) -> int:
     """Run one trial and print what became of it."""
     # Physics and strategies take half a second to import: not before a trial is really wanted.
-    from reachd.fields import SettingError
     from reachd.strategies import StrategyError
     from sim_device.world.base import WorldError
+    from tactile_core.config import ConfigError
 
     if options.png is not None and options.log is None:
         print("tactile reach: --png is drawn from the log: give --log as well", file=sys.stderr)
@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
 
             draw_reach(options.log, options.png)
             print(f"wrote {options.png}")
-    except (StrategyError, SettingError, ValueError) as error:
+    except (StrategyError, ConfigError, ValueError) as error:
         print(f"tactile reach: {error}", file=sys.stderr)
         return 2
     except BrokenPipeError:

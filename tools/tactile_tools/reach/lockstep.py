@@ -79,7 +79,7 @@ def run_trial(
     sense: Sense | None = None,
     watch: Callable[[Step], None] | None = None,
 ) -> Result:
-    """Run one trial to its end. StrategyError, SettingError or WorldError where it cannot be run.
+    """Run one trial to its end. StrategyError, ConfigError or WorldError where it cannot be run.
 
     ``seed``: strategy, board and arm draw from generators made of it. ``world``: another engine
     than MuJoCo. ``watch``: called once a control cycle.

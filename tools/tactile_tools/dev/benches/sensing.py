@@ -26,8 +26,9 @@ from tactiled.blocks import SampleBlock
 from tactiled.sensing.consensus import Consensus
 from tactiled.sensing.forces import ForceModel
 from tactiled.sensing.layout import Layout
-from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
+from tactiled.sensing.pipeline import BoardPipeline
 from tactiled.sensing.ransac_plane import fit_plane
+from tactiled.sensing.settings import Method, PipelineSettings
 
 Float = NDArray[np.float64]
 
@@ -58,7 +59,7 @@ def four_by_sixteen() -> SkinGeometry:
 
 
 def bench_pipeline(
-    *, quick: bool = False, cycles: int | None = None, method: str = "consensus", seed: int = 0
+    *, quick: bool = False, cycles: int | None = None, method: Method = "consensus", seed: int = 0
 ) -> dict[str, float]:
     """Milliseconds from the bytes of one cycle to its features, 4 arrays × 16 taxels.
 
@@ -192,7 +193,7 @@ def bench_rotation(
     quick: bool = False,
     steps: int | None = None,
     contact_sets: int | None = None,
-    methods: tuple[str, ...] | None = None,
+    methods: tuple[Method, ...] | None = None,
     seed: int = 0,
 ) -> dict[str, float]:
     """False forces while the board turns through 360° in 50 µT, uncompensated and compensated.
@@ -249,7 +250,7 @@ def _calibrated(seed: int) -> BoardCalibration:
 
 
 def _turn(
-    share: float, method: str, noisy: bool, steps: int, seed: int, calibration: BoardCalibration
+    share: float, method: Method, noisy: bool, steps: int, seed: int, calibration: BoardCalibration
 ) -> _Turn:
     """Turn the default finger once with a share of every array's taxels pressed."""
     rng = np.random.default_rng(seed)

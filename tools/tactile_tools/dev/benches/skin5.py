@@ -13,7 +13,8 @@ from sim_device.skin.skin import Contact, SkinModel, nominal_calibration
 from tactile_core.geometry import anyskin
 from tactile_core.types import NS_PER_S, Instant
 from tactiled.blocks import Cycle, SampleBlock
-from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
+from tactiled.sensing.pipeline import BoardPipeline
+from tactiled.sensing.settings import Method, PipelineSettings
 
 Float = NDArray[np.float64]
 
@@ -30,7 +31,7 @@ TURN_RAD_PER_S = 1.0
 class Board:
     """A simulated AnySkin board with its factory calibration, under the sensing pipeline."""
 
-    def __init__(self, seed: int, method: str = "consensus") -> None:
+    def __init__(self, seed: int, method: Method = "consensus") -> None:
         self._rng = np.random.default_rng([seed, 5])
         self.geometry = anyskin()
         self.skin = SkinModel(self.geometry, anyskin_parameters(), self._rng)
