@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 SOAK_MINUTES ?= 60
 KILLS ?= 1000
 
-.PHONY: setup test test-random lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage stress soak fuzz-pipeline kills docs pictures clean
+.PHONY: setup test test-random lint docs-reference demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage stress soak fuzz-pipeline kills docs pictures clean
 
 setup: $(STAMP)
 
@@ -29,6 +29,10 @@ RUNS ?= 1
 test-random: setup
 	@for run in $$(seq $(RUNS)); do \
 	  $(BIN)/python -m pytest -q -n 2 --hypothesis-profile=random -m "hypothesis or random" || exit 1; done
+
+# The reference of every configuration file, from the code that reads them.
+docs-reference: setup
+	$(BIN)/python -m tactile_tools.dev.config_reference docs/configuration.md
 
 demo: setup
 	$(BIN)/tactile demo --out demo.mcap --png demo.png

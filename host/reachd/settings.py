@@ -95,7 +95,7 @@ class ConfigFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         Duration | None, Meta(description="time the first reach may take; left out: the set's")
     ] = None
     seed: Annotated[
-        Annotated[int, Meta(ge=0, le=2**63 - 1)] | None,
+        Annotated[int, Meta(ge=0)] | None,
         Meta(description="of the strategy's random draws; left out: a new one is drawn and said"),
     ] = None
     home: Annotated[

@@ -1,6 +1,7 @@
 """The configuration layer: every TOML file of the project is read, checked and described here.
 
-A schema is a frozen `msgspec.Struct` that forbids unknown fields. The types of its fields carry
+A schema is a frozen `msgspec.Struct` that forbids unknown fields; a class variable ``replaced`` may
+hold the remedy for keys that older versions had. The types of its fields carry
 everything there is to say about a key: unit (`Seconds`, `Newtons`, ...), range and meaning
 (`msgspec.Meta`). That one description serves three purposes:
 
@@ -23,7 +24,7 @@ import stat
 import sys
 import tomllib
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING as NO_DEFAULT
 from dataclasses import dataclass, field, fields
 from enum import Enum
@@ -85,7 +86,6 @@ Fraction = Annotated[float, Meta(ge=0, le=1)]
 Duration = Annotated[Seconds, Meta(gt=0, le=1e9)]
 Rate = Annotated[Hertz, Meta(gt=0, le=1e6)]
 Count = Annotated[int, Meta(gt=0)]
-Size = Annotated[int, Meta(ge=0)]
 
 MinusInfinity = Annotated[
     float,
@@ -222,14 +222,17 @@ class Document:
             wanted = (*keys, match.group(1))
             return self.missing(wanted, allowed(_type_at(info, wanted)))
         if (match := UNKNOWN.fullmatch(reason)) is not None:
-            known = [f.encode_name for f in _fields(_type_at(info, keys)) or ()]
-            return self._unknown((*keys, match.group(1)), known)
+            return self._unknown((*keys, match.group(1)), _type_at(info, keys))
         if REFUSED.match(reason) is not None:
             return self.wrong(keys, allowed(_type_at(info, keys)) or reason)
         more = getattr(error.__cause__, "keys", ())  # a check of the schema's own
         return self.error((*keys, *more), f"{dotted(keys)}: {reason}" if keys else reason)
 
-    def _unknown(self, keys: KeyPath, known: Sequence[str]) -> ConfigError:
+    def _unknown(self, keys: KeyPath, table: Any) -> ConfigError:
+        remedy = getattr(_struct(table), "replaced", {}).get(keys[-1])
+        if remedy is not None:
+            return self.error(keys, f"{dotted(keys)} is of an older version: {remedy}")
+        known = [f.encode_name for f in _fields(table) or ()]
         near = difflib.get_close_matches(str(keys[-1])[:SHOWN], known, 1)
         hint = f" (did you mean {near[0]}?)" if near else ""
         return self.error(
@@ -416,16 +419,17 @@ def allowed(info: Any, unit: str = "") -> str:
             return f"an array of {len(each)}: {', '.join(each)}"
         case _ if isinstance(info, LISTS):
             count = _bounds(info.min_length, info.max_length)
-            of = f" of {count} elements" if count else ""
+            of = f" of {count}" if count else ""
             return f"an array{of}, each element {allowed(info.item_type, unit)}"
     text = NAMES.get(type(info), "")
     if isinstance(info, types.StrType):
         text += " that is not empty" if info.min_length else ""
         text += f" that matches {info.pattern}" if info.pattern else ""
     bounds = allowed_range(info)
-    if bounds and unit:
-        return f"{text} {bounds} {unit}"
-    return " ".join(part for part in (text, bounds, f"({unit})" if unit else "") if part)
+    if not bounds:
+        return f"{text} ({unit})" if unit else text
+    of = "of " if bounds.startswith("at ") else ""
+    return f"{text} {of}{bounds} {unit}".rstrip()
 
 
 def allowed_range(info: Any) -> str:
@@ -433,22 +437,22 @@ def allowed_range(info: Any) -> str:
     gt, ge, lt, le = (getattr(info, name, None) for name in ("gt", "ge", "lt", "le"))
     if ge is not None and le is not None:
         return f"from {_plain(ge)} to {_plain(le)}"
-    words = (("above", gt), ("of at least", ge), ("below", lt), ("at most", le))
+    words = (("above", gt), ("at least", ge), ("below", lt), ("at most", le))
     return " and ".join(f"{word} {_plain(bound)}" for word, bound in words if bound is not None)
 
 
 def _bounds(least: int | None, most: int | None) -> str:
     if least == most:
-        return "" if least is None else str(least)
-    if least is None or most is None:
-        return f"at most {most}" if least is None else f"at least {least}"
-    return f"{least} to {most}"
+        return "" if least is None else f"{least} elements"
+    if least is not None and most is not None:
+        return f"{least} to {most} elements"
+    return f"at most {most} elements" if least is None else f"at least {least} element(s)"
 
 
 def _plain(value: object) -> str:
     if isinstance(value, int) and not isinstance(value, bool):
         return str(value)
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return f"{value:g}".replace("e+0", "e") if isinstance(value, float) else str(value)
 
 
 def _extra(info: Any) -> dict[str, Any]:
@@ -462,6 +466,15 @@ def _fields(info: Any) -> tuple[types.Field, ...] | None:
     if isinstance(info, types.UnionType):
         return next((found for t in info.types if (found := _fields(t)) is not None), None)
     return info.fields if isinstance(info, types.StructType | types.DataclassType) else None
+
+
+def _struct(info: Any) -> Any:
+    """Class of the schema, or of the schema in a union; None where there is none."""
+    if isinstance(info, types.Metadata):
+        return _struct(info.type)
+    if isinstance(info, types.UnionType):
+        return next((found for t in info.types if (found := _struct(t)) is not None), None)
+    return getattr(info, "cls", None)
 
 
 def _step(info: Any, key: str | int) -> Any:
@@ -525,6 +538,7 @@ def _finite(value: Any) -> Any:
 
 def table_of(
     name: str,
+    doc: str,
     settings: type,
     *,
     only: Iterable[str] | None = None,
@@ -534,15 +548,19 @@ def table_of(
 ) -> type[Any]:
     """Schema of a table in which any field of a dataclass may be given, and none must.
 
-    ``only``, ``without``: which fields. ``rename``: keys by field. ``others``: types of fields
-    that a file writes in another way. What a file left out is `msgspec.UNSET`; see `given`.
+    ``doc``: what the table is for. ``only``, ``without``: which fields. ``rename``: keys by field.
+    ``others``: types of fields that a file writes in another way. What a file left out is
+    `msgspec.UNSET`; see `given`.
     """
     hints = _hints(settings)
     chosen = [key for key in (hints if only is None else only) if key not in set(without)]
     members = []
     for key in chosen:
         default = others[key]() if isinstance(others.get(key), type) else UNSET
-        members.append((key, others.get(key, hints[key]) | UnsetType, default))
+        kind = others.get(key, hints[key])
+        if key in others and hasattr(hints[key], "__metadata__"):  # the meaning stays
+            kind = Annotated[(kind, *hints[key].__metadata__)]
+        members.append((key, kind | UnsetType, default))
     return msgspec.defstruct(
         name,
         members,
@@ -550,7 +568,7 @@ def table_of(
         kw_only=True,
         forbid_unknown_fields=True,
         rename=dict(rename or {}),
-        namespace={"overrides": settings},
+        namespace={"__doc__": doc, "overrides": settings},
     )
 
 
@@ -565,39 +583,96 @@ def given(table: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """One key of a file: its path, what it holds, and what it means.
+    """One key of a table, in words.
 
-    ``default``: as it is written in the file; empty for none, None where the key must be given.
+    ``default``: as it is written in a file; empty where there is none, None where the key must be
+    given. ``range``: what is allowed beyond the ``type``; empty where there is no limit.
     """
 
-    path: str
-    allowed: str
+    name: str
+    type: str
     unit: str
+    range: str
     default: str | None
     meaning: str
 
 
-def describe(kind: type) -> list[Key]:
-    """Every key of a schema, tables within tables included, in the order of the schema."""
-    return list(_keys(types.type_info(kind), ""))
+@dataclass(frozen=True, slots=True)
+class Section:
+    """One table of a file: its header (empty for the keys above all tables), meaning and keys."""
+
+    header: str
+    meaning: str
+    keys: tuple[Key, ...]
 
 
-def _keys(info: Any, prefix: str) -> Iterator[Key]:
+def describe(kind: type) -> list[Section]:
+    """Every table of a schema, each after the one it is in."""
+    return list(_sections(types.type_info(kind), "", ""))
+
+
+def _sections(info: Any, path: str, header: str) -> Iterator[Section]:
+    keys, inner = [], []
     for each in _fields(info) or ():
-        path = f"{prefix}{each.encode_name}"
-        inner, plural = _table_in(each.type)
-        if inner is not None:
-            yield from _keys(inner, f"{path}[]." if plural else f"{path}.")
-            continue
-        meta = each.type
-        schema = (meta.extra_json_schema or {}) if isinstance(meta, types.Metadata) else {}
-        yield Key(
-            path,
-            allowed(meta),
-            str(_extra(meta).get("unit", "")),
-            _default(each, getattr(info, "cls", None)),
-            str(schema.get("description", "")),
-        )
+        table, plural = _table_in(each.type)
+        if table is None:
+            keys.append(_key(each, info.cls))
+        else:
+            name = f"{path}{each.encode_name}"
+            inner.append((table, f"{name}.", f"[[{name}]]" if plural else f"[{name}]"))
+    yield Section(header, " ".join((info.cls.__doc__ or "").split()), tuple(keys))
+    for table in inner:
+        yield from _sections(*table)
+
+
+def _key(each: types.Field, owner: Any) -> Key:
+    kind, extent = _in_words(each.type)
+    said = _said(each.type)
+    unit, meaning = str(said.get("unit", "")), str(said.get("description", ""))
+    return Key(each.encode_name, kind, unit, extent, _default(each, owner), meaning)
+
+
+def _said(info: Any) -> dict[str, Any]:
+    """What `Meta` says of a type, or of what it is made of: unit and description."""
+    match info:
+        case types.Metadata():
+            own = {**(info.extra_json_schema or {}), **(info.extra or {})}
+            return {**_said(info.type), **own}
+        case types.UnionType():
+            return {k: v for t in info.types for k, v in _said(t).items()}
+        case types.TupleType():
+            return _said(info.item_types[0])
+        case types.CollectionType():
+            return _said(info.item_type)
+    return {}
+
+
+def _in_words(info: Any) -> tuple[str, str]:
+    """Type and range of what is no table."""
+    match info:
+        case types.Metadata():
+            kind, extent = _in_words(info.type)
+            return kind, str(_extra(info).get("allowed") or extent)
+        case types.UnionType():
+            return next(words for t in info.types if (words := _in_words(t))[0])
+        case types.LiteralType() | types.EnumType():
+            return "word", f"one of {allowed(info)}"
+        case types.TupleType():
+            members = {_in_words(t) for t in info.item_types}
+            kind, extent = members.pop() if len(members) == 1 else ("number", "")
+            return f"array of {len(info.item_types)} {kind}s", extent and f"each {extent}"
+        case _ if isinstance(info, LISTS):
+            kind, extent = _in_words(info.item_type)
+            count = _bounds(info.min_length, info.max_length)
+            parts = (count, f"each {extent}" if extent else "")
+            kind = kind.replace("array of", "arrays of") if "array" in kind else f"{kind}s"
+            return f"array of {kind}", ", ".join(part for part in parts if part)
+        case types.StrType():
+            return "text", "not empty" if info.min_length else ""
+        case types.BoolType():
+            return "true or false", ""
+    name = {types.IntType: "whole number", types.FloatType: "number"}.get(type(info), "")
+    return name, allowed_range(info)
 
 
 def _table_in(info: Any) -> tuple[Any, bool]:
@@ -618,11 +693,10 @@ def _table_in(info: Any) -> tuple[Any, bool]:
 def _default(each: types.Field, kind: Any) -> str | None:
     if each.required:
         return None
-    value = each.default if each.default is not NODEFAULT else each.default_factory()
-    if value is UNSET and hasattr(kind, "overrides"):
+    value = each.default
+    if value is NODEFAULT and hasattr(kind, "overrides"):  # of `table_of`: UNSET is not told
         value = {f.name: f.default for f in fields(kind.overrides)}[each.name]
-        value = UNSET if value is NO_DEFAULT else value
-    return "" if value is None or value is UNSET else written(value)
+    return "" if value in (None, NODEFAULT, NO_DEFAULT) else written(value)
 
 
 def written(value: Any) -> str:
@@ -633,7 +707,7 @@ def written(value: Any) -> str:
         case str():
             return quoted(str(value))
         case float():
-            return f"{value:g}"
+            return _plain(value)
         case tuple() | list() | frozenset():
             return f"[{', '.join(written(item) for item in value)}]"
     return str(value)

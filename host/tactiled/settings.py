@@ -105,12 +105,17 @@ if TYPE_CHECKING:
 else:
     CompensationTable = table_of(
         "CompensationTable",
+        "``[compensation]``: how the ambient field is taken off.",
         PipelineSettings,
         only=("method", "compensation_rate_hz"),
         rename={"compensation_rate_hz": "rate"},
     )
     SensingTable = table_of(
-        "SensingTable", PipelineSettings, only=_SENSING, rename={"feature_rate_hz": "feature_rate"}
+        "SensingTable",
+        "``[sensing]``: thresholds of contact, health and taring; see sensing.md.",
+        PipelineSettings,
+        only=_SENSING,
+        rename={"feature_rate_hz": "feature_rate"},
     )
 
 

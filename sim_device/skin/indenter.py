@@ -114,9 +114,10 @@ class Indenter:
 class PressTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``[[press]]``: one force on the skin. Where: either ``array`` or ``position_mm``."""
 
-    array: Annotated[str | None, Meta(description="array of the skin: left, right, tip; skin")] = (
-        None
-    )
+    array: Annotated[
+        str | None,
+        Meta(description="array of the skin: left, right or tip of the finger; skin of AnySkin"),
+    ] = None
     u_mm: Annotated[
         Millimetres | None,
         Meta(description="point on the unrolled skin, from the array's middle, along it"),

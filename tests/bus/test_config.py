@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,16 +13,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import Meta
 
+from tactile_core import config
 from tactile_core.bus.session import BusConfig
 from tactile_core.config import (
     ConfigError,
     Count,
     Duration,
+    MetresPerSecond,
     Positive,
     Rate,
+    check_fields,
+    describe,
     key_lines,
     load_toml,
     parse_toml,
+    table_of,
 )
 from tactile_core.log.recorder import RecorderSettings
 
@@ -46,7 +52,7 @@ class Settings(msgspec.Struct, forbid_unknown_fields=True):
     bus: BusConfig = BusConfig()
 
 
-DURATION = "a finite number above 0 and at most 1e+09 s"
+DURATION = "a finite number above 0 and at most 1e9 s"
 GOOD = """
 # a comment with [brackets] and "quotes"
 name = "abc"
@@ -96,7 +102,7 @@ def test_a_good_file_is_read(tmp_path: Path) -> None:
         ("boards = 3", "t.toml:1: boards = 3; allowed: an array, each element a table"),
         (
             '[[boards]]\nport = "a"\n\n[[boards]]\nport = "b"\nrate = 0',
-            "t.toml:6: boards[1].rate = 0; allowed: a finite number above 0 and at most 1e+06 Hz",
+            "t.toml:6: boards[1].rate = 0; allowed: a finite number above 0 and at most 1e6 Hz",
         ),
         (
             '[[boards]]\nport = "a"\n[[boards]]\nrate = 5',
@@ -113,7 +119,7 @@ def test_a_good_file_is_read(tmp_path: Path) -> None:
         ("[log]\n#\nmax_files = 0", "t.toml:3: log.max_files = 0; allowed: a whole number above 0"),
         (
             "[rates]\na = 1\nb = -1",
-            "t.toml:3: rates.b = -1; allowed: a finite number above 0 and at most 1e+06 Hz",
+            "t.toml:3: rates.b = -1; allowed: a finite number above 0 and at most 1e6 Hz",
         ),
         ('bus.role = "x"', 't.toml:1: bus.role = "x"; allowed: arm, reachd, tactiled, tool'),
     ],
@@ -219,3 +225,30 @@ def test_counts_are_whole_numbers() -> None:
 
     with pytest.raises(ConfigError, match="a whole number above 0"):
         parse_toml("n = 1.0", One)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Figures:
+    speed: Annotated[MetresPerSecond, Meta(gt=0, description="greatest speed")] = 1.0
+    way: Annotated[Literal["a", "b"], Meta(description="which way")] = "a"
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+FiguresTable = table_of("FiguresTable", "Some figures.", Figures, rename={"speed": "v"})
+
+
+def test_a_dataclass_is_checked_as_a_file_is_and_overridden_by_one() -> None:
+    with pytest.raises(ConfigError, match=r"speed = nan; allowed: .* above 0 m/s") as caught:
+        Figures(speed=float("nan"))
+    assert caught.value.keys == ("speed",)
+    said = config.given(parse_toml("v = 2", FiguresTable, "t.toml"))
+    assert Figures(**said) == Figures(speed=2.0)
+    with pytest.raises(ConfigError, match=r"t.toml:1: v = 0; allowed: a finite number above 0 m/s"):
+        parse_toml("v = 0", FiguresTable, "t.toml")
+    (section,) = describe(FiguresTable)
+    assert [(k.name, k.unit, k.default) for k in section.keys] == [
+        ("v", "m/s", "1"),
+        ("way", "", '"a"'),
+    ]

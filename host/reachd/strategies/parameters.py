@@ -251,9 +251,19 @@ if TYPE_CHECKING:
 
         safety: GateTable = GateTable()
 else:
-    GateTable = table_of("GateTable", SafetySettings, tip_region=Corners, pivot_region=Corners)
+    GateTable = table_of(
+        "GateTable",
+        "``[parameters.safety]``: limits of the gate that differ from the set's; see safety.md.",
+        SafetySettings,
+        tip_region=Corners,
+        pivot_region=Corners,
+    )
     ParameterTable = table_of(
-        "ParameterTable", Parameters, without=("name", "note"), safety=GateTable
+        "ParameterTable",
+        "``[parameters]``: values that differ from the set's; the symbols are the paper's.",
+        Parameters,
+        without=("name", "note"),
+        safety=GateTable,
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import stat
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import msgspec
 from msgspec import Meta
@@ -50,6 +50,11 @@ class TlsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
     ``name``: this party's own common name, so that what it may not ask can be told at once.
     """
+
+    replaced: ClassVar[dict[str, str]] = {
+        "allowed": "name the certificates of each role in [bus.tls.roles], as `tactile bus keys` "
+        "does in roles.toml"
+    }
 
     root_ca: Annotated[str, Meta(description="PEM file of the lab's own authority")]
     certificate: Annotated[str, Meta(description="PEM file of this party's certificate")]

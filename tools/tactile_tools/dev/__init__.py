@@ -1,1 +1,1 @@
-"""For developers: benchmarks, fuzzers, kills, mutation, fidelity. Not part of a user's wheel."""
+"""Commands for those who work on the project; nothing a rig needs."""

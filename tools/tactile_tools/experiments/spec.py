@@ -84,7 +84,7 @@ class Conditions:
         return cls(**given(convert(_table(text, "conditions"), _ConditionsTable)))
 
 
-_ConditionsTable = table_of("ConditionsTable", Conditions)
+_ConditionsTable = table_of("ConditionsTable", "What differs from the set.", Conditions)
 
 
 @dataclass(frozen=True, slots=True)
