@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from tactile_core.arrays import FloatArray
 
 
 class Side(IntEnum):
@@ -44,10 +43,10 @@ class ArrayGeometry:
     side: Side
     rows: int
     columns: int
-    position: Float
-    rotation: Float
-    surface: Float
-    chip_yaw: Float
+    position: FloatArray
+    rotation: FloatArray
+    surface: FloatArray
+    chip_yaw: FloatArray
     posed: bool = True
 
     def __post_init__(self) -> None:
@@ -102,8 +101,8 @@ def grid_on_plane(
     shape: tuple[int, int],
     pitch: tuple[float, float],
     centre: tuple[float, float, float],
-    axes: Float,
-    chip_yaw: Float | None = None,
+    axes: FloatArray,
+    chip_yaw: FloatArray | None = None,
 ) -> ArrayGeometry:
     """Flat grid of taxels: rows along the taxel's y, columns along its x.
 
@@ -249,7 +248,7 @@ def anyskin_board(name: str, side: Side, sideways: float = 0.0) -> ArrayGeometry
     )
 
 
-def _mount(side: Side) -> tuple[Float, Float]:
+def _mount(side: Side) -> tuple[FloatArray, FloatArray]:
     """Axes (3, 3) and centre (3,) m in ``ee`` of a board on a side of the finger; z outwards."""
     up = (0.0, 0.0, 1.0)
     if side is Side.LEFT:

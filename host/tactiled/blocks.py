@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sensor_proto.can_transfers import CanFrame
+from tactile_core.arrays import FloatArray
 from tactile_core.geometry import Side
 from tactile_core.types import Instant
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +56,8 @@ class SampleBlock:
     captured: Instant
     received: Instant
     uncertainty: float
-    field_ut: Float
-    temperature_c: Float
+    field_ut: FloatArray
+    temperature_c: FloatArray
     status: NDArray[np.uint8]
     thermometer: bool = True
     clock_usable: bool = True
@@ -96,10 +95,10 @@ class Ambient:
     """
 
     method: str
-    plane: Float
-    support: Float
-    residual_ut: Float
-    age: Float
+    plane: FloatArray
+    support: FloatArray
+    residual_ut: FloatArray
+    age: FloatArray
     valid: NDArray[np.bool_]
 
 
@@ -123,8 +122,8 @@ class Patch:
     taxels: int
     normal_force: float
     peak_force: float
-    force: Float
-    centroid: Float
+    force: FloatArray
+    centroid: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,9 +138,9 @@ class Features:
     reasons: tuple[Reason, ...]
     peak_force: float
     peak_side: Side
-    peak_position: Float
+    peak_position: FloatArray
     normal_force: float
-    wrench: Float
+    wrench: FloatArray
     tip_force: float
     tip_contact_time: float
     taxels_in_contact: int
@@ -173,10 +172,10 @@ class Cycle:
     captured: Instant
     received: Instant
     uncertainty: float
-    temperature_c: Float
-    field_ut: Float
-    force: Float
-    normal_bound: Float
+    temperature_c: FloatArray
+    field_ut: FloatArray
+    force: FloatArray
+    normal_bound: FloatArray
     health: NDArray[np.uint8]
     ambient: Ambient
     features: Features

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from sensor_proto.packets import TaxelStatus
 from sim_device.skin.parameters import ChipParameters, ChipSetting, ToleranceParameters
-
-Float = NDArray[np.float64]
+from tactile_core.arrays import FloatArray
 
 COUNT_MAX = 32767
 THERMOMETER_RAW_25 = 46244
@@ -19,7 +18,7 @@ THERMOMETER_LSB_PER_K = 45.2
 """MLX90393 datasheet: T = 25 °C + (raw - 46244) / 45.2."""
 
 
-def temperature_of_raw(raw: Float) -> Float:
+def temperature_of_raw(raw: FloatArray) -> FloatArray:
     """°C that the 16-bit thermometer value ``raw`` stands for."""
     return 25.0 + (raw - THERMOMETER_RAW_25) / THERMOMETER_LSB_PER_K
 
@@ -35,16 +34,16 @@ class Reading:
 
     counts: NDArray[np.int16]
     status: NDArray[np.uint8]
-    temperature_c: Float
+    temperature_c: FloatArray
     infinite: NDArray[np.bool_] | None = None
 
 
-def truncated_normal(rng: np.random.Generator, sigma: float, shape: tuple[int, ...]) -> Float:
+def truncated_normal(rng: np.random.Generator, sigma: float, shape: tuple[int, ...]) -> FloatArray:
     """Normal draws cut off at two sigma: parts beyond are thrown out at inspection."""
     return np.clip(rng.standard_normal(shape), -2.0, 2.0) * sigma
 
 
-def small_rotation(rng: np.random.Generator, sigma: float, n: int) -> Float:
+def small_rotation(rng: np.random.Generator, sigma: float, n: int) -> FloatArray:
     """Rotations (n, 3, 3) by small angles about each axis, ``sigma`` rad."""
     x, y, z = truncated_normal(rng, sigma, (n, 3)).T
     cx, cy, cz, sx, sy, sz = np.cos(x), np.cos(y), np.cos(z), np.sin(x), np.sin(y), np.sin(z)
@@ -61,7 +60,7 @@ class Magnetometers:
 
     def __init__(
         self,
-        rotation: Float,
+        rotation: FloatArray,
         parameters: ChipParameters,
         tolerance: ToleranceParameters,
         rng: np.random.Generator,
@@ -88,9 +87,9 @@ class Magnetometers:
         self.configure(slice(None), p.setting)
 
     @property
-    def lsb_ut(self) -> Float:
+    def lsb_ut(self) -> FloatArray:
         """µT per count (N, 3), read-only."""
-        view: Float = self._lsb.view()
+        view: FloatArray = self._lsb.view()
         view.flags.writeable = False
         return view
 
@@ -104,29 +103,31 @@ class Magnetometers:
         # The chip converts X, Y, Z one after another: when Z ends, X is two conversions old.
         self._lag[chips] = self._oscillator[chips, None] * setting.axis_time * [2.0, 1.0, 0.0]
 
-    def response(self, temperature_c: float) -> Float:
+    def response(self, temperature_c: float) -> FloatArray:
         """Matrices (N, 3, 3): field in ``ee`` to what each chip makes of it, offsets apart."""
         warmer = temperature_c - self.parameters.reference_c
-        matrices: Float = self._view * (1.0 + self._sensitivity_drift * warmer)[:, :, None]
+        matrices: FloatArray = self._view * (1.0 + self._sensitivity_drift * warmer)[:, :, None]
         return matrices
 
-    def sense(self, field_ut: Float, temperature_c: float) -> Float:
+    def sense(self, field_ut: FloatArray, temperature_c: float) -> FloatArray:
         """Noiseless, unrounded field (N, 3) µT in chip axes of ``field_ut`` (N, 3) in ``ee``."""
         warmer = temperature_c - self.parameters.reference_c
-        seen: Float = np.einsum("nij,nj->ni", self._view, field_ut)
+        seen: FloatArray = np.einsum("nij,nj->ni", self._view, field_ut)
         seen *= 1.0 + self._sensitivity_drift * warmer
         seen += self._offset_drift * warmer
         return seen
 
-    def skew(self, now: Float, before: Float, elapsed: float) -> Float:
+    def skew(self, now: FloatArray, before: FloatArray, elapsed: float) -> FloatArray:
         """Field (N, 3) µT that each axis saw when it was converted.
 
         ``now``: at the end of the conversion of z; ``before``: ``elapsed`` s earlier.
         """
-        seen: Float = now + (before - now) * np.minimum(self._lag / elapsed, 1.0)
+        seen: FloatArray = now + (before - now) * np.minimum(self._lag / elapsed, 1.0)
         return seen
 
-    def convert(self, field_ut: Float, temperature_c: float, rng: np.random.Generator) -> Reading:
+    def convert(
+        self, field_ut: FloatArray, temperature_c: float, rng: np.random.Generator
+    ) -> Reading:
         """Add noise, saturate, round to counts and wrap to 16 bits as the chip does.
 
         A wrap is silent, as in the chip; saturated Hall plates and a count at either end of

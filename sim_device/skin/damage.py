@@ -162,8 +162,6 @@ def _indices(fault: TaxelFault, taxels: Mapping[str, int]) -> range:
 # What befalls a whole skin: lifted off, exchanged, a magnet lost, gain changed, a magnet near.
 
 
-Float = NDArray[np.float64]
-
 OTHER_SKIN = 0.2
 """Largest relative difference of another skin's magnets from this one's."""
 LEAP_DIRECTION = np.array([0.6, -0.4, 0.693])

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_device.skin.parameters import ElastomerParameters
-
-Float = NDArray[np.float64]
+from tactile_core.arrays import FloatArray
 
 CALIBRATION_DWELL = 2.0
 """s that a calibration rig waits at each load: about as long as a contact in use lasts."""
@@ -27,20 +25,20 @@ class Contact:
     The force is what the environment exerts on the skin; the radius is that of the patch.
     """
 
-    position: Float
-    force: Float
+    position: FloatArray
+    force: FloatArray
     radius: float = 4e-3
 
 
 class Spreader:
     """Shares contacts out over taxels at ``position`` (N, 3) m in ``ee``."""
 
-    def __init__(self, position: Float, parameters: ElastomerParameters) -> None:
+    def __init__(self, position: FloatArray, parameters: ElastomerParameters) -> None:
         self._position = position
         self._parameters = parameters
         self._norm2 = (position**2).sum(axis=1)
 
-    def weights(self, contacts: Sequence[Contact]) -> Float:
+    def weights(self, contacts: Sequence[Contact]) -> FloatArray:
         """Share (C, N) of each contact that each taxel bears.
 
         Rows sum to one within ``full_reach`` of a taxel, to zero beyond ``no_reach``: there the
@@ -56,16 +54,16 @@ class Spreader:
         nearest = np.maximum(squared.min(axis=1), 0.0)
         width = p.spread**2 + _HERTZ_VARIANCE * radius**2
         # Measured from the nearest taxel so that far contacts do not underflow to 0/0.
-        share: Float = np.exp((nearest[:, None] - squared) / (2.0 * width[:, None]))
+        share: FloatArray = np.exp((nearest[:, None] - squared) / (2.0 * width[:, None]))
         borne = (p.no_reach - np.sqrt(nearest)) / (p.no_reach - p.full_reach)
         share *= (np.clip(borne, 0.0, 1.0) / share.sum(axis=1))[:, None]
         return share
 
-    def force(self, contacts: Sequence[Contact]) -> Float:
+    def force(self, contacts: Sequence[Contact]) -> FloatArray:
         """Force (N, 3) N in ``ee`` on each taxel."""
         if not contacts:
             return np.zeros_like(self._position)
-        force: Float = self.weights(contacts).T @ np.array([c.force for c in contacts])
+        force: FloatArray = self.weights(contacts).T @ np.array([c.force for c in contacts])
         return force
 
 
@@ -78,7 +76,7 @@ class Elastomer:
     """
 
     def __init__(
-        self, parameters: ElastomerParameters, stiffness_factor: Float, travel: Float
+        self, parameters: ElastomerParameters, stiffness_factor: FloatArray, travel: FloatArray
     ) -> None:
         """``stiffness_factor`` (N,) of each taxel; ``travel`` (N,) m its magnet can sink."""
         p = self._parameters = parameters
@@ -100,7 +98,7 @@ class Elastomer:
         for state in (self._force, self._creep, self._play, self._peak):
             state[:] = 0.0
 
-    def load(self, force: Float, dt: float) -> Float:
+    def load(self, force: FloatArray, dt: float) -> FloatArray:
         """Displacement (N, 3) m after ``dt`` s in which the force went to ``force`` (N, 3) N."""
         if not dt >= 0:
             raise ValueError(f"time went back by {-dt} s")
@@ -114,7 +112,7 @@ class Elastomer:
         effective = force + p.creep * self._creep + self._play_weight * (self._play - force)
         return self._displace(effective)
 
-    def settled(self, force: Float) -> Float:
+    def settled(self, force: FloatArray) -> FloatArray:
         """Displacement (..., N, 3) m of recovered rubber some time after ``force`` came on.
 
         ``force``: (..., N, 3) N, on for `CALIBRATION_DWELL`. What a calibration rig sees, which
@@ -124,7 +122,7 @@ class Elastomer:
         crept = -p.creep * math.expm1(-CALIBRATION_DWELL / p.creep_time)
         return self._displace(force * (1.0 + crept - self._play_weight * p.hysteresis_knee))
 
-    def _displace(self, effective: Float) -> Float:
-        displacement: Float = effective * self._compliance
+    def _displace(self, effective: FloatArray) -> FloatArray:
+        displacement: FloatArray = effective * self._compliance
         np.maximum(displacement[..., 2], -self._travel, out=displacement[..., 2])
         return displacement

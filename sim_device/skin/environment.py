@@ -8,10 +8,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-AttitudeScript = Callable[[float], Float]
+from tactile_core.arrays import FloatArray
+
+AttitudeScript = Callable[[float], FloatArray]
 """Seconds since power-on to the rotation (3, 3) from ``ee`` to world axes."""
 
 TemperatureScript = Callable[[float], float]
@@ -46,19 +46,21 @@ class Surroundings:
     axes; ``temperature_c`` of the board.
     """
 
-    attitude: Float = field(default_factory=lambda: np.eye(3))
-    world_field_ut: Float = field(default_factory=lambda: np.zeros(3))
-    gradient: Float = field(default_factory=lambda: np.zeros((3, 3)))
+    attitude: FloatArray = field(default_factory=lambda: np.eye(3))
+    world_field_ut: FloatArray = field(default_factory=lambda: np.zeros(3))
+    gradient: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
     temperature_c: float = 25.0
 
-    def field_ut(self, position: Float) -> Float:
+    def field_ut(self, position: FloatArray) -> FloatArray:
         """Ambient field (n, 3) µT in ``ee`` at ``position`` (n, 3) m in ``ee``."""
         turn = self.attitude
-        in_ee: Float = self.world_field_ut @ turn + position @ (turn.T @ self.gradient @ turn).T
+        in_ee: FloatArray = (
+            self.world_field_ut @ turn + position @ (turn.T @ self.gradient @ turn).T
+        )
         return in_ee
 
 
-def still(_seconds: float) -> Float:
+def still(_seconds: float) -> FloatArray:
     """Attitude script of an end-effector that does not turn."""
     return np.eye(3)
 
@@ -83,7 +85,7 @@ class Environment:
         # No sources inside the skin: the gradient is symmetric and has no trace (Maxwell).
         self._gradient = p.gradient_ut_per_m * np.diag([1.0, -0.5, -0.5])
 
-    def at(self, seconds: float, attitude: Float | None = None) -> Surroundings:
+    def at(self, seconds: float, attitude: FloatArray | None = None) -> Surroundings:
         """Surroundings ``seconds`` after power-on; ``attitude`` (3, 3) overrides the script."""
         return Surroundings(
             self.attitude(seconds) if attitude is None else attitude,
@@ -97,11 +99,11 @@ class Environment:
         return p.room_c - p.self_heating_k * math.expm1(-max(seconds, 0.0) / p.self_heating_time)
 
 
-def rotation_about(axis: Float, angle: float) -> Float:
+def rotation_about(axis: FloatArray, angle: float) -> FloatArray:
     """Rotation (3, 3) by ``angle`` rad about the unit vector ``axis`` (Rodrigues' formula)."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    turn: Float = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * (cross @ cross)
+    turn: FloatArray = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * (cross @ cross)
     return turn
 
 

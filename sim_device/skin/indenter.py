@@ -10,9 +10,9 @@ from typing import Annotated
 import msgspec
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from sim_device.skin.elastomer import Contact
+from tactile_core.arrays import FloatArray
 from tactile_core.config import (
     Document,
     KeyPath,
@@ -24,8 +24,6 @@ from tactile_core.config import (
     unit,
 )
 from tactile_core.geometry import ArrayGeometry, SkinGeometry, finger
-
-Float = NDArray[np.float64]
 
 MAX_NORMAL_N = 100.0
 """N; the elastomer is crushed well before."""
@@ -190,7 +188,7 @@ def _press(document: Document, number: int, table: PressTable, geometry: SkinGeo
 
 def _place(
     document: Document, at: KeyPath, table: PressTable, geometry: SkinGeometry
-) -> tuple[Float, Float]:
+) -> tuple[FloatArray, FloatArray]:
     """Position (3,) m in ``ee`` and the axes (3, 3) of the skin there."""
     if table.position_mm is not None:
         for key in ("array", "u_mm", "v_mm"):
@@ -227,7 +225,7 @@ def _place(
     return on_surface(array, *place)
 
 
-def on_surface(array: ArrayGeometry, u: float, v: float) -> tuple[Float, Float]:
+def on_surface(array: ArrayGeometry, u: float, v: float) -> tuple[FloatArray, FloatArray]:
     """Point (3,) m in ``ee`` at surface coordinates ``u``, ``v`` m, and the axes (3, 3) there.
 
     The skin is taken as flat round its nearest taxel.
@@ -235,5 +233,5 @@ def on_surface(array: ArrayGeometry, u: float, v: float) -> tuple[Float, Float]:
     step = np.array([u, v]) - array.surface
     nearest = int((step**2).sum(axis=1).argmin())
     axes = array.rotation[nearest]
-    point: Float = array.position[nearest] + axes[:, :2] @ step[nearest]
+    point: FloatArray = array.position[nearest] + axes[:, :2] @ step[nearest]
     return point, axes

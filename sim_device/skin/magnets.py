@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from tactile_core.arrays import FloatArray
+
 Index = NDArray[np.intp]
 
 MU0_OVER_4PI = 1e-7
@@ -14,7 +15,7 @@ MU0_OVER_4PI = 1e-7
 UT_PER_T = 1e6
 
 
-def dipole_field_ut(offset: Float, moment: Float) -> Float:
+def dipole_field_ut(offset: FloatArray, moment: FloatArray) -> FloatArray:
     """Field in µT at ``offset`` (..., 3) m from point dipoles ``moment`` (..., 3) A·m².
 
     B = µ0/4π · (3 (m·r̂) r̂ − m) / r³ (Jackson, Classical Electrodynamics, eq. 5.56).
@@ -22,7 +23,7 @@ def dipole_field_ut(offset: Float, moment: Float) -> Float:
     r2 = np.einsum("...i,...i->...", offset, offset)
     along = np.einsum("...i,...i->...", moment, offset)
     scale = (MU0_OVER_4PI * UT_PER_T) / (r2 * np.sqrt(r2))
-    field: Float = (3.0 * along / r2 * scale)[..., None] * offset - scale[..., None] * moment
+    field: FloatArray = (3.0 * along / r2 * scale)[..., None] * offset - scale[..., None] * moment
     return field
 
 
@@ -32,7 +33,9 @@ class MagnetArray:
     Each chip sees the magnets within ``radius`` m of it at rest; the others are left out.
     """
 
-    def __init__(self, chips: Float, rest: Float, moment: Float, radius: float) -> None:
+    def __init__(
+        self, chips: FloatArray, rest: FloatArray, moment: FloatArray, radius: float
+    ) -> None:
         self._rest = rest
         distance = np.linalg.norm(chips[:, None] - rest[None], axis=2)
         seen = distance <= radius
@@ -46,7 +49,7 @@ class MagnetArray:
         self._whole = np.ascontiguousarray(moment[self._magnet].T)
         self._moment = self._whole
 
-    def scale(self, factor: Float) -> None:
+    def scale(self, factor: FloatArray) -> None:
         """Let every moment be ``factor`` (N,) of what it was made as; 0: the magnet is gone."""
         self._moment = self._whole * factor[self._magnet]
 
@@ -55,7 +58,7 @@ class MagnetArray:
         """Chip and magnet (P,) of every pair in which the chip sees the magnet."""
         return self._chip, self._magnet
 
-    def shares_ut(self, displacement: Float) -> Float:
+    def shares_ut(self, displacement: FloatArray) -> FloatArray:
         """Field (..., P, 3) µT in ee at the chip of each pair from its magnet alone.
 
         ``displacement``: (..., N, 3) m in ee.
@@ -63,7 +66,7 @@ class MagnetArray:
         offset = self._offset.T - displacement.take(self._magnet, axis=-2)
         return dipole_field_ut(offset, self._moment.T)
 
-    def field_ut(self, displacement: Float, strength: float = 1.0) -> Float:
+    def field_ut(self, displacement: FloatArray, strength: float = 1.0) -> FloatArray:
         """Field (N, 3) µT in ee at the chips, the magnets moved by ``displacement`` (N, 3) m in ee.
 
         ``strength``: factor on every moment.
@@ -76,5 +79,5 @@ class MagnetArray:
         scale = (MU0_OVER_4PI * UT_PER_T * strength) / (r2 * np.sqrt(r2))
         along *= 3.0 * scale / r2
         pairs = along * offset - scale * self._moment
-        total: Float = np.add.reduceat(pairs, self._starts, axis=1).T
+        total: FloatArray = np.add.reduceat(pairs, self._starts, axis=1).T
         return total

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sim_device.faults import FaultPlan
 from sim_device.skin.chips import Reading
 from sim_device.skin.damage import BrokenTaxels, SkinChanges
 from sim_device.skin.environment import Environment
 from sim_device.skin.skin import Contact, SkinModel
+from tactile_core.arrays import FloatArray
 from tactile_core.types import Instant
 
-Float = NDArray[np.float64]
 Contacts = Sequence[Contact] | Callable[[float], Sequence[Contact]]
-Attitude = Float | Callable[[float], Float] | None
+Attitude = FloatArray | Callable[[float], FloatArray] | None
 
 
 class Sampler:

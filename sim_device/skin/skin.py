@@ -5,20 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_device.skin.chips import Magnetometers, Reading, small_rotation, truncated_normal
 from sim_device.skin.elastomer import Contact, Elastomer, Spreader
 from sim_device.skin.environment import Surroundings
 from sim_device.skin.magnets import MagnetArray
 from sim_device.skin.parameters import SkinParameters
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration import ArrayCalibration, BoardCalibration
 from tactile_core.geometry import SkinGeometry
 from tactile_core.types import Instant, seconds_between
 
 __all__ = ["Contact", "SkinModel", "nominal_calibration"]
-
-Float = NDArray[np.float64]
 
 
 class SkinModel:
@@ -64,15 +62,15 @@ class SkinModel:
         )
         self.yaw = _yaw_matrices(yaw)
         self.chips = Magnetometers(rotation @ self.yaw, parameters.chip, tolerance, rng)
-        self._last: tuple[Instant, Float] | None = None
+        self._last: tuple[Instant, FloatArray] | None = None
         self._true_force = np.zeros((n, 3))
 
     @property
-    def true_force(self) -> Float:
+    def true_force(self) -> FloatArray:
         """Force (N, 3) N in taxel axes on each taxel at the last sample."""
         return self._true_force
 
-    def taxel_force(self, contacts: Sequence[Contact]) -> Float:
+    def taxel_force(self, contacts: Sequence[Contact]) -> FloatArray:
         """Force (N, 3) N in taxel axes that ``contacts`` put on each taxel."""
         return _turn(self._to_taxel, self.spreader.force(contacts))
 
@@ -94,7 +92,7 @@ class SkinModel:
             seen = self.chips.skew(seen, last[1], elapsed)
         return self.chips.convert(seen, surroundings.temperature_c, self._rng)
 
-    def field_ut(self, displacement: Float, surroundings: Surroundings) -> Float:
+    def field_ut(self, displacement: FloatArray, surroundings: Surroundings) -> FloatArray:
         """Noiseless field (N, 3) µT in chip axes, magnets moved by ``displacement`` (N, 3) m."""
         warmer = surroundings.temperature_c - self.parameters.chip.reference_c
         strength = 1.0 + self.parameters.magnet.drift_per_k * warmer
@@ -102,7 +100,7 @@ class SkinModel:
         field += surroundings.field_ut(self._position)
         return self.chips.sense(field, surroundings.temperature_c)
 
-    def settled_field_ut(self, force: Float, temperature_c: float) -> Float:
+    def settled_field_ut(self, force: FloatArray, temperature_c: float) -> FloatArray:
         """Noiseless field (N, 3) µT in taxel axes some time under ``force`` (N, 3) N, no ambient.
 
         In the axes that a host gets by undoing the designed yaw of each chip; see
@@ -167,7 +165,7 @@ def nominal_calibration(
     )
 
 
-def _presses(model: SkinModel, temperature_c: float) -> tuple[Float, Float]:
+def _presses(model: SkinModel, temperature_c: float) -> tuple[FloatArray, FloatArray]:
     """Loads (L, 3) N of the calibration and what each pair of chip and magnet makes of them.
 
     The field (L, P, 3) µT is the change in taxel axes when the magnet's own taxel bears the load
@@ -183,11 +181,11 @@ def _presses(model: SkinModel, temperature_c: float) -> tuple[Float, Float]:
     change = model.magnets.shares_ut(moved) - model.magnets.shares_ut(np.zeros((n, 3)))
     seen = model.yaw @ model.chips.response(temperature_c)
     chip, _ = model.magnets.pairs
-    field: Float = np.einsum("pij,lpj->lpi", seen[chip], change)
+    field: FloatArray = np.einsum("pij,lpj->lpi", seen[chip], change)
     return loads, field
 
 
-def _fit(model: SkinModel, taxels: slice, loads: Float, field: Float) -> Float:
+def _fit(model: SkinModel, taxels: slice, loads: FloatArray, field: FloatArray) -> FloatArray:
     """Matrix (3n, 3n) N/µT of one array, from what `_presses` found."""
     weight = 1.0 / np.linalg.norm(loads, axis=1)
     n = taxels.stop - taxels.start
@@ -204,13 +202,13 @@ def _fit(model: SkinModel, taxels: slice, loads: Float, field: Float) -> Float:
     return np.ascontiguousarray(matrix.T)
 
 
-def _turn(matrices: Float, vectors: Float) -> Float:
+def _turn(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
     """Each (n, 3, 3) matrix times its (n, 3) vector."""
-    turned: Float = np.einsum("nij,nj->ni", matrices, vectors)
+    turned: FloatArray = np.einsum("nij,nj->ni", matrices, vectors)
     return turned
 
 
-def _yaw_matrices(yaw: Float) -> Float:
+def _yaw_matrices(yaw: FloatArray) -> FloatArray:
     """Rotations (n, 3, 3) about z, chip axes to taxel axes."""
     matrices = np.zeros((len(yaw), 3, 3))
     matrices[:, 0, 0] = matrices[:, 1, 1] = np.cos(yaw)

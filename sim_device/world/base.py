@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_device.world.scenes import Scene
+from tactile_core.arrays import FloatArray
 from tactile_core.types import Twist, record
-
-Float = NDArray[np.float64]
 
 PHYSICS_STEP = 0.005
 """s; 10 ms explodes in MuJoCo, 5 ms is as clean as 2.5 and twice as fast."""
@@ -115,7 +114,7 @@ class World(Protocol):
         """Where the finger is, how it moves and what pushes it."""
         ...
 
-    def poses(self) -> Float:
+    def poses(self) -> FloatArray:
         """(n, 3) x, y m and yaw rad of each object in ``cupboard``, fallen ones included."""
         ...
 

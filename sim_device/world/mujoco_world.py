@@ -16,7 +16,6 @@ from sim_device.world.base import (
     WALL,
     FingerContact,
     FingerState,
-    Float,
     Touch,
     WorldError,
     merge_touches,
@@ -26,6 +25,7 @@ from sim_device.world.mujoco_model import FINGER_GEOM, MOTOR_TIME, cupboard_mode
 from sim_device.world.parameters import WorldParameters, world_parameters
 from sim_device.world.scene_squeeze import settled
 from sim_device.world.scenes import Scene
+from tactile_core.arrays import FloatArray
 from tactile_core.types import Twist
 
 _FALLEN = -0.02
@@ -220,9 +220,9 @@ class MujocoWorld:
             )
         return self._state
 
-    def poses(self) -> Float:
+    def poses(self) -> FloatArray:
         """(n, 3) x, y m and yaw rad of each object."""
-        poses: Float = self._initial + self._objects_qpos[:, [0, 1, 3]]
+        poses: FloatArray = self._initial + self._objects_qpos[:, [0, 1, 3]]
         return poses
 
     def on_shelf(self) -> NDArray[np.bool_]:

@@ -18,7 +18,6 @@ from sim_device.world.base import (
     WALL,
     FingerContact,
     FingerState,
-    Float,
     Touch,
     WorldError,
     merge_touches,
@@ -27,6 +26,7 @@ from sim_device.world.base import (
 from sim_device.world.mujoco_model import GRAVITY, yaw_inertia
 from sim_device.world.parameters import WorldParameters, world_parameters
 from sim_device.world.scenes import Scene, SceneObject, Shape
+from tactile_core.arrays import FloatArray
 from tactile_core.geometry import FINGER_HEIGHT
 from tactile_core.types import Twist
 
@@ -87,7 +87,7 @@ class PybulletWorld:
         self._contacts: tuple[FingerContact, ...] = ()
         self._state = self._finger_state(self._motion(), [0.0] * 3, 1)
 
-    def _body(self, mass: float, shape: int, place: Float, yaw: float, friction: float) -> int:
+    def _body(self, mass: float, shape: int, place: FloatArray, yaw: float, friction: float) -> int:
         """Body of ``mass`` (0: fixed) at ``place``, units."""
         bullet, client = self._bullet, self._client
         turn = bullet.getQuaternionFromEuler((0, 0, yaw))
@@ -286,7 +286,7 @@ class PybulletWorld:
         """Where the finger is, how it moves and what pushes it."""
         return self._state
 
-    def poses(self) -> Float:
+    def poses(self) -> FloatArray:
         """(n, 3) x, y m and yaw rad of each object, wherever it fell."""
         rows = []
         for body in self._objects:

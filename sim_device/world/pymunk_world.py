@@ -18,7 +18,6 @@ from sim_device.world.base import (
     WALL,
     FingerContact,
     FingerState,
-    Float,
     Touch,
     merge_touches,
     substeps,
@@ -27,6 +26,7 @@ from sim_device.world.mujoco_model import GRAVITY, MOTOR_TIME, mean_lever, yaw_i
 from sim_device.world.parameters import WorldParameters, world_parameters
 from sim_device.world.scene_squeeze import settled
 from sim_device.world.scenes import Scene, SceneObject, Shape
+from tactile_core.arrays import FloatArray
 from tactile_core.types import Twist
 
 ITERATIONS = 30
@@ -224,7 +224,7 @@ class PymunkWorld:
             mz=mz,
         )
 
-    def poses(self) -> Float:
+    def poses(self) -> FloatArray:
         """(n, 3) x, y m and yaw rad of each object, where it left the shelf if it fell."""
         rows = [[b.position.x, b.position.y, b.angle] for b in self._objects]
         return np.array(rows).reshape(len(rows), 3)

@@ -16,8 +16,8 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration.force_model import (
     MAX_DEGREE,
     MAX_FEATURES,
@@ -51,8 +51,6 @@ from tactile_core.config import (
     unit,
 )
 from tactile_core.geometry import ArrayGeometry, Side
-
-Float = NDArray[np.float64]
 
 FORMAT_NAME = "tactile-calibration"
 FORMAT_VERSION = 3
@@ -401,7 +399,7 @@ def _net_lines(net: NetModel) -> Iterable[str]:
         yield f"how = {quoted(figure.how)}"
 
 
-def _matrix_lines(key: str, values: Float, remark: str) -> Iterable[str]:
+def _matrix_lines(key: str, values: FloatArray, remark: str) -> Iterable[str]:
     """Lines of a list of rows."""
     yield f"{key} = [  # {remark}"
     for row in values:
@@ -409,7 +407,7 @@ def _matrix_lines(key: str, values: Float, remark: str) -> Iterable[str]:
     yield "]"
 
 
-def _row(values: Float) -> str:
+def _row(values: FloatArray) -> str:
     """Exact decimals of a row, without brackets."""
     return ", ".join(_exact(v) for v in values.tolist())
 
@@ -433,7 +431,7 @@ def _array(document: Document, number: int, table: ArrayTable) -> ArrayCalibrati
         raise document.wrong((*at, "rows"), f"at most {MAX_TAXELS} taxels", found)
     _check_printable(document, (*at, "name"))
 
-    def matrix(key: str, rows: Sequence[Any], inner: KeyPath = ()) -> Float:
+    def matrix(key: str, rows: Sequence[Any], inner: KeyPath = ()) -> FloatArray:
         if len(rows) != n:
             keys = (*at, *inner, key)
             raise document.wrong(keys, f"{n} rows, one a taxel", f"{len(rows)} rows")
@@ -477,7 +475,7 @@ def _array(document: Document, number: int, table: ArrayTable) -> ArrayCalibrati
 def _net(document: Document, number: int, table: NetTable) -> NetModel:
     at: KeyPath = ("net", number)
 
-    def matrix(keys: KeyPath, rows: Sequence[Sequence[float]], columns: int) -> Float:
+    def matrix(keys: KeyPath, rows: Sequence[Sequence[float]], columns: int) -> FloatArray:
         for k, row in enumerate(rows):
             if len(row) != columns:
                 raise document.wrong((*keys, k), f"{columns} numbers", f"{len(row)} numbers")

@@ -13,9 +13,8 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from tactile_core.arrays import FloatArray
 
 TARGET_UNITS = {"normal": "N", "shear": "N", "shear_x": "N", "shear_y": "N", "x": "mm", "y": "mm"}
 """What a model may predict. ``normal``: force into the skin, positive when pressed. ``shear_x``,
@@ -58,8 +57,8 @@ class Layer:
     """
 
     kind: Literal["linear", "tanh", "rbf"]
-    weights: Float
-    bias: Float
+    weights: FloatArray
+    bias: FloatArray
 
     @property
     def inputs(self) -> int:
@@ -95,13 +94,13 @@ class FeatureMap:
     """
 
     tracker: RestTracker | None
-    projection: Float
+    projection: FloatArray
     degree: int = 1
     curved: int = 0
-    taus_s: Float = field(default_factory=lambda: np.zeros(0))
+    taus_s: FloatArray = field(default_factory=lambda: np.zeros(0))
     lagged: int = 0
     lag_degree: int = 0
-    radii: Float = field(default_factory=lambda: np.zeros(0))
+    radii: FloatArray = field(default_factory=lambda: np.zeros(0))
     direction: bool = False
 
     def __post_init__(self) -> None:
@@ -163,10 +162,10 @@ class NetModel:
     recipe: str
     targets: tuple[str, ...]
     features: FeatureMap
-    mean: Float
-    scale: Float
+    mean: FloatArray
+    scale: FloatArray
     layers: tuple[Layer, ...]
-    floor: Float
+    floor: FloatArray
     delay_s: float
     figures: tuple[Figure, ...]
 
@@ -210,7 +209,7 @@ class NetModel:
         """Taxels of the board."""
         return self.features.channels // 3
 
-    def digest(self, text: Callable[[str], None], numbers: Callable[[Float], None]) -> None:
+    def digest(self, text: Callable[[str], None], numbers: Callable[[FloatArray], None]) -> None:
         """Give everything that the model says to ``text`` and ``numbers`` of a hash."""
         f = self.features
         text(f"{self.recipe}/{','.join(self.targets)}/{f.degree}/{f.curved}/{f.lagged}")
@@ -229,7 +228,7 @@ class NetModel:
             text(f"{figure.name}/{figure.unit}/{figure.how}")
 
 
-def _finite(*named: tuple[str, Float]) -> None:
+def _finite(*named: tuple[str, FloatArray]) -> None:
     for name, value in named:
         if not np.isfinite(value).all():
             raise NetModelError(f"{name} is not finite")

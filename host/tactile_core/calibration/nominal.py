@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sensor_proto.packets import ArrayDescriptor, Descriptor
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration.types import ArrayCalibration, BoardCalibration
 from tactile_core.geometry import (
     ANYSKIN_CHIPS,
@@ -23,8 +23,6 @@ from tactile_core.geometry import (
     finger,
     grid_on_plane,
 )
-
-Float = NDArray[np.float64]
 
 SENSITIVITY_UT_PER_N = {"finger": (152.0, 152.0), "anyskin": (115.0, 115.0)}
 """µT/N of a shear and of a normal force on the nearest magnetometer.
@@ -47,7 +45,7 @@ MAX_ANYSKIN_MAGNETOMETERS = 20
 NOMINAL_MODELS = ("finger", "anyskin")
 
 
-def nominal_newton_per_ut(taxels: int, shear: float, normal: float) -> Float:
+def nominal_newton_per_ut(taxels: int, shear: float, normal: float) -> FloatArray:
     """(3n, 3n) N/µT without coupling between taxels, from µT/N of shear and normal force.
 
     Magnets point away from the chips: a press (negative z) brings them nearer and raises B_z,

@@ -6,12 +6,10 @@ import hashlib
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration.force_model import NetModel
 from tactile_core.geometry import ArrayGeometry, SkinGeometry
-
-Float = NDArray[np.float64]
 
 YAW_DECIMALS = 9
 """Chip yaw is kept in degrees in files; this many decimals make degrees → radians → degrees the
@@ -44,10 +42,10 @@ class ArrayCalibration:
     """
 
     geometry: ArrayGeometry
-    rest_ut: Float
-    drift_ut_per_k: Float
+    rest_ut: FloatArray
+    drift_ut_per_k: FloatArray
     reference_c: float
-    newton_per_ut: Float
+    newton_per_ut: FloatArray
 
     def __post_init__(self) -> None:
         """Refuse shapes that disagree with the geometry, and numbers that are not finite."""
@@ -113,7 +111,7 @@ class BoardCalibration:
             data = value.encode()
             digest.update(len(data).to_bytes(4, "little") + data)
 
-        def numbers(value: Float) -> None:
+        def numbers(value: FloatArray) -> None:
             digest.update(np.ascontiguousarray(value + 0.0, "<f8").tobytes())  # -0 counts as 0
 
         for value in (self.serial_number, self.model, self.frame, self.created, self.provenance):
@@ -138,6 +136,6 @@ class BoardCalibration:
             raise CalibrationMismatch(self.serial_number, serial_number, source)
 
 
-def yaw_degrees(yaw: Float) -> Float:
+def yaw_degrees(yaw: FloatArray) -> FloatArray:
     """Chip yaw in degrees as files carry it; ``yaw`` in rad."""
     return np.asarray(np.round(np.rad2deg(yaw), YAW_DECIMALS) + 0.0, np.float64)

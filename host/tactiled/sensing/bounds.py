@@ -11,14 +11,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactiled.sensing.compensation import Estimate
 from tactiled.sensing.consensus import PLANE_TAXELS
 from tactiled.sensing.forces import ForceModel
 from tactiled.sensing.layout import Layout
-
-Float = NDArray[np.float64]
 
 QUANTILE_95 = 1.96
 """Normal errors are within this many sigma in 95 % of cycles."""
@@ -56,19 +54,19 @@ class Bounds:
         self._scale = NOMINAL_SCALE if nominal else MEASURED_SCALE
         self._nominal = nominal
         self._gain = np.linalg.norm(self._slopes[:, :, 0], axis=1)  # N/µT
-        self._still: Float = np.zeros(layout.taxels)  # N², what does not change with the cycle
-        self._drift: Float = np.zeros(layout.taxels)  # N/K rms
+        self._still: FloatArray = np.zeros(layout.taxels)  # N², what does not change with the cycle
+        self._drift: FloatArray = np.zeros(layout.taxels)  # N/K rms
 
     @property
     def few(self) -> bool:
         """Whether every array has so few taxels that their sum is as well known as one of them."""
         return self._few
 
-    def set_noise(self, normal_sigma: Float) -> None:
+    def set_noise(self, normal_sigma: FloatArray) -> None:
         """Noise of each taxel's normal force, (N,) N rms."""
         self._still = normal_sigma**2 + (UNEVEN_UT * self._gain) ** 2
 
-    def set_rest(self, rest_ut: Float) -> None:
+    def set_rest(self, rest_ut: FloatArray) -> None:
         """The rest field in force, (N, 3) µT."""
         per_kelvin = np.full(len(rest_ut), KNOWN_DRIFT_UT_PER_K)
         if self._nominal:
@@ -76,19 +74,19 @@ class Bounds:
             per_kelvin = np.hypot(UNKNOWN_DRIFT_UT_PER_K, share)
         self._drift = per_kelvin * self._gain
 
-    def drift_sigma(self, warmer_k: Float) -> Float:
+    def drift_sigma(self, warmer_k: FloatArray) -> FloatArray:
         """(N,) N rms that ``warmer_k`` (N,) K since the rest was taken may look like."""
         return np.abs(warmer_k) * self._drift
 
-    def taxels(self, estimate: Estimate, drift: Float) -> Float:
+    def taxels(self, estimate: Estimate, drift: FloatArray) -> FloatArray:
         """(N,) N, the additive bound of each taxel's normal force. ``drift``: `drift_sigma`."""
         a = self._array
         ambient = (self._slopes[:, :, 0] * estimate.sigma[a]) ** 2
         slope = (self._slopes[:, :, 1:] ** 2).sum(axis=(1, 2)) * estimate.slope_sigma[a] ** 2
-        variance: Float = ambient.sum(axis=1) + slope + self._still + drift**2
+        variance: FloatArray = ambient.sum(axis=1) + slope + self._still + drift**2
         return QUANTILE_95 * np.sqrt(variance)
 
-    def together(self, taxels: list[int], estimate: Estimate, drift: Float) -> float:
+    def together(self, taxels: list[int], estimate: Estimate, drift: FloatArray) -> float:
         """N, the additive bound of the summed normal force of ``taxels``."""
         if not taxels:
             return 0.0
@@ -100,7 +98,7 @@ class Bounds:
             variance += float((lost[:, 1:] ** 2).sum()) * float(estimate.slope_sigma[a]) ** 2
         return QUANTILE_95 * math.sqrt(variance)
 
-    def implausible(self, force: Float) -> float:
+    def implausible(self, force: FloatArray) -> float:
         """N that no contact exerts: pulls, and shear beyond friction; ``force`` (N, 3) N.
 
         A magnet that passes looks like that. Only where the skin's own calibration tells what a

@@ -8,11 +8,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.types import Instant
 from tactiled.blocks import Ambient
 from tactiled.sensing.layout import Layout
 
-Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 
@@ -29,26 +29,28 @@ class Estimate:
     taxels that are known to bear something although it may be little; only small arrays tell.
     """
 
-    theta: Float
+    theta: FloatArray
     ambient: Ambient
     borrowed: Bool
-    sigma: Float
-    slope_sigma: Float
-    leap: Float
+    sigma: FloatArray
+    slope_sigma: FloatArray
+    leap: FloatArray
     loaded: Bool
 
 
 class Compensator(Protocol):
     """One method of compensation."""
 
-    def update(self, field_ee: Float, forces: Float, healthy: Bool, captured: Instant) -> Estimate:
+    def update(
+        self, field_ee: FloatArray, forces: FloatArray, healthy: Bool, captured: Instant
+    ) -> Estimate:
         """Estimate for one cycle.
 
         ``field_ee``: (A, 3, n) µT. ``forces``: (A, 3, n) N, ambient included. ``healthy``:
         (A, n), False in the padding; what unhealthy taxels hold is finite and means nothing.
         """
 
-    def set_noise(self, noise_ut: Float) -> None:
+    def set_noise(self, noise_ut: FloatArray) -> None:
         """Noise of one sample, (3,) µT rms in chip axes, as a tare measured it."""
 
     def reset(self, rested: bool = False) -> None:
@@ -82,17 +84,23 @@ class Off:
             loaded=np.zeros_like(layout.real),
         )
 
-    def update(self, field_ee: Float, forces: Float, healthy: Bool, captured: Instant) -> Estimate:  # noqa: ARG002 - as every `Compensator`
+    def update(  # the arguments of every `Compensator`
+        self,
+        field_ee: FloatArray,  # noqa: ARG002
+        forces: FloatArray,  # noqa: ARG002
+        healthy: Bool,  # noqa: ARG002
+        captured: Instant,  # noqa: ARG002
+    ) -> Estimate:
         """The same estimate for every cycle."""
         return self._estimate
 
-    def set_noise(self, noise_ut: Float) -> None:
+    def set_noise(self, noise_ut: FloatArray) -> None:
         """Nothing depends on it."""
 
     def reset(self, rested: bool = False) -> None:
         """Nothing is remembered."""
 
 
-def outside_plane(theta: Float, layout: Layout) -> Float:
+def outside_plane(theta: FloatArray, layout: Layout) -> FloatArray:
     """(A, 3, 3) of `Ambient.plane` ([a, component, value or slope per m]) from ``theta``."""
     return theta * layout.plane_scale

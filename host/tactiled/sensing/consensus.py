@@ -19,6 +19,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.types import NS_PER_S, Instant
 from tactiled.blocks import Ambient
 from tactiled.sensing.compensation import Estimate, outside_plane
@@ -29,8 +30,6 @@ from tactiled.sensing.layout import Layout
 #
 # No random draws: the subsets depend on the geometry alone, so equal inputs give equal fits.
 
-
-Float = NDArray[np.float64]
 
 PLANE_TAXELS = 9
 """Arrays of fewer taxels get a constant instead of a plane: on five taxels a plane takes 46 % of
@@ -49,14 +48,14 @@ DENSE = 24
 the largest array of 128 takes no longer than for one of 24 (2,024 triples)."""
 
 
-def design_candidates(design: Float) -> tuple[Float, NDArray[np.bool_]]:
+def design_candidates(design: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Operators from the field on n taxels to the coefficients that each subset proposes.
 
     ``design``: (n, 3), `Layout.design` of one array, taxels first. Returns
     (k, 3, n) and (k, n) which taxels each uses.
     """
     n = len(design)
-    operators: list[Float] = []
+    operators: list[FloatArray] = []
     used: list[tuple[int, ...]] = []
     for group in _groups(design):
         operator = np.zeros((3, n))
@@ -75,7 +74,7 @@ def design_candidates(design: Float) -> tuple[Float, NDArray[np.bool_]]:
     return np.array(operators), uses
 
 
-def _groups(design: Float) -> list[tuple[int, ...]]:
+def _groups(design: FloatArray) -> list[tuple[int, ...]]:
     """Compact groups that propose a constant; all pairs on small arrays."""
     n = len(design)
     if n < PLANE_TAXELS:
@@ -94,7 +93,7 @@ def _groups(design: Float) -> list[tuple[int, ...]]:
     return [every[i] for i in keep.tolist()]
 
 
-def _triples(design: Float) -> list[tuple[int, ...]]:
+def _triples(design: FloatArray) -> list[tuple[int, ...]]:
     """Wide triples that use all taxels about equally often."""
     n = len(design)
     pool = np.unique(np.linspace(0, n - 1, min(n, DENSE)).round().astype(int)).tolist()
@@ -174,13 +173,13 @@ class Fit:
     field that an array's taxels agree on is from where it must be; 0 where it is not beyond that.
     """
 
-    theta: Float
-    support: Float
-    residual_ut: Float
+    theta: FloatArray
+    support: FloatArray
+    residual_ut: FloatArray
     valid: Bool
-    common: Float
+    common: FloatArray
     whole: bool
-    leap: Float
+    leap: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,14 +231,16 @@ class Consensus:
         """µT rms by which one component of a free taxel is off a perfect plane."""
         return math.sqrt(self._variance)
 
-    def set_noise(self, noise_ut: Float) -> None:
+    def set_noise(self, noise_ut: FloatArray) -> None:
         """Noise of one sample, (3,) µT rms in chip axes."""
         self._variance = float((noise_ut**2).mean()) + MODEL_ERROR_UT**2
         self._gate = INLIER_SIGMAS**2 * self._variance
         # mean of a taxel's squared distance when a quarter of them are at the gate
         self._doubtful = (0.25 * self._gate + 0.75 * 3.3 * self._variance) * self._layout.counts
 
-    def fit(self, field_ee: Float, forces: Float, healthy: Bool, prior: Prior | None = None) -> Fit:
+    def fit(
+        self, field_ee: FloatArray, forces: FloatArray, healthy: Bool, prior: Prior | None = None
+    ) -> Fit:
         """Fit of one cycle; see `Compensator.update` for the arguments.
 
         ``prior``: what the board saw before; None when it has seen nothing yet.
@@ -257,7 +258,12 @@ class Consensus:
         return self._judge(theta, target, healthy, prior)
 
     def follow(
-        self, theta: Float, field_ee: Float, forces: Float, healthy: Bool, prior: Prior | None
+        self,
+        theta: FloatArray,
+        field_ee: FloatArray,
+        forces: FloatArray,
+        healthy: Bool,
+        prior: Prior | None,
     ) -> Fit | None:
         """Fit of a cycle that continues the earlier fit ``theta``; None when a vote is needed.
 
@@ -271,7 +277,12 @@ class Consensus:
         return fit if fit.whole and fit.support.min() >= FOLLOW_SUPPORT else None
 
     def check(
-        self, theta: Float, field_ee: Float, forces: Float, healthy: Bool, prior: Prior | None
+        self,
+        theta: FloatArray,
+        field_ee: FloatArray,
+        forces: FloatArray,
+        healthy: Bool,
+        prior: Prior | None,
     ) -> Fit:
         """How far the present cycle bears out ``theta``, an earlier fit or another's."""
         target = self._target(theta, field_ee, forces)
@@ -280,7 +291,7 @@ class Consensus:
     def _all(self, healthy: Bool) -> bool:
         return int(np.count_nonzero(healthy)) == self._layout.taxels
 
-    def _target(self, theta: Float, field_ee: Float, forces: Float) -> Float:
+    def _target(self, theta: FloatArray, field_ee: FloatArray, forces: FloatArray) -> FloatArray:
         """Fields without neighbours' contacts, given about where the ambient field is."""
         if not self._model.decouples:
             return field_ee
@@ -288,7 +299,7 @@ class Consensus:
         target -= self._model.plane_leak(theta)
         return target
 
-    def _vote(self, field: Float, healthy: Bool) -> tuple[Float, Float]:
+    def _vote(self, field: FloatArray, healthy: Bool) -> tuple[FloatArray, FloatArray]:
         """Best proposal of each array, (A, 3, 3), and its score, (A,) µT²."""
         # component first, so that every step below runs over contiguous numbers
         single = field.swapaxes(0, 1).astype(np.float32, order="C")
@@ -309,7 +320,9 @@ class Consensus:
         theta = proposed[:, self._rows, :, best].astype(np.float64)
         return theta, score[self._rows, best]
 
-    def _prefer_common(self, theta: Float, score: Float, field: Float, weight: Float) -> None:
+    def _prefer_common(
+        self, theta: FloatArray, score: FloatArray, field: FloatArray, weight: FloatArray
+    ) -> None:
         """Put the board's constant into ``theta`` for arrays that it explains about as well."""
         flat = field.swapaxes(0, 1).reshape(3, -1)
         flat_weight = weight.reshape(-1)
@@ -332,8 +345,13 @@ class Consensus:
             theta[a, :, 0] = common
 
     def _refine(
-        self, theta: Float, target: Float, weight: Float, reach: float, shrink: bool = False
-    ) -> Float:
+        self,
+        theta: FloatArray,
+        target: FloatArray,
+        weight: FloatArray,
+        reach: float,
+        shrink: bool = False,
+    ) -> FloatArray:
         """One step of reweighted least squares with Tukey's weights."""
         away = target - theta @ self._design
         inside = np.einsum("acn,acn->an", away, away)
@@ -355,10 +373,14 @@ class Consensus:
                 normal[:, 1, 1] += ridge
                 normal[:, 2, 2] += ridge
                 inverse = np.linalg.inv(normal)
-        refined: Float = right @ inverse  # symmetric: each row is the solution of one component
+        refined: FloatArray = (
+            right @ inverse
+        )  # symmetric: each row is the solution of one component
         return refined
 
-    def _judge(self, theta: Float, target: Float, healthy: Bool, prior: Prior | None) -> Fit:
+    def _judge(
+        self, theta: FloatArray, target: FloatArray, healthy: Bool, prior: Prior | None
+    ) -> Fit:
         """Whether the taxels bear out a fit."""
         away = target - theta @ self._design
         squared = np.einsum("acn,acn->an", away, away)
@@ -477,7 +499,7 @@ class FieldTracker:
     def reset(self) -> None:
         """Forget every plane."""
         arrays = self._layout.arrays
-        self.theta: Float = np.zeros((arrays, 3, 3))
+        self.theta: FloatArray = np.zeros((arrays, 3, 3))
         self._sure = np.zeros(arrays)  # taxels that bear out the plane in force
         self._common = np.full((arrays, 3), np.nan)
         self._fitted_at = np.zeros(arrays, dtype=np.int64)
@@ -516,7 +538,7 @@ class FieldTracker:
         return self._estimate(fit, self.theta, valid, age, self._none)
 
     def _estimate(
-        self, fit: Fit, theta: Float, valid: Bool, age: Float, borrowed: Bool
+        self, fit: Fit, theta: FloatArray, valid: Bool, age: FloatArray, borrowed: Bool
     ) -> Estimate:
         support = fit.support * self._layout.counts
         self._sure = np.where(valid, support, self._sure)
@@ -553,7 +575,7 @@ class FieldTracker:
             or supporting.sum() >= LENDING_BOARD * self._layout.taxels
         )
 
-    def _borrow(self, fit: Fit, valid: Bool, age: Float) -> tuple[Float, Bool]:
+    def _borrow(self, fit: Fit, valid: Bool, age: FloatArray) -> tuple[FloatArray, Bool]:
         """Planes in which the arrays without a fit of their own follow the rest of the board."""
         theta = self.theta.copy()
         for a in np.flatnonzero(~valid):

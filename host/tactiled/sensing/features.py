@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.geometry import ArrayGeometry, Side, SkinGeometry
 from tactile_core.types import Instant, seconds_between
 from tactiled.blocks import Features, Patch, Reason
@@ -97,7 +98,6 @@ def _near(array: ArrayGeometry) -> NDArray[np.bool_]:
     return touching
 
 
-Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 BRIDGED_CYCLES = 1
@@ -166,11 +166,11 @@ class FeatureExtractor:
         return self._contact
 
     @property
-    def least_n(self) -> Float:
+    def least_n(self) -> FloatArray:
         """(N,) N that a taxel must read at least to be in contact."""
         return self._on
 
-    def set_noise(self, sigma_n: Float) -> None:
+    def set_noise(self, sigma_n: FloatArray) -> None:
         """Noise of the normal forces, (N,) N rms: contact thresholds follow."""
         self._on = np.maximum(self._minimum, self._sigmas * sigma_n)
         self._slight = SLIGHT_SIGMAS * sigma_n
@@ -187,7 +187,7 @@ class FeatureExtractor:
 
     def update(
         self,
-        force: Float,
+        force: FloatArray,
         masked: int,
         reasons: tuple[Reason, ...],
         valid: bool,
@@ -276,7 +276,7 @@ class FeatureExtractor:
             patches=tuple(patches),
         )
 
-    def _peak_position(self, peak: int, row: dict[int, int], presses: list[float]) -> Float:
+    def _peak_position(self, peak: int, row: dict[int, int], presses: list[float]) -> FloatArray:
         """Centroid of the normal forces on the peak taxel and its neighbours in contact."""
         touching = len(presses)  # rows from there on belong to the rings
         around = [t for t in self._adjacency.neighbours[peak] if row.get(t, touching) < touching]

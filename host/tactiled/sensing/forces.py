@@ -13,12 +13,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration.force_model import FeatureMap, Layer, NetModel, RestTracker, monomials
 from tactile_core.calibration.types import BoardCalibration
 from tactile_core.types import Instant, seconds_between
 from tactiled.sensing.layout import Layout
-
-Float = NDArray[np.float64]
 
 MAX_OWN_CONDITION = 1e4
 """A taxel whose own 3 × 3 block is worse conditioned does not feel three components of force; its
@@ -60,7 +59,7 @@ class ForceModel:
         self._matrix = blocks.reshape(arrays, 3 * n, 3 * n)
         self._derive(blocks)
 
-    def _derive(self, blocks: Float) -> None:
+    def _derive(self, blocks: FloatArray) -> None:
         """Precompute what depends on geometry and matrix alone."""
         layout = self.layout
         arrays, n = layout.arrays, layout.width
@@ -96,7 +95,7 @@ class ForceModel:
         leak[~self._decouples] = 0
         self._plane_leak = leak.reshape(arrays, 3 * n, 9)
 
-    def rested_at(self, temperature_c: Float) -> None:
+    def rested_at(self, temperature_c: FloatArray) -> None:
         """The rest field was taken at ``temperature_c`` (A, n) °C.
 
         Of a board nobody has measured the makers' drift of its magnets is taken off from there on.
@@ -108,15 +107,15 @@ class ForceModel:
             self._drifts = bool(self._drift.any())
 
     @property
-    def rested_c(self) -> Float:
+    def rested_c(self) -> FloatArray:
         """(A, n) °C at which the rest field in force was taken."""
         return self._rested_at
 
-    def warmer(self, temperature_c: Float) -> Float:
+    def warmer(self, temperature_c: FloatArray) -> FloatArray:
         """(A, n) K since the rest field was taken."""
         return np.asarray(temperature_c - self._rested_at)
 
-    def taxel_field(self, raw: Float, temperature_c: Float) -> Float:
+    def taxel_field(self, raw: FloatArray, temperature_c: FloatArray) -> FloatArray:
         """µT in taxel axes, rest and drift taken off; ``raw`` µT in chip axes, ``temperature_c``
         (A, n).
         """
@@ -132,47 +131,47 @@ class ForceModel:
             field -= self._drift * (temperature_c - self._reference)[:, None, :]
         return field
 
-    def chip_rest(self) -> Float:
+    def chip_rest(self) -> FloatArray:
         """(A, 3, n) µT in chip axes that the untouched chips read."""
         out = self.rest.copy()
         out[:, 0] = self._cos * self.rest[:, 0] + self._sin * self.rest[:, 1]
         out[:, 1] = self._cos * self.rest[:, 1] - self._sin * self.rest[:, 0]
         return out
 
-    def forces(self, field: Float) -> Float:
+    def forces(self, field: FloatArray) -> FloatArray:
         """N in taxel axes that ``field`` in taxel axes stands for, ambient and all."""
-        forces: Float = (self._matrix @ field.reshape(len(field), -1, 1)).reshape(field.shape)
+        forces: FloatArray = (self._matrix @ field.reshape(len(field), -1, 1)).reshape(field.shape)
         return forces
 
-    def field_in_ee(self, field: Float) -> Float:
+    def field_in_ee(self, field: FloatArray) -> FloatArray:
         """µT in ``ee`` axes, where a uniform ambient field is the same at every taxel."""
         return np.asarray((self.layout.rotation * field[:, None]).sum(axis=2))
 
-    def decoupled_in_ee(self, field_ee: Float, forces: Float) -> Float:
+    def decoupled_in_ee(self, field_ee: FloatArray, forces: FloatArray) -> FloatArray:
         """µT in ``ee`` axes without what neighbours' contacts add, from all of the `forces`.
 
         A uniform field comes out changed too; `plane_leak` says by how much.
         """
-        undone: Float = (self._undo * forces[:, None]).sum(axis=2)
+        undone: FloatArray = (self._undo * forces[:, None]).sum(axis=2)
         if not self._decouples.all():
             undone[~self._decouples] = field_ee[~self._decouples]
         return undone
 
-    def plane_leak(self, theta: Float) -> Float:
+    def plane_leak(self, theta: FloatArray) -> FloatArray:
         """µT in ``ee`` axes by which `decoupled_in_ee` changes the plane ``theta``."""
         return self._of_plane(self._plane_leak, theta)
 
-    def plane_forces(self, theta: Float) -> Float:
+    def plane_forces(self, theta: FloatArray) -> FloatArray:
         """N in taxel axes that the plane ``theta`` adds to `forces`."""
         return self._of_plane(self._plane_force, theta)
 
-    def plane_field(self, theta: Float) -> Float:
+    def plane_field(self, theta: FloatArray) -> FloatArray:
         """µT of the plane ``theta`` in taxel axes."""
         in_ee = theta @ self.layout.design
-        field: Float = (self.layout.rotation * in_ee[:, :, None]).sum(axis=1)
+        field: FloatArray = (self.layout.rotation * in_ee[:, :, None]).sum(axis=1)
         return field
 
-    def normal_slopes(self) -> Float:
+    def normal_slopes(self) -> FloatArray:
         """(A, n, 3, 3) N/µT, what the normal forces lose to a plane: [a, taxel, component in
         ``ee``, coefficient over `Layout.design`].
         """
@@ -180,15 +179,15 @@ class ForceModel:
         rows = self._plane_force.reshape(arrays, 3, n, 3, 3)[:, 2]
         return np.ascontiguousarray(rows)
 
-    def normal_sigma(self, noise_ut: Float) -> Float:
+    def normal_sigma(self, noise_ut: FloatArray) -> FloatArray:
         """(A, n) N rms of the normal force, from independent noise ``noise_ut`` (3,) µT rms."""
         arrays, n = self.layout.arrays, self.layout.width
         rows = self._matrix.reshape(arrays, 3, n, 3, n)[:, 2]
-        sigma: Float = np.sqrt(np.einsum("aicj,c->ai", rows**2, noise_ut**2))
+        sigma: FloatArray = np.sqrt(np.einsum("aicj,c->ai", rows**2, noise_ut**2))
         return sigma
 
-    def _of_plane(self, matrix: Float, theta: Float) -> Float:
-        vectors: Float = (matrix @ theta.reshape(-1, 9, 1)).reshape(
+    def _of_plane(self, matrix: FloatArray, theta: FloatArray) -> FloatArray:
+        vectors: FloatArray = (matrix @ theta.reshape(-1, 9, 1)).reshape(
             self.layout.arrays, 3, self.layout.width
         )
         return vectors
@@ -216,7 +215,7 @@ class RestFollower:
         self._mean = np.zeros(channels)
         self._begun = False
 
-    def step(self, field: Float, elapsed: float) -> Float:
+    def step(self, field: FloatArray, elapsed: float) -> FloatArray:
         """Change from rest of ``field`` (3n,) µT, ``elapsed`` s after the last."""
         tracker = self._tracker
         if tracker is None:
@@ -248,7 +247,7 @@ class History:
         self._leaky = np.zeros((len(features.taus_s), features.lagged))
         self._play = np.zeros((len(features.radii), features.lagged))
 
-    def step(self, components: Float, elapsed: float) -> Float:
+    def step(self, components: FloatArray, elapsed: float) -> FloatArray:
         """(lagged * (T + P),): component minus integrator, then component minus play."""
         now = components[: self._count]
         leaky, play = self._leaky, self._play
@@ -257,7 +256,7 @@ class History:
         return np.concatenate([(now - leaky).ravel(), (now - play).ravel()])
 
 
-def expand(features: FeatureMap, components: Float, history: Float) -> Float:
+def expand(features: FeatureMap, components: FloatArray, history: FloatArray) -> FloatArray:
     """(..., F) features of (..., k) components and (..., h) history terms."""
     parts, first = [components], components[..., :1]
     indices = _indices(features.curved, features.degree)
@@ -288,7 +287,7 @@ def _indices(components: int, degree: int) -> NDArray[np.intp]:
     return out
 
 
-def readout(model: NetModel, features: Float) -> Float:
+def readout(model: NetModel, features: FloatArray) -> FloatArray:
     """(..., targets) of (..., F) features."""
     value = (features - model.mean) / model.scale
     for layer in model.layers:
@@ -296,13 +295,13 @@ def readout(model: NetModel, features: Float) -> Float:
     return np.maximum(value, model.floor)
 
 
-def _apply(layer: Layer, value: Float) -> Float:
+def _apply(layer: Layer, value: FloatArray) -> FloatArray:
     if layer.kind == "rbf":
         square = (value**2).sum(axis=-1, keepdims=True) + (layer.weights**2).sum(axis=1)
         square = square - 2.0 * (value @ layer.weights.T)
-        near: Float = np.exp(-layer.bias[0] * np.maximum(square, 0.0))
+        near: FloatArray = np.exp(-layer.bias[0] * np.maximum(square, 0.0))
         return near
-    out: Float = value @ layer.weights + layer.bias
+    out: FloatArray = value @ layer.weights + layer.bias
     return np.tanh(out) if layer.kind == "tanh" else out
 
 
@@ -319,15 +318,15 @@ class NetEstimator:
         self._rest = RestFollower(features.tracker, features.channels)
         self._history = History(features)
 
-    def step(self, field: Float, elapsed: float) -> Float:
+    def step(self, field: FloatArray, elapsed: float) -> FloatArray:
         """(targets,) for ``field`` (3n,) µT over the tared rest, ``elapsed`` s after the last."""
         change = self._rest.step(field, elapsed)
-        components: Float = change @ self.model.features.projection
+        components: FloatArray = change @ self.model.features.projection
         history = self._history.step(components, elapsed)
         return readout(self.model, expand(self.model.features, components, history))
 
 
-def batch_features(features: FeatureMap, time_s: Float, field: Float) -> Float:
+def batch_features(features: FeatureMap, time_s: FloatArray, field: FloatArray) -> FloatArray:
     """(m, F) features of a whole recording: ``time_s`` (m,) s, ``field`` (m, 3n) µT over rest."""
     rest = RestFollower(features.tracker, field.shape[1])
     history = History(features)
@@ -374,7 +373,7 @@ class NetStage:
         """The stream began anew: the next frame follows none, the rest stays as followed."""
         self._last = None
 
-    def update(self, field: Float, captured: Instant) -> dict[str, float]:
+    def update(self, field: FloatArray, captured: Instant) -> dict[str, float]:
         """Prediction by target; ``field`` (A, 3, n) µT over rest, ambient and all, all healthy."""
         elapsed = 0.0 if self._last is None else max(0.0, seconds_between(self._last, captured))
         self._last = captured
@@ -385,7 +384,7 @@ class NetStage:
             out.update(zip(estimator.model.targets, values, strict=True))
         return out
 
-    def share(self, forces: Float, net: dict[str, float]) -> None:
+    def share(self, forces: FloatArray, net: dict[str, float]) -> None:
         """Scale ``forces`` (A, 3, n) N in place so that they add up to ``net``."""
         press = np.where(self._layout.real, np.maximum(-forces[:, 2], 0.0), 0.0)
         total = float(press.sum())

@@ -14,6 +14,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.geometry import SkinGeometry
 from tactile_core.types import NS_PER_S, Instant
 from tactiled.blocks import Reason, TaxelHealth
@@ -31,7 +32,6 @@ from tactiled.sensing.scale import Scale, Scales
 # that toggles spans a count.
 
 
-Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 BLOCK_S = 0.25
@@ -72,7 +72,7 @@ class Activity:
         self._start: Instant | None = None
         self._cycles = 0
 
-    def add(self, raw: Float, captured: Instant) -> bool:
+    def add(self, raw: FloatArray, captured: Instant) -> bool:
         """Take finite (A, 3, n) µT of one cycle; True when it ended a block, see `judge`."""
         np.minimum(self._low, raw, out=self._low)
         np.maximum(self._high, raw, out=self._high)
@@ -86,7 +86,7 @@ class Activity:
         self.dead &= ~moved
         self.stuck &= ~moved
 
-    def judge(self, steps: Float) -> None:
+    def judge(self, steps: FloatArray) -> None:
         """End a block: find who is ``dead`` or has an axis ``stuck``.
 
         ``steps``: (A, 3, 1) µT a count, NaN where it is not known.
@@ -179,7 +179,7 @@ class Twins:
     that read the same at rest may read the same. None: unknown.
     """
 
-    def __init__(self, real: Bool, rest_ut: Float | None) -> None:
+    def __init__(self, real: Bool, rest_ut: FloatArray | None) -> None:
         self._real = real
         self._places = np.flatnonzero(real)
         self._whole = bool(real.all())
@@ -190,7 +190,9 @@ class Twins:
         """Forget who was the same."""
         self._run: NDArray[np.int64] | None = None
 
-    def check(self, raw: Float, trusted: Float, unchanged: Bool, near: Float) -> Bool | None:
+    def check(
+        self, raw: FloatArray, trusted: FloatArray, unchanged: Bool, near: FloatArray
+    ) -> Bool | None:
         """(A, n) taxels that are found to send another chip's bits; None: none is.
 
         ``raw``: (A, 3, n) µT. A chip that left what it last read, ``trusted``, by more than
@@ -219,7 +221,7 @@ class Twins:
         self._run = run
         return guilty.reshape(unchanged.shape) if guilty.any() else None
 
-    def _pairs(self, key: Float) -> list[list[int]]:
+    def _pairs(self, key: FloatArray) -> list[list[int]]:
         """Flat indices of taxels with the same key."""
         values = key[self._places]
         order = np.argsort(values, kind="stable")
@@ -228,7 +230,7 @@ class Twins:
         out: list[list[int]] = pairs.tolist()
         return out
 
-    def _differ(self, i: int, j: int, near: Float) -> bool:
+    def _differ(self, i: int, j: int, near: FloatArray) -> bool:
         """Whether two taxels at rest read different fields, however their chips are turned."""
         if self._rest is None:
             return True
@@ -238,7 +240,7 @@ class Twins:
         return bool(z > near[2, 0] or xy > near[0, 0])
 
 
-def _columns(vectors: Float) -> Float:
+def _columns(vectors: FloatArray) -> FloatArray:
     """(A, 3, n) as (A n, 3)."""
     return vectors.swapaxes(1, 2).reshape(-1, 3)
 
@@ -284,9 +286,9 @@ class Jumps:
         self._any_small = bool(self._small.any())
         self.never: Bool = np.zeros(real.shape, bool)
         self._none = np.zeros(real.shape, np.int64)
-        self.rest: Float | None = None
+        self.rest: FloatArray | None = None
         """(A, 3, n) µT in chip axes that the untouched chips read; None: unknown."""
-        self.near: Float = np.zeros((3, 1))
+        self.near: FloatArray = np.zeros((3, 1))
         """µT that noise alone may make."""
         self.reset()
 
@@ -311,7 +313,7 @@ class Jumps:
         largest = float(self._scales.jump.min())
         return min(largest, ALONE_UT) if self._any_small else largest
 
-    def accept_rest(self, rest_ut: Float) -> None:
+    def accept_rest(self, rest_ut: FloatArray) -> None:
         """A tare has found what the untouched chips read."""
         self.rest = rest_ut
         self._displaced = self.never
@@ -324,9 +326,9 @@ class Jumps:
 
     def check(
         self,
-        raw: Float,
-        trusted: Float,
-        last: Float,
+        raw: FloatArray,
+        trusted: FloatArray,
+        last: FloatArray,
         open_: Bool,
         before: Bool,
         captured: Instant,
@@ -377,7 +379,7 @@ class Jumps:
         self._jumping = jumped
         return jumped | alone, jumped & wrapped
 
-    def _settle(self, jumped: Bool, step: Float, captured: Instant) -> Bool:
+    def _settle(self, jumped: Bool, step: FloatArray, captured: Instant) -> Bool:
         """Those of ``jumped`` that have not gone on from there for long enough."""
         on = jumped & self._jumping & (step <= self._scales.jump).all(axis=1)
         fresh = jumped & ~on
@@ -392,24 +394,24 @@ class Jumps:
             self._displaced = self._displaced | settled
         return jumped
 
-    def _undo(self, raw: Float, turns: Float) -> None:
+    def _undo(self, raw: FloatArray, turns: FloatArray) -> None:
         """Take ``turns`` (A, 3, n) whole ranges off ``raw``, now and from now on."""
         if np.count_nonzero(turns):
             raw -= np.where(turns == 0, 0.0, turns * self._scales.span)
             self._turn(self.turns - turns)
 
-    def _turn(self, turns: Float) -> None:
+    def _turn(self, turns: FloatArray) -> None:
         self.turns = turns
         self.wrapped = bool(np.count_nonzero(turns))
         self.offset = np.where(turns == 0, 0.0, turns * self._scales.span)
 
-    def _at_rest(self, raw: Float) -> Bool:
+    def _at_rest(self, raw: FloatArray) -> Bool:
         """(A, n) taxels that read about what they do untouched, where that is known."""
         if self.rest is None:
             return self.never
         return np.asarray((np.abs(raw - self.rest) <= REST_UT).all(axis=1))
 
-    def _find_again(self, raw: Float) -> None:
+    def _find_again(self, raw: FloatArray) -> None:
         """A chip whose wraps were lost count of, and that reads its rest but for whole ranges, is
         at rest: correct it in ``raw``, in place.
         """
@@ -423,7 +425,7 @@ class Jumps:
         self._undo(raw, np.where(here[:, None], turns, 0.0))
 
     def _alone(
-        self, distance: Float, step: Float, open_: Bool, before: Bool, elapsed_ns: int
+        self, distance: FloatArray, step: FloatArray, open_: Bool, before: Bool, elapsed_ns: int
     ) -> Bool:
         """(A, n): a chip of a small array jumped, no other moved, and it is not yet certain."""
         if not self._any_small or not 0 <= elapsed_ns <= ALONE_S * NS_PER_S:
@@ -481,7 +483,7 @@ class Thermometers:
     def reset(self) -> None:
         """Forget every temperature."""
         shape = self._real.shape
-        self.last: Float = np.full(shape, np.nan)
+        self.last: FloatArray = np.full(shape, np.nan)
         """(A, n) °C of the last cycle."""
         self._good = np.full(shape, np.nan)
         self._since = np.zeros(shape, np.int64)
@@ -490,15 +492,15 @@ class Thermometers:
         self.stuck: Bool | None = None
         self.uneasy = False
 
-    def plain(self, temperature_c: Float) -> bool:
+    def plain(self, temperature_c: FloatArray) -> bool:
         """Whether (A, n) °C need no closer look: near those of the cycle before."""
         return float(np.abs(temperature_c - self.last).max()) < STEP_C
 
-    def accept(self, temperature_c: Float) -> None:
+    def accept(self, temperature_c: FloatArray) -> None:
         """Take (A, n) °C that need no closer look."""
         self._good = temperature_c
 
-    def check(self, temperature_c: Float, read: Bool, captured: Instant) -> tuple[Bool, Bool]:
+    def check(self, temperature_c: FloatArray, read: Bool, captured: Instant) -> tuple[Bool, Bool]:
         """(A, n) temperatures that are impossible, and that jumped; the former are replaced.
 
         ``read``: (A, n) chips that were read; what others show is not kept.
@@ -664,7 +666,7 @@ class HealthMonitor:
         layout: Layout,
         frozen_after_s: float | None,
         range_limit_ut: float,
-        rest_ut: Float | None = None,
+        rest_ut: FloatArray | None = None,
     ) -> None:
         """``rest_ut``: (A, 3, n) µT in chip axes that an untouched chip reads; None: unknown."""
         shape = (layout.arrays, layout.width)
@@ -713,12 +715,12 @@ class HealthMonitor:
         for copies in self._copies:
             copies.reset()
 
-    def set_noise(self, noise_ut: Float) -> None:
+    def set_noise(self, noise_ut: FloatArray) -> None:
         """Noise of one sample, (3,) µT rms in chip axes."""
         self._near = self._jumps.near = NEAR_SIGMAS * noise_ut[:, None]
         self._quiet = float(self._near.min())
 
-    def set_rest(self, rest_ut: Float) -> None:
+    def set_rest(self, rest_ut: FloatArray) -> None:
         """A tare has found what the untouched chips read: (A, 3, n) µT in chip axes."""
         self._rest = rest_ut
         self._jumps.accept_rest(rest_ut)
@@ -730,8 +732,8 @@ class HealthMonitor:
 
     def update(
         self,
-        raw: Float,
-        temperature_c: Float,
+        raw: FloatArray,
+        temperature_c: FloatArray,
         status: UInt8,
         present: Bool,
         captured: Instant,
@@ -831,7 +833,7 @@ class HealthMonitor:
 
     # What is looked at in every cycle
 
-    def _repair(self, raw: Float) -> tuple[Bool, Bool] | None:
+    def _repair(self, raw: FloatArray) -> tuple[Bool, Bool] | None:
         """Put what was read before in place of what no chip can read, in ``raw``.
 
         (A, n) taxels that are not a number and that are beyond the range; None: there are none.
@@ -843,7 +845,7 @@ class HealthMonitor:
         np.copyto(raw, np.nan_to_num(self._last), where=(strange | beyond)[:, None])
         return strange, beyond
 
-    def _is_motion(self, raw: Float, moved: Float) -> bool:
+    def _is_motion(self, raw: FloatArray, moved: FloatArray) -> bool:
         """Whether steps beyond the noise are a contact's: small, and x and y not alike, as they
         are in failed reads.
         """
@@ -851,7 +853,7 @@ class HealthMonitor:
             return False
         return not np.count_nonzero((raw[:, 0] == raw[:, 1]) & (moved >= self._quiet))
 
-    def _copied(self, raw: Float, moved: Float, present: Bool) -> Bool | None:
+    def _copied(self, raw: FloatArray, moved: FloatArray, present: Bool) -> Bool | None:
         """(A,) arrays whose frame is a copy of an earlier one; None: none is."""
         out: Bool | None = None
         for a, copies in enumerate(self._copies):
@@ -903,7 +905,7 @@ class HealthMonitor:
             _mark(fault, (status & TaxelHealth.SATURATED) > 0, Fault.SATURATED)
             _mark(fault, status > 0, Fault.STALE)
 
-    def _mark_failed(self, fault: UInt8, raw: Float, sent: Float) -> None:
+    def _mark_failed(self, fault: UInt8, raw: FloatArray, sent: FloatArray) -> None:
         """Failed reads: the same count on every axis; zero, minus one, or what an offset makes.
 
         Only where the chip read something else before: noise is not that alike.
@@ -926,7 +928,9 @@ class HealthMonitor:
         _mark(fault, zero & (far | lasts), Fault.ZEROS)
         _mark(fault, same & (far | (lasts & (np.abs(z) < TINY_UT))), Fault.ONES)
 
-    def _mark_temperatures(self, fault: UInt8, temperature_c: Float, captured: Instant) -> None:
+    def _mark_temperatures(
+        self, fault: UInt8, temperature_c: FloatArray, captured: Instant
+    ) -> None:
         impossible, jumped = self._thermometers.check(temperature_c, fault == 0, captured)
         if np.count_nonzero(impossible):
             _mark(fault, impossible, Fault.TEMPERATURE)
@@ -950,7 +954,7 @@ class HealthMonitor:
             self._gone |= new
         self._ailing = bool(np.count_nonzero(fault)) or self._thermometers.uneasy
 
-    def _end_block(self, raw: Float, fault: UInt8) -> None:
+    def _end_block(self, raw: FloatArray, fault: UInt8) -> None:
         """What is looked at four times a second."""
         activity, steps = self._activity, self.scales.steps
         activity.judge(steps)

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from tactile_core.geometry import SkinGeometry
 
-Float = NDArray[np.float64]
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.types import NS_PER_S, Instant
 from tactiled.blocks import Ambient
 from tactiled.sensing.compensation import Compensator, Estimate, Off, outside_plane
@@ -15,7 +16,6 @@ from tactiled.sensing.ransac import RansacCompensator
 from tactiled.sensing.settings import PipelineSettings
 from tactiled.sensing.small_array import SmallArray
 
-Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 
@@ -42,7 +42,7 @@ class ConsensusCompensator:
         self._fitted: Instant | None = None
         self._sound = False  # the last fit was valid on every array: it can be followed
 
-    def set_noise(self, noise_ut: Float) -> None:
+    def set_noise(self, noise_ut: FloatArray) -> None:
         """Noise of one sample, (3,) µT rms in chip axes."""
         self._consensus.set_noise(noise_ut)
         self._tracker.sample_sigma = self._consensus.sample_sigma
@@ -53,7 +53,9 @@ class ConsensusCompensator:
         self._fitted = None
         self._sound = False
 
-    def update(self, field_ee: Float, forces: Float, healthy: Bool, captured: Instant) -> Estimate:
+    def update(
+        self, field_ee: FloatArray, forces: FloatArray, healthy: Bool, captured: Instant
+    ) -> Estimate:
         """Estimate for one cycle."""
         if self._fitted is None or captured - self._fitted >= self._period:
             prior = self._tracker.prior(captured)
@@ -84,7 +86,7 @@ class SmallArrays:
         self._arrays = {a: SmallArray(model.press_direction[a, :, : layout.counts[a]]) for a in few}
         self.reset()
 
-    def set_noise(self, noise_ut: Float) -> None:
+    def set_noise(self, noise_ut: FloatArray) -> None:
         """Noise of one sample, (3,) µT rms in chip axes."""
         if self._rest is not None:
             self._rest.set_noise(noise_ut)
@@ -103,7 +105,9 @@ class SmallArrays:
         if self._rest is not None:
             self._rest.reset(rested)
 
-    def update(self, field_ee: Float, forces: Float, healthy: Bool, captured: Instant) -> Estimate:
+    def update(
+        self, field_ee: FloatArray, forces: FloatArray, healthy: Bool, captured: Instant
+    ) -> Estimate:
         """Estimate for one cycle."""
         layout, model = self._layout, self._model
         elapsed = 0.0 if self._last is None else (captured - self._last) / NS_PER_S

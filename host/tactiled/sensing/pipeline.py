@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration.types import BoardCalibration
 from tactile_core.types import NS_PER_S, Instant
 from tactiled.blocks import Ambient, Cycle, Features, Reason, SampleBlock, TaxelHealth
@@ -176,7 +177,6 @@ def gather_temperature(group: Group) -> np.ndarray[tuple[int], np.dtype[np.float
 
 __all__ = ["BoardPipeline", "CycleCounters", "PipelineSettings", "RestState", "TareReport"]
 
-Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 
@@ -214,8 +214,8 @@ class BoardPipeline:
         self._hold = np.where(layout.counts < PLANE_TAXELS, np.inf, settings.hold_s).tolist()
         self._bounds = Bounds(self._model, layout, calibration.nominal)
         self._watch = RestWatch(layout, self._model, [a.name for a in geometry.arrays])
-        self._warmer: Float = np.zeros(layout.taxels)
-        self._drift: Float = np.zeros(layout.taxels)
+        self._warmer: FloatArray = np.zeros(layout.taxels)
+        self._drift: FloatArray = np.zeros(layout.taxels)
         self._forgotten: Reason | None = None
         self._theta = np.zeros((layout.arrays, 3, 3))
         self._feature_due: Instant | None = None
@@ -455,7 +455,7 @@ class BoardPipeline:
             features_due=self._due(captured),
         )
 
-    def _collect(self, group: Group) -> tuple[Float, Float, NDArray[np.uint8], Bool]:
+    def _collect(self, group: Group) -> tuple[FloatArray, FloatArray, NDArray[np.uint8], Bool]:
         """Blocks of a cycle in padded arrays; missing ones are zero and marked by ``present``."""
         shape = (self._layout.arrays, self._layout.width)
         raw = np.zeros((shape[0], 3, shape[1]))
@@ -524,8 +524,8 @@ class BoardPipeline:
 
     def _advance_tare(
         self,
-        field: Float,
-        temperature: Float,
+        field: FloatArray,
+        temperature: FloatArray,
         health: NDArray[np.uint8],
         whole: bool,
         captured: Instant,
@@ -555,13 +555,18 @@ class BoardPipeline:
         self._settle_rest(temperature)
         self._apply_noise(report.noise_ut)
 
-    def _settle_rest(self, temperature: Float) -> None:
+    def _settle_rest(self, temperature: FloatArray) -> None:
         """A rest field has just come into force."""
         self._model.rested_at(temperature)
         self._bounds.set_rest(self._layout.flat_vectors(self._model.rest))
 
     def _watch_rest(
-        self, field: Float, forces: Float, estimate: Estimate, healthy: Bool, captured: Instant
+        self,
+        field: FloatArray,
+        forces: FloatArray,
+        estimate: Estimate,
+        healthy: Bool,
+        captured: Instant,
     ) -> None:
         """See whether the rest field is still what it was."""
         reason = self._watch.judge(field, forces, estimate, healthy, captured)
@@ -572,7 +577,7 @@ class BoardPipeline:
         elif self._rest.suspicion is not None and self._watch.restored(forces, estimate, healthy):
             self._rest.trust()
 
-    def _feel_warmth(self, temperature: Float, healthy: Bool) -> None:
+    def _feel_warmth(self, temperature: FloatArray, healthy: Bool) -> None:
         """What the warming since the tare may look like, from the taxels' own thermometers."""
         # a masked chip's thermometer says nothing
         warmer = self._layout.flat(np.where(healthy, self._model.warmer(temperature), 0.0))
@@ -586,8 +591,8 @@ class BoardPipeline:
         self._features.set_noise(np.hypot(self._sigma, WARMING_SIGMAS * self._drift))
 
     def _bound(
-        self, features: Features, estimate: Estimate, force: Float, known: bool
-    ) -> tuple[Features, Float]:
+        self, features: Features, estimate: Estimate, force: FloatArray, known: bool
+    ) -> tuple[Features, FloatArray]:
         """Features with their bounds, not valid where those are too wide; bounds of the taxels."""
         if not known:
             return features, np.full(len(force), np.nan)
@@ -632,7 +637,7 @@ class BoardPipeline:
         ends = np.cumsum(self._layout.counts)
         return int(np.searchsorted(ends, self._features.peak_taxel, side="right"))
 
-    def _rest_late(self, field: Float, late: Bool, untouched: bool, captured: Instant) -> None:
+    def _rest_late(self, field: FloatArray, late: Bool, untouched: bool, captured: Instant) -> None:
         """Let chips that came late have a rest field once nothing touches the skin."""
         if not (untouched and late.any()):
             self._late.forget()
@@ -644,7 +649,7 @@ class BoardPipeline:
             self._monitor.set_rest(self._model.chip_rest())
             self._bounds.set_rest(self._layout.flat_vectors(self._model.rest))
 
-    def _apply_noise(self, noise: Float) -> None:
+    def _apply_noise(self, noise: FloatArray) -> None:
         """Noise of one sample, (3,) µT in chip axes, sets the thresholds of contact and fit."""
         self._noise = np.maximum(noise, MIN_NOISE_UT)
         self._monitor.set_noise(self._noise)
@@ -654,7 +659,7 @@ class BoardPipeline:
         self._compensator.set_noise(self._noise)
 
     def _follow_rest(
-        self, field: Float, estimate: Estimate, healthy: Bool, captured: Instant
+        self, field: FloatArray, estimate: Estimate, healthy: Bool, captured: Instant
     ) -> None:
         """Let the rest of untouched taxels follow what compensation left over."""
         period = self.settings.rest_tracking_s

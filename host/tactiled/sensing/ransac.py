@@ -11,12 +11,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.types import NS_PER_S, Instant
 from tactiled.sensing.compensation import Estimate
 from tactiled.sensing.consensus import Consensus, FieldTracker
 from tactiled.sensing.layout import Layout
 
-Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 MIN_TAXELS = 4
@@ -43,7 +43,7 @@ class RansacCompensator:
         self._tracker = FieldTracker(layout, "ransac", borrows=False)
         self.reset()
 
-    def set_noise(self, noise_ut: Float) -> None:
+    def set_noise(self, noise_ut: FloatArray) -> None:
         """Noise of one sample, (3,) µT rms in chip axes."""
         self._checker.set_noise(noise_ut)
         self._tracker.sample_sigma = self._checker.sample_sigma
@@ -56,7 +56,9 @@ class RansacCompensator:
         self._theta = np.zeros((self._layout.arrays, 3, 3))
         self._complete = np.zeros(self._layout.arrays, dtype=bool)
 
-    def update(self, field_ee: Float, forces: Float, healthy: Bool, captured: Instant) -> Estimate:
+    def update(
+        self, field_ee: FloatArray, forces: FloatArray, healthy: Bool, captured: Instant
+    ) -> Estimate:
         """Estimate for one cycle."""
         surfaces = 3 * self._layout.arrays
         due = 0
@@ -74,7 +76,7 @@ class RansacCompensator:
         held = self._checker.check(self._tracker.theta, field_ee, forces, healthy, prior)
         return self._tracker.take(held, captured, fresh=False)
 
-    def _fit_surfaces(self, upto: int, field: Float, healthy: Bool) -> bool:
+    def _fit_surfaces(self, upto: int, field: FloatArray, healthy: Bool) -> bool:
         """Fit surfaces until ``upto`` of them are done; True when that ends the period's round."""
         surfaces = 3 * self._layout.arrays
         if self._done >= upto:

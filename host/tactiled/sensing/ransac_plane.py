@@ -5,11 +5,10 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.linear_model import LinearRegression, RANSACRegressor
 
-Float = NDArray[np.float64]
+from tactile_core.arrays import FloatArray
 
 MAX_TRIALS = 100
 """scikit-learn's default."""
@@ -18,7 +17,7 @@ MAX_TRIALS = 100
 class Plane(RegressorMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn has no types
     """Least-squares plane; what `LinearRegression` gives, without its checks: ten times faster."""
 
-    def fit(self, surface: Float, values: Float) -> Plane:
+    def fit(self, surface: FloatArray, values: FloatArray) -> Plane:
         """Fit ``values`` (k,) at ``surface`` (k, 2)."""
         design = np.empty((len(surface), 3))
         design[:, 0] = 1.0
@@ -27,15 +26,15 @@ class Plane(RegressorMixin, BaseEstimator):  # type: ignore[misc]  # scikit-lear
         self.intercept_, self.coef_ = solution[0], solution[1:]
         return self
 
-    def predict(self, surface: Float) -> Float:
+    def predict(self, surface: FloatArray) -> FloatArray:
         """(k,) heights of the plane at ``surface`` (k, 2)."""
-        heights: Float = self.intercept_ + surface @ self.coef_
+        heights: FloatArray = self.intercept_ + surface @ self.coef_
         return heights
 
 
 def fit_plane(
-    surface: Float, values: Float, rng: np.random.Generator, plain: bool = False
-) -> Float | None:
+    surface: FloatArray, values: FloatArray, rng: np.random.Generator, plain: bool = False
+) -> FloatArray | None:
     """RANSAC plane through ``values`` (n,) at ``surface`` (n, 2): (3,) height at 0 and slopes.
 
     None when there is no consensus. ``plain``: with `LinearRegression`, scikit-learn's default,

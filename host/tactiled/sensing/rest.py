@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.types import Instant, seconds_between
 from tactiled.blocks import Reason
 from tactiled.sensing import reasons as why
@@ -23,7 +24,6 @@ from tactiled.sensing.settings import PipelineSettings
 # Taring: what the untouched, unmoving skin reads becomes its rest field.
 
 
-Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 MIN_CYCLES = 8
@@ -53,14 +53,14 @@ class TareReport:
     message: str
     cycles: int
     shift_ut: float
-    noise_ut: Float
+    noise_ut: FloatArray
     sequence: int
 
 
 class Tare:
     """Sums of the cycles of one tare; constant memory. ``expected``: (3,) µT rms of one sample."""
 
-    def __init__(self, shape: tuple[int, ...], seconds: float, noise_ut: Float) -> None:
+    def __init__(self, shape: tuple[int, ...], seconds: float, noise_ut: FloatArray) -> None:
         self._seconds = seconds
         self.expected = noise_ut
         self._start: Instant | None = None
@@ -81,9 +81,9 @@ class Tare:
         return sum(self._counts)
 
     @property
-    def mean(self) -> Float:
+    def mean(self) -> FloatArray:
         """(A, 3, n) µT, mean of the cycles taken, at least one."""
-        mean: Float = self._pivot + self._sums.sum(axis=0) / self.cycles
+        mean: FloatArray = self._pivot + self._sums.sum(axis=0) / self.cycles
         return mean
 
     @property
@@ -91,7 +91,7 @@ class Tare:
         """(A, n) taxels that were healthy in every cycle taken."""
         return self._healthy
 
-    def add(self, field: Float, healthy: Bool, whole: bool, captured: Instant) -> bool:
+    def add(self, field: FloatArray, healthy: Bool, whole: bool, captured: Instant) -> bool:
         """Take one cycle, unless an array was missing from it; True when the tare is over."""
         if self._start is None:
             self._start = captured
@@ -127,15 +127,15 @@ class Tare:
             return f"the field varied by {spread.max():.1f} µT rms: keep the skin still, untouched"
         return None
 
-    def noise(self) -> Float:
+    def noise(self) -> FloatArray:
         """(3,) µT rms of one sample in x, y, z: median over taxels healthy throughout."""
-        noise: Float = np.median(self._spread().swapaxes(1, 2)[self._healthy], axis=0)
+        noise: FloatArray = np.median(self._spread().swapaxes(1, 2)[self._healthy], axis=0)
         return noise
 
-    def _spread(self) -> Float:
+    def _spread(self) -> FloatArray:
         total = self._sums.sum(axis=0)
         variance = (self._squares - total * total / self.cycles) / (self.cycles - 1)
-        spread: Float = np.sqrt(np.maximum(variance, 0.0))
+        spread: FloatArray = np.sqrt(np.maximum(variance, 0.0))
         return spread
 
 
@@ -203,7 +203,7 @@ class RestWatch:
     def __init__(self, layout: Layout, model: ForceModel, names: Sequence[str]) -> None:
         self._layout, self._model, self._names = layout, model, names
         self._small = layout.counts < PLANE_TAXELS
-        self._last: tuple[Instant, Float] | None = None
+        self._last: tuple[Instant, FloatArray] | None = None
         self._bare_since = np.full(layout.real.shape, -1, np.int64)
         self._gone = np.zeros_like(layout.real)
         self.off = False
@@ -214,7 +214,7 @@ class RestWatch:
         self._last = None
         self._bare_since[:] = -1
 
-    def regained(self, field: Float, bare: Bool) -> Reason | None:
+    def regained(self, field: FloatArray, bare: Bool) -> Reason | None:
         """A magnet over one of the taxels ``bare`` (A, n) that had none: the skin was changed."""
         reading = np.linalg.norm(field + self._model.rest, axis=1)
         least = np.maximum(MAGNET_UT, 2.0 * np.linalg.norm(self._model.rest, axis=1))
@@ -223,7 +223,12 @@ class RestWatch:
         return why.field_jump(float(reading[bare].max()))
 
     def judge(
-        self, field: Float, forces: Float, estimate: Estimate, healthy: Bool, captured: Instant
+        self,
+        field: FloatArray,
+        forces: FloatArray,
+        estimate: Estimate,
+        healthy: Bool,
+        captured: Instant,
     ) -> Reason | None:
         """What speaks against the rest field in this cycle; None when nothing does.
 
@@ -239,7 +244,7 @@ class RestWatch:
             or self._scrambled(field, forces, healthy, captured, last)
         )
 
-    def restored(self, forces: Float, estimate: Estimate, healthy: Bool) -> bool:
+    def restored(self, forces: FloatArray, estimate: Estimate, healthy: Bool) -> bool:
         """Whether the skin reads again what it read at rest: nothing bears a force."""
         if estimate.leap.any() or (np.abs(estimate.theta[:, :, 0]) > EARTH_UT).any():
             return False
@@ -247,7 +252,11 @@ class RestWatch:
         return bool((free | ~healthy).all())
 
     def _bare(
-        self, field: Float, healthy: Bool, captured: Instant, last: tuple[Instant, Float] | None
+        self,
+        field: FloatArray,
+        healthy: Bool,
+        captured: Instant,
+        last: tuple[Instant, FloatArray] | None,
     ) -> Reason | None:
         rest = self._model.rest
         magnet = (rest**2).sum(axis=1) > MAGNET_UT**2
@@ -277,12 +286,12 @@ class RestWatch:
 
     def _fallen(
         self,
-        field: Float,
-        reading: Float,
-        strong: Float,
+        field: FloatArray,
+        reading: FloatArray,
+        strong: FloatArray,
         chips: Bool,
         captured: Instant,
-        last: tuple[Instant, Float] | None,
+        last: tuple[Instant, FloatArray] | None,
     ) -> Bool:
         """(A, n) chips that have lost most of their field at once, as no press makes it."""
         if last is None or seconds_between(last[0], captured) > SCRAMBLE_S:
@@ -291,7 +300,7 @@ class RestWatch:
         low = reading < (GONE_SHARE * strong) ** 2
         return np.asarray(chips & low & (strong > 2 * MAGNET_UT) & (step > AT_ONCE * strong))
 
-    def lost(self, before: Float) -> Bool:
+    def lost(self, before: FloatArray) -> Bool:
         """(A, n) taxels whose magnet is gone, by the rest field ``before`` (A, 3, n) and now."""
         magnet = (before**2).sum(axis=1) > MAGNET_UT**2
         low = (self._model.rest**2).sum(axis=1) < BARE_UT**2
@@ -311,7 +320,7 @@ class RestWatch:
                 return None
         return why.field_jump(size)
 
-    def _gain(self, field: Float, healthy: Bool) -> Reason | None:
+    def _gain(self, field: FloatArray, healthy: Bool) -> Reason | None:
         rest = self._model.rest
         use = healthy[:, None] & np.ones_like(rest, dtype=bool)
         there = float((rest[use] ** 2).sum())
@@ -329,11 +338,11 @@ class RestWatch:
 
     def _scrambled(
         self,
-        field: Float,
-        forces: Float,
+        field: FloatArray,
+        forces: FloatArray,
         healthy: Bool,
         captured: Instant,
-        last: tuple[Instant, Float] | None,
+        last: tuple[Instant, FloatArray] | None,
     ) -> Reason | None:
         if last is None or seconds_between(last[0], captured) > SCRAMBLE_S:
             return None
@@ -365,8 +374,8 @@ class LateRest:
         self._tare = self._wanted = None
 
     def advance(
-        self, left_over: Float, wanted: Bool, noise_ut: Float, captured: Instant
-    ) -> Float | None:
+        self, left_over: FloatArray, wanted: Bool, noise_ut: FloatArray, captured: Instant
+    ) -> FloatArray | None:
         """Take one untouched cycle; (A, 3, n) µT to add to the rest field when it is known.
 
         ``left_over``: (A, 3, n) µT over the present rest field, ambient field taken off.
@@ -425,8 +434,8 @@ class Recovery:
         self._mean = np.zeros((layout.arrays, 3, layout.width))
 
     def step(
-        self, left_over: Float, healthy: Bool, noise_ut: float, elapsed: float
-    ) -> Float | None:
+        self, left_over: FloatArray, healthy: Bool, noise_ut: float, elapsed: float
+    ) -> FloatArray | None:
         """Change of the rest field, (A, 3, n) µT, in one cycle; None when there is none.
 
         ``left_over``: (A, 3, n) µT in taxel axes, what compensation leaves. ``noise_ut``: µT rms.
@@ -502,7 +511,7 @@ class RestField:
             return RestState.TARING
         return RestState.KNOWN if self.known and not self.rough else RestState.UNKNOWN
 
-    def begin(self, noise_ut: Float, force: bool = False) -> None:
+    def begin(self, noise_ut: FloatArray, force: bool = False) -> None:
         """Begin a tare; ``noise_ut`` (3,) µT rms is what one sample is expected to vary by.
 
         ``force``: whatever the skin reads becomes its rest field, moving or under load.
@@ -515,7 +524,7 @@ class RestField:
         self._refused = 0
         self._forced = force
 
-    def suspect(self, reason: Reason, noise_ut: Float) -> None:
+    def suspect(self, reason: Reason, noise_ut: FloatArray) -> None:
         """The rest field may not be what it was: take it anew once the skin is still."""
         if self.suspicion is None:
             self.suspicion = reason
@@ -532,10 +541,10 @@ class RestField:
         self.known, self.rough, self.suspicion = False, False, None
         self.unrested = self._layout.real.copy()
 
-    def _make(self, seconds: float, noise_ut: Float) -> Tare:
+    def _make(self, seconds: float, noise_ut: FloatArray) -> Tare:
         return Tare((self._layout.arrays, 3, self._layout.width), seconds, noise_ut)
 
-    def restore(self, rest_ut: Float, unrested: Bool, rough: bool) -> None:
+    def restore(self, rest_ut: FloatArray, unrested: Bool, rough: bool) -> None:
         """Go on from a rest field that was in force before: (A, 3, n) µT, and (A, n) bool."""
         self._model.rest[:] = rest_ut
         self.unrested[:] = unrested
@@ -543,7 +552,7 @@ class RestField:
         self._tare = None
 
     @property
-    def rest_ut(self) -> Float:
+    def rest_ut(self) -> FloatArray:
         """(A, 3, n) µT: the rest field in force."""
         return self._model.rest
 
@@ -552,8 +561,8 @@ class RestField:
         self._peak = max(self._peak, newton)
 
     def advance(
-        self, field: Float, healthy: Bool, whole: bool, captured: Instant, sequence: int
-    ) -> Float | None:
+        self, field: FloatArray, healthy: Bool, whole: bool, captured: Instant, sequence: int
+    ) -> FloatArray | None:
         """Take one cycle into the tare under way.
 
         ``field``: (A, 3, n) µT over the rest field in force. Returns by how much the rest field
@@ -583,17 +592,19 @@ class RestField:
             self._tare = tare.again()
         return None
 
-    def recover(self, left_over: Float, healthy: Bool, noise_ut: float, elapsed: float) -> None:
+    def recover(
+        self, left_over: FloatArray, healthy: Bool, noise_ut: float, elapsed: float
+    ) -> None:
         """Follow a skin that has been let go; see `Recovery.step`."""
         change = self._recovery.step(left_over, healthy, noise_ut, elapsed)
         if change is not None:
             self._model.rest += change
 
-    def follow(self, left_over: Float, free: Bool, share: float) -> None:
+    def follow(self, left_over: FloatArray, free: Bool, share: float) -> None:
         """Move the rest of ``free`` (A, n) taxels by a share of what compensation left over."""
         self._model.rest += np.where(free[:, None], share * left_over, 0.0)
 
-    def _accept(self, tare: Tare, sequence: int, trouble: str | None = None) -> Float:
+    def _accept(self, tare: Tare, sequence: int, trouble: str | None = None) -> FloatArray:
         shift = np.where(tare.healthy[:, None], tare.mean, 0.0)
         self._model.rest += shift
         largest = float(np.abs(shift).max())

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from tactile_core.arrays import FloatArray
+
 Bool = NDArray[np.bool_]
 Scale = tuple[float, float]
 """µT a count of x and y, and of z."""
@@ -51,11 +52,11 @@ class ScaleFinder:
     """Finds the step of x and y, and of z, of one array from `SAMPLES` cycles of its values."""
 
     def __init__(self) -> None:
-        self._kept: list[Float] = []
+        self._kept: list[FloatArray] = []
         self._skip = 0
         self._failures = 0
 
-    def add(self, raw: Float) -> tuple[float, float] | None:
+    def add(self, raw: FloatArray) -> tuple[float, float] | None:
         """Take (3, n) µT in chip axes; the steps (xy, z) in µT when they have been found.
 
         Begins anew by itself, ever less often, where what was kept shows no grid.
@@ -77,7 +78,7 @@ class ScaleFinder:
         return None
 
 
-def step_of(values: Float, known: tuple[float, ...] = ()) -> float | None:
+def step_of(values: FloatArray, known: tuple[float, ...] = ()) -> float | None:
     """Step in µT of the grid that every column of (k, m) values lies on; None: there is none."""
     flat = np.abs(values[np.isfinite(values)])
     distinct = np.unique(flat[flat > FINEST_UT])
@@ -106,7 +107,7 @@ def step_of(values: Float, known: tuple[float, ...] = ()) -> float | None:
     return None
 
 
-def on_grid(values: Float, step: float) -> bool:
+def on_grid(values: FloatArray, step: float) -> bool:
     """Whether all values are whole steps."""
     counts = values / step
     return bool((np.abs(counts - np.rint(counts)) < ON_GRID).all())
@@ -140,7 +141,7 @@ class Scales:
         self._told[array] = True
         return self._set(array, scale)
 
-    def learn(self, raw: Float) -> list[int]:
+    def learn(self, raw: FloatArray) -> list[int]:
         """Look at (A, 3, n) µT as sent; arrays whose scale is found to be another than before."""
         other = []
         for a, finder in enumerate(self._finders):
@@ -153,7 +154,7 @@ class Scales:
                 other.append(a)
         return other
 
-    def recheck(self, raw: Float, good: Bool) -> None:
+    def recheck(self, raw: FloatArray, good: Bool) -> None:
         """Give up scales that were found and that the readings of ``good`` (A, n) fit no more."""
         for a, scale in enumerate(self._now):
             if scale is None or self._told[a]:

@@ -27,7 +27,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from tactile_core.arrays import FloatArray
+
 Bool = NDArray[np.bool_]
 
 LAG_S = 0.25
@@ -119,8 +120,8 @@ class Small:
     chips that the field explains about it. ``moving``: the field is seen to turn.
     """
 
-    field: Float
-    sigma: Float
+    field: FloatArray
+    sigma: FloatArray
     free: Bool
     changing: Bool
     leap: float
@@ -130,27 +131,27 @@ class Small:
 
 @dataclass(slots=True, eq=False)
 class _Frame:
-    target: Float
+    target: FloatArray
     healthy: Bool
     elapsed: float
     changing: Bool
-    pace: Float | None = None  # µT/s of the ambient field, by this frame and those before
+    pace: FloatArray | None = None  # µT/s of the ambient field, by this frame and those before
 
 
 class SmallArray:
     """The filter of one array of ``n`` taxels; memory and time of a frame are bounded."""
 
-    def __init__(self, direction: Float) -> None:
+    def __init__(self, direction: FloatArray) -> None:
         """``direction``: (3, n), unit vectors in ``ee`` along which a press changes the field."""
         self._n = direction.shape[1]
         self._direction = direction
         self.set_noise(np.array([4.4, 4.4, 6.7]))
         self.reset()
 
-    def set_noise(self, noise: Float) -> None:
+    def set_noise(self, noise: FloatArray) -> None:
         """Noise of one sample, (3,) µT rms along ``ee``."""
-        self._noise: Float = noise**2
-        self._variance: Float = noise**2 + MODEL_ERROR_UT**2
+        self._noise: FloatArray = noise**2
+        self._variance: FloatArray = noise**2 + MODEL_ERROR_UT**2
 
     def reset(self, unknown: float = 0.0) -> None:
         """Nothing touches; the ambient field is zero, ± ``unknown`` µT rms a component."""
@@ -162,14 +163,14 @@ class SmallArray:
         self._peak = np.zeros(n)
         self._waiting: deque[_Frame] = deque()
         self._behind = 0.0  # s of the frames that wait
-        self._mean: Float | None = None
+        self._mean: FloatArray | None = None
         self._mean_variance = 1.0
         self._near = np.zeros(n, dtype=bool)
         self._lean = np.zeros((3, n))
         self._lean_weight = 1.0
         self._pace = np.zeros(3)  # µT/s
 
-    def update(self, target: Float, healthy: Bool, elapsed: float) -> Small:
+    def update(self, target: FloatArray, healthy: Bool, elapsed: float) -> Small:
         """Take one frame.
 
         ``target``: (3, n) µT in ``ee`` over rest, without what neighbours' contacts add.
@@ -189,7 +190,7 @@ class SmallArray:
 
     # The present
 
-    def _smooth(self, target: Float, elapsed: float) -> None:
+    def _smooth(self, target: FloatArray, elapsed: float) -> None:
         """Average the frames of the last `SMOOTH_S`; one frame where they come more slowly."""
         if self._mean is None:
             self._mean = target.copy()
@@ -237,8 +238,8 @@ class SmallArray:
         return self._say(moved + shift, variance, frame.changing, leap, left_over)
 
     def _locate(
-        self, away: Float, chips: NDArray[np.intp], prior: Float, noise: Float
-    ) -> tuple[Float, Float]:
+        self, away: FloatArray, chips: NDArray[np.intp], prior: FloatArray, noise: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Shift of the ambient field by the readings ``away`` (3, k) of ``chips``; its variance."""
         cov = self._cov
         if not chips.size:
@@ -251,7 +252,7 @@ class SmallArray:
         gain = np.linalg.solve(inner, rows[:, :, None])[:, :, 0]
         return (gain * away).sum(axis=1), np.maximum(prior - (gain * rows).sum(axis=1), 0.0)
 
-    def _moved(self) -> tuple[Float, Float, Float]:
+    def _moved(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """How far the field should have moved since the filter's time; (3,) µT each.
 
         What is expected of a steady motion, how far off that may be, and how far if the motion
@@ -263,7 +264,7 @@ class SmallArray:
         unsteady, turning = np.full(3, doubt * behind), np.full(3, TURNING_UT_PER_S * behind)
         return moved, unsteady, turning
 
-    def _follow_pace(self, frame: _Frame, seen: Float) -> None:
+    def _follow_pace(self, frame: _Frame, seen: FloatArray) -> None:
         """The field of the room was ``seen`` to move at so many µT/s, (3,)."""
         share = -math.expm1(-frame.elapsed / PACE_TAU_S)
         pace = self._pace + share * (seen - self._pace)
@@ -273,7 +274,7 @@ class SmallArray:
         self._pace = pace
 
     def _say(
-        self, shift: Float, variance: Float, changing: Bool, leap: float, left_over: float
+        self, shift: FloatArray, variance: FloatArray, changing: Bool, leap: float, left_over: float
     ) -> Small:
         return Small(
             self._state[:, 0] + shift,
@@ -362,7 +363,7 @@ class SmallArray:
             moved = (LEAN_GAIN * np.abs(lean)) ** 2
             self._cov[:, index, index] += moved * min(1.0, frame.elapsed / LEAN_TAU_S)
 
-    def _absorb(self, target: Float, seen: NDArray[np.intp]) -> None:
+    def _absorb(self, target: FloatArray, seen: NDArray[np.intp]) -> None:
         """Kalman's update with the chips ``seen``."""
         state, cov = self._state, self._cov
         rows = cov[:, 0, :][:, None, :] + cov[:, 1 + seen, :]  # H P
@@ -445,7 +446,12 @@ class _Vote:
     """
 
     def __init__(
-        self, away: Float, spread: Float, contact: Float, direction: Float, touched: bool
+        self,
+        away: FloatArray,
+        spread: FloatArray,
+        contact: FloatArray,
+        direction: FloatArray,
+        touched: bool,
     ) -> None:
         self._away, self._spread = away, spread
         self._contact, self._direction = contact, direction
@@ -456,7 +462,7 @@ class _Vote:
         self._unit = contact / np.maximum(load, 1e-9)
         self._sigma = np.sqrt(spread.mean(axis=0))  # (S, k)
 
-    def result(self, steady: Float, turning: Float) -> tuple[Bool, int, float]:
+    def result(self, steady: FloatArray, turning: FloatArray) -> tuple[Bool, int, float]:
         """Chips (k,) that both signals' best explanations keep, its kind, and a leap's size, µT.
 
         ``steady``, ``turning``: (3,) µT², variance of the ambient field in either kind.
@@ -505,7 +511,7 @@ class _Vote:
             kind = max(kind, which)
         return kept, kind, leap
 
-    def _prices(self, shift: Float) -> tuple[Float, Float]:
+    def _prices(self, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Squared distance of each chip, and the price of letting it change; (S, kinds, s, k)."""
         rest = self._away[:, :, None, None] - shift[..., None]
         spread = self._spread[:, :, None, None]

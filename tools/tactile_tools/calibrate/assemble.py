@@ -7,7 +7,6 @@ from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_core.calibration import BoardCalibration
 from tactile_core.calibration.force_model import TARGET_UNITS, Figure, NetModel
@@ -15,8 +14,6 @@ from tactile_tools.calibrate.evaluate import Judged, leave_one_out, tail20
 from tactile_tools.calibrate.fit import Choice, Progress, choose, fit, quiet
 from tactile_tools.calibrate.recording import Recording
 from tactile_tools.calibrate.results import DEFINITIONS
-
-Float = NDArray[np.float64]
 
 
 def group(recordings: Sequence[Recording]) -> list[list[Recording]]:

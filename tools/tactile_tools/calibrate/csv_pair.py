@@ -14,13 +14,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration.nominal import MAX_ANYSKIN_MAGNETOMETERS, nominal
 from tactile_core.geometry import SkinGeometry
 from tactile_tools.calibrate.recording import Recording, RecordingError, check, with_clock
-
-Float = NDArray[np.float64]
 
 NEWTON_PER_GRAM_FORCE = 9.80665e-3
 NO_READING = -1.0
@@ -88,7 +86,7 @@ def read_pair(path: Path, target: str | None = None) -> Recording:
     return with_clock(whole)
 
 
-def to_taxel_axes(field: Float, geometry: SkinGeometry) -> Float:
+def to_taxel_axes(field: FloatArray, geometry: SkinGeometry) -> FloatArray:
     """(m, 3n) µT with the yaw of each chip undone."""
     yaw = np.concatenate([a.chip_yaw for a in geometry.arrays])
     out = field.reshape(len(field), -1, 3).copy()
@@ -98,7 +96,7 @@ def to_taxel_axes(field: Float, geometry: SkinGeometry) -> Float:
     return out.reshape(field.shape)
 
 
-def _rests(path: Path, sensor: Float, geometry: SkinGeometry) -> Float | None:
+def _rests(path: Path, sensor: FloatArray, geometry: SkinGeometry) -> FloatArray | None:
     """Rest field of each frame, from what the rig subtracted; None where it did not write that."""
     if _find(path, "sensor_post_baselines") is None:
         return None
@@ -118,7 +116,7 @@ def _find(path: Path, stem: str) -> Path | None:
     return None
 
 
-def _read(path: Path, stem: str) -> Float:
+def _read(path: Path, stem: str) -> FloatArray:
     """Numbers of one CSV file, (rows, columns)."""
     file = _find(path, stem)
     if file is None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration.force_model import NetModel
 from tactile_tools.calibrate.fit import Choice, Progress, choose, fit, quiet
 from tactile_tools.calibrate.recipes import Recipe
@@ -15,8 +16,6 @@ from tactile_tools.calibrate.recording import Recording
 from tactile_tools.calibrate.rows import causal
 from tactile_tools.calibrate.splits import TAIL_SHARE
 from tactiled.sensing.forces import batch_features, readout
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,25 +30,25 @@ class Judged:
     recording: Recording
     model: NetModel
     choice: Choice
-    measured: Float
-    predicted: Float
-    time_s: Float
+    measured: FloatArray
+    predicted: FloatArray
+    time_s: FloatArray
     tested: NDArray[np.bool_]
     fitted_on: tuple[Recording, ...]
 
     @property
-    def errors(self) -> Float:
+    def errors(self) -> FloatArray:
         """(tested, targets)."""
         return (self.predicted - self.measured)[self.tested]
 
     @property
-    def rmse(self) -> Float:
+    def rmse(self) -> FloatArray:
         """(targets,)."""
-        value: Float = np.sqrt((self.errors**2).mean(axis=0))
+        value: FloatArray = np.sqrt((self.errors**2).mean(axis=0))
         return value
 
 
-def predict(model: NetModel, recording: Recording, label_clock: bool = True) -> Float:
+def predict(model: NetModel, recording: Recording, label_clock: bool = True) -> FloatArray:
     """(k, targets) for every label of ``recording``, causal, tared at its beginning.
 
     ``label_clock``: at the instant each label was true, not at its stamp less the mean lag.

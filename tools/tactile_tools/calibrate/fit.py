@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration.force_model import NetModel
 from tactile_tools.calibrate.readouts import export, pipeline
 from tactile_tools.calibrate.recipes import (
@@ -21,7 +22,6 @@ from tactile_tools.calibrate.recording import Recording, RecordingError
 from tactile_tools.calibrate.rows import Rows, align, copies
 from tactile_tools.calibrate.splits import GAP_S, block_edges, block_masks
 
-Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 DELAYS_S = tuple(round(0.05 * i, 2) for i in range(-2, 9))
@@ -83,7 +83,7 @@ def choose(
 ) -> Choice:
     """Delay, recipe and penalty with the least cross-validated error on ``recordings``."""
     recipes = recipes_for(recordings) if recipes is None else tuple(recipes)
-    delays: list[tuple[float, Float]] = []
+    delays: list[tuple[float, FloatArray]] = []
     delay = 0.0
     judge = next((r for r in recipes if r.knows_history), None)
     if judge is not None:
@@ -115,7 +115,7 @@ def choose(
     return Choice(chosen.recipe, chosen.penalty, delay, tuple(scores), means)
 
 
-def simplest(errors: Sequence[Float]) -> int:
+def simplest(errors: Sequence[FloatArray]) -> int:
     """First of candidates, simplest first, whose fold errors are as good as the best's.
 
     As good: worse by no more than one standard error of the difference, fold by fold (Breiman's
@@ -132,7 +132,7 @@ def simplest(errors: Sequence[Float]) -> int:
 
 def cross_validate(
     rows: Rows, recordings: Sequence[Recording], recipe: Recipe, penalty: float
-) -> Float:
+) -> FloatArray:
     """(folds,) root mean square error of each, in the targets' unit.
 
     Candidates are judged by the mean of these, not by the root of the mean square: one fold with

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from tactile_core.arrays import FloatArray
 
 NEIGHBOURS = 3
 """Steps to each side whose median is the slope that a jump stands out from."""
@@ -42,10 +42,10 @@ class LabelClock:
     reading_s: float
     jumps: int
     concentration: float
-    lag_s: Float
+    lag_s: FloatArray
 
 
-def find_clock(time_s: Float, label: Float) -> LabelClock | None:
+def find_clock(time_s: FloatArray, label: FloatArray) -> LabelClock | None:
     """Sawtooth lag of ``label`` (k,) read at ``time_s`` (k,); None where there is no beat."""
     step = np.diff(time_s)
     period = float(np.median(step))
@@ -83,7 +83,7 @@ def find_clock(time_s: Float, label: Float) -> LabelClock | None:
     return LabelClock(beat, reading, len(at), concentration, np.clip(lag, 0.0, reading))
 
 
-def _teeth(time_s: Float, label: Float, beat: float, first: float) -> NDArray[np.intp]:
+def _teeth(time_s: FloatArray, label: FloatArray, beat: float, first: float) -> NDArray[np.intp]:
     """Index of the first label after each tooth: the steepest step near where it is expected."""
     numbers = np.arange(
         np.ceil((time_s[0] - first) / beat + 1e-9), np.ceil((time_s[-1] - first) / beat)
@@ -100,7 +100,7 @@ def _teeth(time_s: Float, label: Float, beat: float, first: float) -> NDArray[np
     return np.unique(np.array(out, np.intp))
 
 
-def _running_median(values: Float) -> Float:
+def _running_median(values: FloatArray) -> FloatArray:
     padded = np.pad(values, NEIGHBOURS, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1)
     return np.asarray(np.median(windows, axis=1))

@@ -8,11 +8,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_tools.calibrate.evaluate import Judged
 from tactile_tools.calibrate.recording import TARE_S, UNTOUCHED_SHARE
 from tactiled.sensing.forces import batch_features, readout
-
-Float = NDArray[np.float64]
 
 STEADY = 5
 """Labels of a short run through which a straight line is laid; a press is straight for a second."""
@@ -79,7 +78,7 @@ def _place_limits(judged: Judged) -> dict[str, float]:
     }
 
 
-def _roughness(time: Float, label: Float) -> Float:
+def _roughness(time: FloatArray, label: FloatArray) -> FloatArray:
     """(k,) distance of each label from a line through its neighbours, scaled to that of one."""
     out = np.zeros_like(label)
     half = STEADY // 2
@@ -89,7 +88,7 @@ def _roughness(time: Float, label: Float) -> Float:
             continue
         line = np.polynomial.polynomial.polyfit(time[near] - time[i], label[near], 1)
         out[i] = label[i] - line[0]
-    scale: Float = out / np.sqrt(1 + 1 / (2 * half))
+    scale: FloatArray = out / np.sqrt(1 + 1 / (2 * half))
     return scale
 
 
@@ -103,5 +102,5 @@ def _first_press(judged: Judged) -> NDArray[np.bool_] | None:
     return np.asarray(np.arange(len(label)) <= ends[0])
 
 
-def _rms(values: Float) -> float:
+def _rms(values: FloatArray) -> float:
     return float(np.sqrt((values**2).mean())) if len(values) else float("nan")

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.bus.messages import DecodeError, codec, stamp_ns
 from tactile_core.bus.topics import FIELD, REFERENCE, find_topic
 from tactile_core.calibration import BoardCalibration, CalibrationError, loads
@@ -31,8 +31,6 @@ from tactile_tools.calibrate.recording import (
     with_clock,
 )
 
-Float = NDArray[np.float64]
-
 MAX_FRAMES = 2_000_000
 """Over five hours at 100 Hz; more of one log is a mistake and would fill the memory."""
 SHEAR_SHARE = 0.02
@@ -46,7 +44,7 @@ class _Board:
     """What the log says of one board; stamps in ns."""
 
     field_ns: list[int] = field(default_factory=list)
-    field_ut: list[Float] = field(default_factory=list)
+    field_ut: list[FloatArray] = field(default_factory=list)
     masked: int = 0
     reference_ns: list[int] = field(default_factory=list)
     force: list[tuple[float, float, float]] = field(default_factory=list)
@@ -193,12 +191,12 @@ def _which(path: Path, boards: dict[str, _Board], name: str | None) -> str:
     return usable[0]
 
 
-def _targets(force: Float) -> tuple[str, ...]:
+def _targets(force: FloatArray) -> tuple[str, ...]:
     """Normal force always; shear where it was measured."""
     least = SHEAR_SHARE * np.abs(force).max()
     shear = np.abs(force[:, :2]).max(axis=0) > least
     return ("normal", *(n for n, there in zip(("shear_x", "shear_y"), shear, strict=True) if there))
 
 
-def _label(force: Float, target: str) -> Float:
+def _label(force: FloatArray, target: str) -> FloatArray:
     return -force[:, 2] if target == "normal" else force[:, ("shear_x", "shear_y").index(target)]

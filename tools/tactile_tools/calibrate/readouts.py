@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.compose import TransformedTargetRegressor
 from sklearn.kernel_approximation import Nystroem
 from sklearn.linear_model import Ridge
@@ -13,10 +12,9 @@ from sklearn.neural_network import MLPRegressor
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration.force_model import Layer
 from tactile_tools.calibrate.recipes import Recipe
-
-Float = NDArray[np.float64]
 
 RBF_REACH = 0.01
 """gamma of the radial basis functions, per unit variance of a feature: with the 30 features of a
@@ -44,7 +42,7 @@ def pipeline(recipe: Recipe, penalty: float, rows: int) -> Pipeline:
     )
 
 
-def export(fitted: Pipeline) -> tuple[Float, Float, tuple[Layer, ...]]:
+def export(fitted: Pipeline) -> tuple[FloatArray, FloatArray, tuple[Layer, ...]]:
     """Mean and scale of the features, and layers, that give the numbers of ``fitted.predict``."""
     scaler = fitted[0]
     mean, scale = np.array(scaler.mean_), np.array(scaler.scale_)

@@ -7,12 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration.force_model import FeatureMap, RestTracker
 from tactile_tools.calibrate.recording import Recording
-
-Float = NDArray[np.float64]
 
 NEAR_SHARE = 0.08
 """The rest is followed while the field is within this share of the strongest presses: twice the
@@ -126,17 +124,17 @@ def feature_map(recipe: Recipe, recordings: Sequence[Recording]) -> FeatureMap:
     )
 
 
-def floor(recordings: Sequence[Recording]) -> Float:
+def floor(recordings: Sequence[Recording]) -> FloatArray:
     """Least value of each target: zero for a force that no label says is ever negative."""
     labels = np.concatenate([r.labels for r in recordings])
-    least: Float = np.full(labels.shape[1], -np.inf)
+    least: FloatArray = np.full(labels.shape[1], -np.inf)
     if recordings[0].forces:
         noise = 0.01 * np.abs(labels).max(axis=0)
         least[labels.min(axis=0) > -noise] = 0.0
     return least
 
 
-def _tracker(changes: list[Float]) -> RestTracker:
+def _tracker(changes: list[FloatArray]) -> RestTracker:
     """Limits of what counts as rest, from how strong presses and noise are."""
     size = np.concatenate([np.linalg.norm(c, axis=1) for c in changes])
     strong = float(np.percentile(size, STRONG_PERCENTILE))

@@ -6,13 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration import BoardCalibration
 from tactile_core.geometry import SkinGeometry
 from tactile_tools.calibrate.label_clock import LabelClock, find_clock
-
-Float = NDArray[np.float64]
 
 MIN_FRAMES = 50
 """Fewest frames and labels of a recording: fewer cannot be split into parts to fit and to test."""
@@ -45,11 +43,11 @@ class Recording:
     geometry: SkinGeometry
     serial_number: str
     started: str
-    time_s: Float
-    field_ut: Float
-    rest_ut: Float | None
-    label_time_s: Float
-    labels: Float
+    time_s: FloatArray
+    field_ut: FloatArray
+    rest_ut: FloatArray | None
+    label_time_s: FloatArray
+    labels: FloatArray
     targets: tuple[str, ...]
     label_clock: LabelClock | None = None
     calibration: BoardCalibration | None = None
@@ -69,15 +67,15 @@ class Recording:
         """Whether the labels are forces, so that a label near zero means untouched."""
         return not {"x", "y"} & set(self.targets)
 
-    def load(self) -> Float:
+    def load(self) -> FloatArray:
         """(k,) size of the labels taken together."""
-        size: Float = np.linalg.norm(self.labels, axis=1)
+        size: FloatArray = np.linalg.norm(self.labels, axis=1)
         return size
 
-    def change_ut(self, start: int = 0) -> Float:
+    def change_ut(self, start: int = 0) -> FloatArray:
         """(m - start, 3n) µT over the rest field, tared at frame ``start``."""
         if self.rest_ut is not None:
-            change: Float = self.field_ut[start:] - self.rest_ut[start:]
+            change: FloatArray = self.field_ut[start:] - self.rest_ut[start:]
             return change
         if not self.forces:  # nothing in it is untouched: any origin will do
             return np.asarray(self.field_ut[start:] - self.field_ut.mean(axis=0))
@@ -86,7 +84,7 @@ class Recording:
         return np.asarray(field - field[:count].mean(axis=0))
 
     @property
-    def lag_s(self) -> Float:
+    def lag_s(self) -> FloatArray:
         """(k,) s by which each label was late when it was read."""
         clock = self.label_clock
         return np.zeros(len(self.label_time_s)) if clock is None else clock.lag_s

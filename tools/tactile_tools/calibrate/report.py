@@ -12,13 +12,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration.force_model import TARGET_UNITS
 from tactile_tools.calibrate.evaluate import Judged, predict
 from tactile_tools.calibrate.fit import Choice, fit
 from tactile_tools.calibrate.limits import limits
 from tactile_tools.calibrate.recipes import FORCE_RECIPES
-
-Float = NDArray[np.float64]
 
 MEASURED, PREDICTED, SIMPLE, FIT_SHADE = "#222222", "#c1272d", "#0072b2", "#e8eef4"
 BINS = 12
@@ -92,7 +91,7 @@ def _draw_force(figure: Figure, judged: Judged) -> None:
         axes.set_title(f"press and release: {title}")
 
 
-def _draw_loop(axes: Any, measured: Float, guess: Float, colour: str, unit: str) -> None:
+def _draw_loop(axes: Any, measured: FloatArray, guess: FloatArray, colour: str, unit: str) -> None:
     """Error over force, the way there and the way back in different strokes."""
     top = int(measured.argmax())
     error = guess - measured
@@ -104,7 +103,7 @@ def _draw_loop(axes: Any, measured: Float, guess: Float, colour: str, unit: str)
     axes.legend(fontsize="small")
 
 
-def _draw_error_by_force(axes: Any, judged: Judged, simple: Float, unit: str) -> None:
+def _draw_error_by_force(axes: Any, judged: Judged, simple: FloatArray, unit: str) -> None:
     measured = judged.measured[judged.tested, 0]
     edges = np.linspace(measured.min(), measured.max(), BINS + 1)
     place = np.clip(np.digitize(measured, edges) - 1, 0, BINS - 1)
@@ -157,7 +156,7 @@ def _draw_place(figure: Figure, judged: Judged) -> None:
     by_size.set_title("touches that move the field little are hard to place")
 
 
-def _without_history(judged: Judged) -> Float:
+def _without_history(judged: Judged) -> FloatArray:
     """(k, targets) of the cubic model, fitted to the same samples."""
     recipe = next(r for r in FORCE_RECIPES if r.name == "cubic")
     choice = Choice(recipe, recipe.penalties[0], judged.choice.delay_s, (), ())

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration.force_model import FeatureMap
 from tactile_tools.calibrate.recording import TARE_S, UNTOUCHED_SHARE, Recording
 from tactiled.sensing.forces import batch_features
 
-Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 LEAST_PAUSE_S = 3.0
@@ -28,8 +28,8 @@ class Copy:
     """One recording from one of its beginnings on: ``time_s`` (m,), ``features`` (m, F)."""
 
     recording: int
-    time_s: Float
-    features: Float
+    time_s: FloatArray
+    features: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,9 +38,9 @@ class Rows:
     (r,) its number; ``whole`` (r,) is True for rows of recordings from their true beginning.
     """
 
-    features: Float
-    labels: Float
-    time_s: Float
+    features: FloatArray
+    labels: FloatArray
+    time_s: FloatArray
     recording: NDArray[np.intp]
     whole: Bool
 
@@ -81,7 +81,7 @@ def copies(features: FeatureMap, recordings: Sequence[Recording], restarts: bool
 
 def align(made: Sequence[Copy], recordings: Sequence[Recording], delay_s: float) -> Rows:
     """Row for each label: what the field was ``delay_s`` s before it was read, never after it."""
-    parts: list[tuple[Float, Float, Float, NDArray[np.intp], Bool]] = []
+    parts: list[tuple[FloatArray, FloatArray, FloatArray, NDArray[np.intp], Bool]] = []
     for copy in made:
         recording = recordings[copy.recording]
         time = recording.label_time_s
@@ -104,7 +104,9 @@ def align(made: Sequence[Copy], recordings: Sequence[Recording], delay_s: float)
     return Rows(columns[0], columns[1], columns[2], columns[3], columns[4])
 
 
-def causal(time_s: Float, values: Float, at_s: Float, delay_s: Float | float) -> Float:
+def causal(
+    time_s: FloatArray, values: FloatArray, at_s: FloatArray, delay_s: FloatArray | float
+) -> FloatArray:
     """``values`` (m, F) between frames at ``at_s - delay_s``; frames after ``at_s`` stay unused."""
     if len(time_s) == 1:
         return np.repeat(values, len(at_s), axis=0)

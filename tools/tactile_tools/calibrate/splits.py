@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from tactile_core.arrays import FloatArray
+
 Bool = NDArray[np.bool_]
 
 TAIL_SHARE = 0.8
@@ -17,7 +18,7 @@ GAP_S = 3.0
 samples stay alike at the rates that presses have."""
 
 
-def block_edges(time_s: Float, folds: int = FOLDS) -> list[tuple[float, float]]:
+def block_edges(time_s: FloatArray, folds: int = FOLDS) -> list[tuple[float, float]]:
     """Times [begin, end) of ``folds`` blocks with equally many samples each."""
     bounds = np.linspace(0, len(time_s), folds + 1).round().astype(int)
     begin = [float(time_s[b]) for b in bounds[:-1]]
@@ -25,7 +26,7 @@ def block_edges(time_s: Float, folds: int = FOLDS) -> list[tuple[float, float]]:
 
 
 def block_masks(
-    time_s: Float, edges: tuple[float, float], gap_s: float = GAP_S
+    time_s: FloatArray, edges: tuple[float, float], gap_s: float = GAP_S
 ) -> tuple[Bool, Bool]:
     """Samples to fit on (at least ``gap_s`` s away from the block) and to test on (inside it)."""
     begin, end = edges

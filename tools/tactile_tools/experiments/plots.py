@@ -12,12 +12,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_tools.experiments.document import spoken, whole
 from tactile_tools.experiments.statistics import Rate
-
-Float = NDArray[np.float64]
 
 DPI = 130
 COLOURS = {
@@ -165,7 +163,7 @@ class Surface:
     """A contour plot: values by row (y) and column (x), where the paper's own setting lies."""
 
     title: str
-    values: Float
+    values: FloatArray
     x: Sequence[float]
     y: Sequence[float]
     x_label: str
@@ -228,7 +226,7 @@ def heat_map(
     title: str,
     rows: Sequence[str],
     columns: Sequence[str],
-    values: Float,
+    values: FloatArray,
     nominal: int | None,
     x_label: str,
 ) -> bytes:

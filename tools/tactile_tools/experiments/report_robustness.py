@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from statistics import fmean
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_tools.experiments.axes import AXES, Level, levels_of
 from tactile_tools.experiments.document import (
     Picture,
@@ -23,8 +23,6 @@ from tactile_tools.experiments.rows import Row
 from tactile_tools.experiments.spec import canonical
 from tactile_tools.experiments.statistics import SIGNIFICANT, Rate, paired_rates, signed_rank
 from tactile_tools.experiments.tables import Run, title_of
-
-Float = NDArray[np.float64]
 
 REFUSED = "the gate refuses to arm"
 """Part of the error of a trial whose touch is so bad that the safety gate does not let it begin.
@@ -240,7 +238,7 @@ def _remarks(points: Sequence[Point]) -> str:
 
 
 def _picture(axis: str, points: Sequence[Point], strategies: Sequence[str], prefix: str) -> Picture:
-    values: Float = np.array([[point.rate(s).value for point in points] for s in strategies])
+    values: FloatArray = np.array([[point.rate(s).value for point in points] for s in strategies])
     own = [i for i, point in enumerate(points) if point.level.nominal]
     return Picture(
         f"{prefix}{axis}",

@@ -8,9 +8,9 @@ from statistics import fmean
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from tactile_core.arrays import FloatArray
 from tactile_tools.experiments.document import Picture, Section, TableData, slug, whole
 from tactile_tools.experiments.plots import Surface, contours
 from tactile_tools.experiments.reference import PAPER_SWEEP
@@ -24,8 +24,6 @@ from tactile_tools.experiments.studies import (
     sweep_cells,
 )
 from tactile_tools.experiments.tables import Run, title_of
-
-Float = NDArray[np.float64]
 
 SIGMA = 1.0
 """Cells, of the Gaussian that the paper smooths with."""
@@ -46,15 +44,15 @@ class Grid:
 
     key: tuple[str, str]
     cells: Sequence[Cell]
-    ratio: Mapping[str, Float]
-    success: Float
+    ratio: Mapping[str, FloatArray]
+    success: FloatArray
 
-    def smooth(self, metric: str) -> Float:
+    def smooth(self, metric: str) -> FloatArray:
         """The ratio as the paper draws it; cells without trials take no part."""
         return smoothed(self.ratio[metric])
 
 
-def smoothed(values: Float) -> Float:
+def smoothed(values: FloatArray) -> FloatArray:
     """Gaussian filter with σ = 1 cell, edges continued; NaN stays NaN and does not spread."""
     there = np.isfinite(values)
     total = gaussian_filter(np.where(there, values, 0.0), SIGMA, mode="nearest")
@@ -222,7 +220,7 @@ def _grid_tables(grid: Grid, prefix: str) -> list[TableData]:
     across = SWEEP_FREQUENCIES if burrow else SWEEP_TIMES
     down = SWEEP_AMPLITUDES if burrow else SWEEP_TIMES
     corner = "A_bur \\ f_bur" if burrow else "t_excv \\ t_trig, s"
-    shown: list[tuple[str, str, Float, Callable[[float], str]]] = [
+    shown: list[tuple[str, str, FloatArray, Callable[[float], str]]] = [
         ("success", "Success in %", grid.success, whole),
         *(
             (metric, f"Mean {metric} over that of straight", grid.ratio[metric], _two_places)

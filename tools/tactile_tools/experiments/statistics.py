@@ -7,10 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
-
-Float = NDArray[np.float64]
 
 Z95 = float(stats.norm.ppf(0.975))
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_tools.plot.look import (
     COLOURS,
     SCREEN,
@@ -27,8 +27,6 @@ from tactile_tools.plot.series import LATENCY_BINS, BoardSeries, Spread
 # Holes in a curve, and the presses in it.
 
 
-Float = NDArray[np.float64]
-
 HOLE_PERIODS = 5.0
 """Periods without a point that are a hole: what a scheduler delays is shorter."""
 NEAR = 31
@@ -41,7 +39,7 @@ PROMINENCE = 0.4
 BIN_S, MOST_BINS = 0.05, 200_000
 
 
-def holes(time: Sequence[float] | Float) -> list[tuple[float, float]]:
+def holes(time: Sequence[float] | FloatArray) -> list[tuple[float, float]]:
     """(begin, end) s of each stretch in which points are missing, in order."""
     from scipy.ndimage import median_filter
 
@@ -56,12 +54,12 @@ def holes(time: Sequence[float] | Float) -> list[tuple[float, float]]:
     ]
 
 
-def period(time: Sequence[float] | Float) -> float:
+def period(time: Sequence[float] | FloatArray) -> float:
     """Median step, s; 0 of fewer than two points."""
     return float(np.median(np.diff(time))) if len(time) > 1 else 0.0
 
 
-def broken(time: Sequence[float] | Float, values: Any) -> tuple[Float, Float]:
+def broken(time: Sequence[float] | FloatArray, values: Any) -> tuple[FloatArray, FloatArray]:
     """Curve with a NaN in each hole, so that no line is drawn through it."""
     times, points = np.asarray(time, float), np.asarray(values, float)
     after = np.searchsorted(times, [end for _, end in holes(times)])
@@ -69,7 +67,7 @@ def broken(time: Sequence[float] | Float, values: Any) -> tuple[Float, Float]:
     return np.insert(times, after, middle), np.insert(points, after, np.nan, axis=0)
 
 
-def presses(time: Sequence[float] | Float, force: Any, least: float, count: int) -> list[int]:
+def presses(time: Sequence[float] | FloatArray, force: Any, least: float, count: int) -> list[int]:
     """Indices, in order of time, of the strongest point of each of the strongest presses.
 
     ``force``: (points, places) N. A press is a maximum at one place (an array of a skin) that is

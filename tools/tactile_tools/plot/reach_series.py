@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.bus.topics import ARM_STATE, FEATURES, REACH_EVENT, REACH_STATE, WORLD
 from tactile_core.geometry import TIP_X, finger
 from tactile_tools.log.terminal import ToolError
 from tactile_tools.plot.curves import HOLE_PERIODS, period, presses
 from tactile_tools.plot.series import LogUnreadableError, messages
-
-Float = NDArray[np.float64]
 
 WANTED = frozenset({ARM_STATE, FEATURES, REACH_EVENT, REACH_STATE, WORLD})
 UNDER_WAY = frozenset({"homing", "reaching"})
@@ -33,9 +32,9 @@ class Contact:
     ``shear`` is the part of the in-plane force that acts along the skin.
     """
 
-    place: Float
+    place: FloatArray
     normal: float
-    shear: Float
+    shear: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +129,7 @@ class ReachSeries:
         away = np.minimum(np.abs(times[after] - asked), np.abs(times[before] - asked))
         return np.asarray(away <= max(HOLE_PERIODS * period(times), 0.02))
 
-    def tip(self) -> Float:
+    def tip(self) -> FloatArray:
         """(arm states, 2) m: path of the tip."""
         poses = np.array([(a.x, a.y, a.heading) for a in self.arm])
         ahead = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
@@ -173,13 +172,13 @@ _PLACES = np.concatenate([a.position[:, :2] for a in _SKIN.arrays])
 _NORMALS = np.concatenate([a.rotation[:, :2, 2] for a in _SKIN.arrays])
 
 
-def _outward(place: Float) -> Float:
+def _outward(place: FloatArray) -> FloatArray:
     """(2,) unit normal of the skin in ``ee`` at its taxel nearest to ``place`` (m, ``ee``)."""
     nearest = int(((_PLACES - place) ** 2).sum(axis=1).argmin())
     return np.asarray(_NORMALS[nearest] / np.linalg.norm(_NORMALS[nearest]))
 
 
-def turned(points: Any, x: float, y: float, heading: float) -> Float:
+def turned(points: Any, x: float, y: float, heading: float) -> FloatArray:
     """Return ``points`` (..., 2), turned by ``heading`` (rad) and then moved by ``x``, ``y``."""
     c, s = math.cos(heading), math.sin(heading)
     return np.asarray(np.asarray(points) @ np.array([[c, s], [-s, c]]) + (x, y))

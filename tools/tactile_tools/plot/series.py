@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.bus.messages import DROPS_PREFIX, LATER_FIELDS, DecodeError, codec, stamp_ns
 from tactile_core.bus.topics import (
     AMBIENT,
@@ -28,8 +29,6 @@ from tactile_tools.log.decode import Decoder
 from tactile_tools.log.sources import find_series
 from tactile_tools.log.stream import Reading, Record, Stream, read_merged
 from tactile_tools.log.terminal import ToolError
-
-Float = NDArray[np.float64]
 
 WANTED = frozenset({AMBIENT, DIAGNOSTICS, FEATURES, FIELD, FORCES, GEOMETRY, LOG, REACH_EVENT})
 
@@ -152,7 +151,7 @@ class BoardSeries:
         return self.forces.time
 
     @property
-    def force(self) -> list[Float]:
+    def force(self) -> list[FloatArray]:
         """(N, 3) N each."""
         return self.forces.items
 
@@ -185,7 +184,7 @@ class BoardSeries:
         names = list(self.geometry.array_name)
         return [(n, slice(a, b)) for n, a, b in zip(names, ends, ends[1:], strict=False)]
 
-    def contact_force(self) -> Float:
+    def contact_force(self) -> FloatArray:
         """(features, arrays) N: sum of the normal forces of each array's contact patches."""
         force = np.zeros((len(self.features), len(self.array_slices())))
         for row, features in enumerate(self.features):

@@ -7,7 +7,6 @@ from functools import cache, lru_cache
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from reachd.interfaces import Touch
 from sim_device.board.catalogue import build_skin, factory_calibration, identity
@@ -15,14 +14,13 @@ from sim_device.board.firmware import SerialBoard
 from sim_device.skin.environment import rotation_about
 from sim_device.world.base import World
 from sim_device.world.touch import on_skin
+from tactile_core.arrays import FloatArray
 from tactile_core.geometry import Side, finger
 from tactile_core.types import Instant, after
 from tactiled.blocks import Chunk, Cycle
 from tactiled.boards.events import Event, Identity, Refusal, Refused, Sampled
 from tactiled.boards.line import SerialLine
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
-
-Float = NDArray[np.float64]
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -95,7 +93,7 @@ def _side_of_cell(column: int, row: int) -> Side:
 
 
 @cache
-def _taxels() -> tuple[Float, list[Side]]:
+def _taxels() -> tuple[FloatArray, list[Side]]:
     """Places (n, 2) m in ``ee`` and sides of the finger's taxels."""
     skin = finger()
     places = np.concatenate([a.position[:, :2] for a in skin.arrays])

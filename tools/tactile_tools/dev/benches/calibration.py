@@ -6,12 +6,10 @@ import gc
 import time
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration.force_model import FeatureMap, Layer, NetModel, RestTracker
 from tactiled.sensing.forces import NetEstimator
-
-Float = NDArray[np.float64]
 
 TAXELS = {"anyskin": 5, "finger": 80}
 COMPONENTS = 6
@@ -75,7 +73,7 @@ def _model(targets: tuple[str, ...], features: FeatureMap, layers: tuple[Layer, 
     )
 
 
-def _time(model: NetModel, frames: int, rng: np.random.Generator) -> Float:
+def _time(model: NetModel, frames: int, rng: np.random.Generator) -> FloatArray:
     """(frames,) ms of each."""
     field = rng.normal(size=(frames, 3 * model.taxels)) * 1000
     estimator = NetEstimator(model)

@@ -19,6 +19,7 @@ from sim_device.skin.environment import (
 )
 from sim_device.skin.parameters import SkinParameters
 from sim_device.skin.skin import SkinModel, nominal_calibration
+from tactile_core.arrays import FloatArray
 from tactile_core.calibration import ArrayCalibration, BoardCalibration
 from tactile_core.geometry import Side, SkinGeometry, finger, grid_on_outline, grid_on_plane
 from tactile_core.types import NS_PER_S, Instant
@@ -29,8 +30,6 @@ from tactiled.sensing.layout import Layout
 from tactiled.sensing.pipeline import BoardPipeline
 from tactiled.sensing.ransac_plane import fit_plane
 from tactiled.sensing.settings import Method, PipelineSettings
-
-Float = NDArray[np.float64]
 
 SERIAL = "00000000000000b5"
 RATE_HZ = 100
@@ -181,10 +180,10 @@ class _Turn:
     ``still``: (N, 3) N, what the same skin gives in no ambient field, without noise.
     """
 
-    forces: Float
-    truth: Float
+    forces: FloatArray
+    truth: FloatArray
     pressed: NDArray[np.bool_]
-    still: Float
+    still: FloatArray
     valid: float
 
 
@@ -236,9 +235,9 @@ def bench_rotation(
     return out
 
 
-def _relative(turn: _Turn, reference: Float) -> Float:
+def _relative(turn: _Turn, reference: FloatArray) -> FloatArray:
     """Relative error of each pressed taxel's normal force at every step, one after another."""
-    error: Float = (turn.forces[:, turn.pressed, 2] / reference[turn.pressed, 2] - 1).ravel()
+    error: FloatArray = (turn.forces[:, turn.pressed, 2] / reference[turn.pressed, 2] - 1).ravel()
     return error
 
 
@@ -308,7 +307,7 @@ def _turn(
 
 
 def _counts(
-    model: SkinModel, force: Float, surroundings: Surroundings, rng: np.random.Generator
+    model: SkinModel, force: FloatArray, surroundings: Surroundings, rng: np.random.Generator
 ) -> NDArray[np.int16]:
     """Counts (N, 3) of the skin under settled taxel forces."""
     displacement = model.elastomer.settled(force)
@@ -358,7 +357,7 @@ def _flat_fitter() -> tuple[Layout, Consensus]:
 
 def _surfaces(
     rng: np.random.Generator, layout: Layout, share: float
-) -> tuple[Float, Float, NDArray[np.bool_]]:
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """True ambient and measured field, (A, 3, n) µT, and which taxels are free, (A, n)."""
     theta = np.empty((layout.arrays, 3, 3))
     uniform = rng.normal(size=3)

@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_device.skin.environment import Environment, EnvironmentParameters, rotation_about
 from sim_device.skin.parameters import anyskin_parameters
 from sim_device.skin.skin import Contact, SkinModel, nominal_calibration
+from tactile_core.arrays import FloatArray
 from tactile_core.geometry import anyskin
 from tactile_core.types import NS_PER_S, Instant
 from tactiled.blocks import Cycle, SampleBlock
 from tactiled.sensing.pipeline import BoardPipeline
 from tactiled.sensing.settings import Method, PipelineSettings
-
-Float = NDArray[np.float64]
 
 RATE_HZ = 100.0
 FORCES_N = (0.5, 1.0, 2.0, 5.0, 10.0)
@@ -42,7 +40,7 @@ class Board:
         self._pipeline = BoardPipeline(calibration, PipelineSettings(method=method, auto_tare=True))
         self._cycle = 0
 
-    def step(self, force: Float, turn: Float) -> Cycle:
+    def step(self, force: FloatArray, turn: FloatArray) -> Cycle:
         """One cycle under taxel forces (5, 3) N, the board turned by ``turn`` (3, 3)."""
         skin = self.skin
         displacement = skin.elastomer.load(force, 1.0 / RATE_HZ)
@@ -64,7 +62,10 @@ class Board:
         return cycle
 
     def run(
-        self, force_at: Callable[[float], Float], turn_at: Callable[[float], Float], seconds: float
+        self,
+        force_at: Callable[[float], FloatArray],
+        turn_at: Callable[[float], FloatArray],
+        seconds: float,
     ) -> tuple[list[float], list[Cycle]]:
         """True normal force (N) and cycle for ``seconds`` after the board has tared."""
         still = turn_at(0.0)
@@ -110,10 +111,10 @@ def _presses(rng: np.random.Generator, quick: bool) -> dict[str, float]:
         def force_at(
             t: float,
             board: Board = board,
-            place: Float = place,
-            load: Float = newton * direction,
+            place: FloatArray = place,
+            load: FloatArray = newton * direction,
             radius: float = radius,
-        ) -> Float:
+        ) -> FloatArray:
             share = min(1.0, max(0.0, (t - 0.3) / RAMP_S))
             return board.skin.taxel_force([Contact(place, share * load, radius)])
 
@@ -157,10 +158,10 @@ def _turning(rng: np.random.Generator, quick: bool) -> dict[str, float]:
             load[pressed, 2] = -rng.uniform(0.5, 4.0, chips)
             load[pressed, :2] = load[pressed, 2:] * rng.uniform(-0.3, 0.3, (chips, 2))
 
-            def force_at(t: float, load: Float = load) -> Float:
+            def force_at(t: float, load: FloatArray = load) -> FloatArray:
                 return load * min(1.0, max(0.0, (t - 2.0) / RAMP_S))
 
-            def turn_at(t: float) -> Float:
+            def turn_at(t: float) -> FloatArray:
                 return rotation_about(TURN_AXIS, TURN_RAD_PER_S * max(0.0, t - 0.5))
 
             truth, cycles = board.run(force_at, turn_at, 7.0)
