@@ -42,19 +42,19 @@ demo-skin: setup
 
 # The longer runs. Each leaves its result where docs/results keeps it.
 bench: setup
-	$(BIN)/tactile bench --json docs/results/bench.json
+	$(BIN)/tactile bench --out docs/results/bench.json
 
 fuzz: setup
-	$(BIN)/tactile fuzz --frames 10000000 --json docs/results/fuzz.json
+	$(BIN)/tactile fuzz --frames 10000000 --out docs/results/fuzz.json
 
 crash: setup
-	$(BIN)/tactile crash --kills 1000 --json docs/results/crash.json
+	$(BIN)/tactile crash --kills 1000 --out docs/results/crash.json
 
 fidelity: setup
-	$(BIN)/tactile fidelity --json docs/results/fidelity.json
+	$(BIN)/tactile fidelity --out docs/results/fidelity.json
 
 mutation: setup
-	$(BIN)/tactile mutation --json docs/results/mutation.json
+	$(BIN)/tactile mutation --out docs/results/mutation.json
 
 # A million random inputs through the safety gate.
 gate-random: setup
@@ -67,19 +67,19 @@ gate-coverage: setup
 
 # An hour of reaching while the machine is loaded and its memory churned.
 stress: setup
-	$(BIN)/tactile bench --only stress --json docs/results/stress.json
+	$(BIN)/tactile bench --only stress --out docs/results/stress.json
 
 # An hour of four boards, one of them pulled out and plugged in each second.
 soak: setup
-	$(BIN)/tactile soak --minutes $(SOAK_MINUTES) --json docs/results/soak.json
+	$(BIN)/tactile soak --minutes $(SOAK_MINUTES) --out docs/results/soak.json
 
 # A million frames with right CRCs that say anything, through links and pipeline.
 fuzz-pipeline: setup
-	$(BIN)/tactile fuzz --through pipeline --frames 1000000 --json docs/results/fuzz-pipeline.json
+	$(BIN)/tactile fuzz --through pipeline --frames 1000000 --out docs/results/fuzz-pipeline.json
 
 # A thousand kills of simulator, tactiled and reachd while they reach; two to three hours.
 kills: setup
-	$(BIN)/tactile crash --processes --kills $(KILLS) --json docs/results/kills.json
+	$(BIN)/tactile crash --processes --kills $(KILLS) --out docs/results/kills.json
 
 # The documents as a site in build/site, offline.
 docs: setup

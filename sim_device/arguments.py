@@ -3,29 +3,73 @@
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Callable, Mapping
-from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from sensor_proto.anyskin import MAX_MAGNETOMETERS
-from sim_device.board.anyskin import SKETCHES
-from sim_device.board.slcan_adapter import DIALECTS
 from sim_device.world.engines import ENGINES
-from tactile_core.arguments import Parser
+from tactile_core.cli import (
+    Command,
+    Parser,
+    add_bus,
+    add_commands,
+    add_out,
+    add_path,
+    add_seeds,
+    later,
+    loaded,
+    number,
+    seconds,
+    whole,
+)
+from tactile_core.daemon import Ending
 
-if TYPE_CHECKING:
-    Commands = argparse._SubParsersAction[argparse.ArgumentParser]
+DIALECTS = (
+    "lawicel",
+    "canable",
+    "println",
+    "late",
+    "candapter",
+    "lower",
+    "stamps",
+    "plain",
+    "canable2.5",
+    "overrun",
+    "buserror",
+)
+"""Firmware of CAN adapters; a test holds it equal to `sim_device.board.slcan_adapter`, and the next likewise."""
 
-Handler = Callable[[argparse.Namespace], int]
+SKETCHES = (
+    "anyskin",
+    "anyskin-text",
+    "reskin-text",
+    "eflesh-text",
+    "touch-text",
+    "labels-text",
+    "adafruit-text",
+)
+"""How people's sketches write: `sim_device.board.anyskin`."""
+
+COMMANDS = {
+    "boards": Command("simulate taxel boards", "sim_device.arguments:_fill_boards"),
+    "cupboard": Command(
+        "simulate a cupboard with an arm and its finger boards",
+        "sim_device.arguments:_fill_cupboard",
+    ),
+    "replay": Command(
+        "send a recording of a real board again", "sim_device.arguments:_fill_replay"
+    ),
+    "calibration": Command(
+        "write the calibration that belongs to a simulated board",
+        "sim_device.arguments:_fill_calibration",
+    ),
+    "version": Command("print the version", "sim_device.arguments:_fill_version"),
+}
 
 ARM_HELP = """\
-faults of the arm, parted by commas: silent, frozen, stale, biased, refuses_limits, backwards,
+faults of the arm, separated by commas: silent, frozen, stale, biased, refuses_limits, backwards,
 sideways, fast (it moves so, or 5 times as fast as it is told), fault, estop; each from the start,
 @Ts or @Ts+Ds (T s after the start, for D s), such as silent@5s+1s,estop@8s.
 fault and estop are given for 0.2 s where D is left out, and hold the arm until it is cleared.
-noise of the arm, parted by commas: position (m), heading (rad), speed (m/s), turn (rad/s),
+noise of the arm, separated by commas: position (m), heading (rad), speed (m/s), turn (rad/s),
 force (N), moment (N·m), each =STD, such as position=1e-4,force=0.1
 
 services, JSON: arm/NAME/srv/claim {name, clock} and release grant who commands the arm;
@@ -39,7 +83,7 @@ MAX_SPEED = 1000.0
 """Times real time; beyond, the terminal and not the recording sets the pace."""
 
 FAULTS_HELP = """\
-faults, parted by commas: flip=1e-5 (per bit), byteloss, byteinsert (per byte), loss, duplicate,
+faults, separated by commas: flip=1e-5 (per bit), byteloss, byteinsert (per byte), loss, duplicate,
 reorder, splice (per frame), delay=0.01:0.02s, silence@5s+2s, reset@8s, busoff@5s+1s (CAN),
 copy@5s+2s (every third frame an old one), seed=N (default: the board's).
 Chips: WHAT=ARRAY:TAXEL@Ts+Ds, TAXEL * for all, such as zeros=left:3@2s+5s; with :SHARE only that
@@ -51,36 +95,40 @@ The whole skin: skinoff@4s+2s, newskin@6s (another skin is on from then), gain=1
 chips), leap=2000@4s+2s (µT of a field that leaps: a magnet near)."""
 
 
-def make_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
-    """Parser whose result has the ``handler`` of its command, from ``handlers`` by name."""
-    parser: argparse.ArgumentParser = Parser(
+def make_parser(ending: Ending | None = None) -> argparse.ArgumentParser:
+    """Parser of the command line; ``ending``: whether the process is told to end."""
+    parser = Parser(
         "simdevice",
         description="Simulated taxel boards on pseudo-terminals and CAN buses, on their own or on "
         "the finger of a simulated arm in a cupboard.",
         epilog="Exit: 0 done (also on Ctrl-C, SIGTERM), 2 bad argument, 3 refused by the system.",
     )
-    parser.add_argument(
-        "--version", action="version", version=f"simdevice {version('tactile-reach')}"
-    )
-    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    _add_boards(commands).set_defaults(handler=handlers["boards"])
-    _add_cupboard(commands).set_defaults(handler=handlers["cupboard"])
-    _add_replay(commands).set_defaults(handler=handlers["replay"])
-    _add_calibration(commands).set_defaults(handler=handlers["calibration"])
-    shown = commands.add_parser("version", help="print the version")
-    shown.set_defaults(handler=handlers["version"])
+    parser.show_version()
+    add_commands(parser, COMMANDS)
+    parser.set_defaults(ending=ending)
     return parser
 
 
-def _add_boards(commands: Commands) -> argparse.ArgumentParser:
-    boards = commands.add_parser(
+def _describe(
+    parser: argparse.ArgumentParser, handler: str, description: str, epilog: str | None = None
+) -> None:
+    parser.description, parser.epilog = description, epilog
+    parser.set_defaults(func=later(f"sim_device.cli:{handler}"))
+
+
+def _fill_version(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(func=later("sim_device.cli:print_version"))
+
+
+def _fill_boards(boards: Parser) -> None:
+    _describe(
+        boards,
         "boards",
-        help="simulate taxel boards",
-        description="Simulate one board on every --pty and one for every --node on every bus. "
+        "Simulate one board on every --pty and one for every --node on every bus. "
         "Board number k (from 0, in this order) has seed SEED + k.",
-        epilog=FAULTS_HELP,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        FAULTS_HELP,
     )
+    boards.former(board="kind", format="layout")
     ports = boards.add_argument_group("ports, each more than once")
     ports.add_argument(
         "--pty", action="append", default=[], type=Path, metavar="LINK",
@@ -91,12 +139,13 @@ def _add_boards(commands: Commands) -> argparse.ArgumentParser:
         help="boards behind a simulated USB-CAN adapter (slcan) on a pseudo-terminal",
     )  # fmt: skip
     ports.add_argument(
-        "--can", action="append", default=[], type=_bus, metavar="BUS",
+        "--can", action="append", default=[], metavar="BUS",
+        type=loaded("sim_device.ports_plan:parse_bus"),
         help="boards on a bus of python-can: socketcan:vcan0, virtual:0 (same process only), "
         "with +fd for CAN FD",
     )  # fmt: skip
     ports.add_argument(
-        "--node", action="append", default=[], type=_node, metavar="ID",
+        "--node", action="append", default=[], type=whole(most=126), metavar="ID",
         help="node id of a board on every bus, 0 to 126; once for each board (default 1)",
     )  # fmt: skip
     ports.add_argument(
@@ -110,7 +159,7 @@ def _add_boards(commands: Commands) -> argparse.ArgumentParser:
     who = boards.add_argument_group("boards")
     _add_identity(who)
     who.add_argument(
-        "--format", default="", metavar="FORMAT",
+        "--layout", default="", metavar="LAYOUT",
         help=f"how anyskin boards write: {', '.join(SKETCHES)} (default anyskin), or a layout such "
         "as floats:5xyz,end=lf (see tactiled --help)",
     )  # fmt: skip
@@ -119,54 +168,49 @@ def _add_boards(commands: Commands) -> argparse.ArgumentParser:
         help="anyskin boards print text at the start and now and then between their frames",
     )  # fmt: skip
     who.add_argument(
-        "--rate", type=_number(0.1, 1000), metavar="HZ",
+        "--rate", type=number("Hz", least=0.1, most=1000), metavar="HZ",
         help="sample rate after power-on in Hz (default 100; anyskin: its loop, 115)",
     )  # fmt: skip
     world = boards.add_argument_group("surroundings and faults")
-    world.add_argument("--press", type=Path, metavar="FILE.toml", help="script of an indenter")
+    add_path(world, "--press", "script of an indenter, TOML")
     world.add_argument(
-        "--rotate", type=_rotation, metavar="ANGLE/TIME[@AXIS]",
+        "--rotate", metavar="ANGLE/TIME[@AXIS]",
+        type=loaded("sim_device.skin.environment:check_rotation"),
         help="steady turn in the earth's field, such as 90deg/10s or 0.2rad/s@y (default none)",
     )  # fmt: skip
     world.add_argument(
-        "--temperature", type=_number(-40, 85), default=23.0, metavar="C",
+        "--temperature", type=number("°C", least=-40, most=85), default=23.0, metavar="C",
         help="room temperature in °C (default 23); boards warm 4 K above it",
     )  # fmt: skip
     world.add_argument(
-        "--field", type=_number(0, 1000), default=50.0, metavar="UT",
+        "--field", type=number("µT", least=0, most=1000), default=50.0, metavar="UT",
         help="magnitude of the earth's field in µT (default 50)",
     )  # fmt: skip
     world.add_argument("--faults", default="", metavar="SPEC", help="faults to inject, see below")
     world.add_argument(
-        "--unplug", action="append", default=[], type=_window, metavar="Ts+Ds",
+        "--unplug", action="append", default=[], metavar="Ts+Ds",
+        type=loaded("sim_device.ports_plan:parse_window"),
         help="take --pty boards away T s after the start for D s, such as 5s+1s; more than once",
     )  # fmt: skip
     _add_duration(boards)
-    return boards
 
 
-def _add_cupboard(commands: Commands) -> argparse.ArgumentParser:
-    from tactile_core.options import add_bus
-
-    cupboard = commands.add_parser(
+def _fill_cupboard(cupboard: Parser) -> None:
+    _describe(
+        cupboard,
         "cupboard",
-        help="simulate a cluttered cupboard with an arm and its finger boards",
-        description="Simulate a cluttered cupboard and an arm whose finger reaches into it, in "
-        "real time: the taxels of the finger's boards on --pty and --slcan, the arm over zenoh.",
-        epilog=ARM_HELP + FAULTS_HELP,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "Simulate a cluttered cupboard and an arm whose finger reaches into it, in real "
+        "time: the taxels of the finger's boards on --pty and --slcan, the arm over zenoh.",
+        ARM_HELP + FAULTS_HELP,
     )
-    add = cupboard.add_argument_group("world").add_argument
+    world = cupboard.add_argument_group("world")
+    add = world.add_argument
     add(
         "--scene", default="authors_sim", metavar="SCENE",
         help="authors_sim, hardware, authors_sim_recorded, recorded:FILE.json.gz, or FILE.json "
         "(default authors_sim)",
     )  # fmt: skip
-    add(
-        "--seed", type=_whole, default=0, metavar="N",
-        help="of scene (its number, of recorded ones), boards and noise (default 0); board number "
-        "k has N + k",
-    )  # fmt: skip
+    add_seeds(world, what="of boards and noise, board number k has N + k")
     add(
         "--engine", choices=ENGINES, default=ENGINES[0],
         help=f"physics engine (default {ENGINES[0]})",
@@ -190,7 +234,7 @@ def _add_cupboard(commands: Commands) -> argparse.ArgumentParser:
         help="CAN FD on --slcan (default CAN 2.0B, which at 1 Mbit/s carries one finger at 60 Hz)",
     )  # fmt: skip
     boards.add_argument(
-        "--rate", type=_number(0.1, 1000), metavar="HZ",
+        "--rate", type=number("Hz", least=0.1, most=1000), metavar="HZ",
         help="sample rate after power-on in Hz (default 100)",
     )  # fmt: skip
     boards.add_argument("--faults", default="", metavar="SPEC", help="faults to inject, see below")
@@ -201,7 +245,7 @@ def _add_cupboard(commands: Commands) -> argparse.ArgumentParser:
         help="states a second (default 100)",
     )  # fmt: skip
     add(
-        "--arm-latency", type=_number(0, 10), default=0.0, metavar="S",
+        "--arm-latency", type=number("s", least=0, most=10), default=0.0, metavar="S",
         help="s each way: from a command's receipt to its effect, and from a state's capture to "
         "its sending (default 0)",
     )  # fmt: skip
@@ -209,19 +253,17 @@ def _add_cupboard(commands: Commands) -> argparse.ArgumentParser:
     add("--arm-fault", default="", metavar="SPEC", help="faults to inject, see below")
     add_bus(cupboard, "arm")
     _add_duration(cupboard)
-    return cupboard
 
 
-def _add_replay(commands: Commands) -> argparse.ArgumentParser:
-    replay = commands.add_parser(
+def _fill_replay(replay: argparse.ArgumentParser) -> None:
+    _describe(
+        replay,
         "replay",
-        help="send a recording of a real board again",
-        description="Send a recorded CSV (plain or .gz: time in s, then x, y, z in µT for each of\n"
-        "1 to 20 magnetometers) as the frames of an AnySkin board, at the recorded times. It\n"
-        "begins when a host reads, so that nothing is lost. Recordings hold no temperatures:\n"
+        "Send a recorded CSV (plain or .gz: time in s, then x, y, z in µT for each of "
+        "1 to 20 magnetometers) as the frames of an AnySkin board, at the recorded times. It "
+        "begins when a host reads, so that nothing is lost. Recordings hold no temperatures: "
         "25 °C is sent for all.",
-        epilog=FAULTS_HELP,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        FAULTS_HELP,
     )
     replay.add_argument("recording", type=Path, metavar="RECORDING.csv")
     replay.add_argument(
@@ -233,7 +275,7 @@ def _add_replay(commands: Commands) -> argparse.ArgumentParser:
         help="symbolic link to make to the pseudo-terminal",
     )  # fmt: skip
     replay.add_argument(
-        "--speed", type=_number(1 / MAX_SPEED, MAX_SPEED), default=1.0, metavar="N",
+        "--speed", metavar="X", type=number(least=1 / MAX_SPEED, most=MAX_SPEED), default=1.0,
         help="times real time, 0.001 to 1000 (default 1)",
     )  # fmt: skip
     replay.add_argument("--loop", action="store_true", help="begin again at the end (default: end)")
@@ -243,124 +285,43 @@ def _add_replay(commands: Commands) -> argparse.ArgumentParser:
         "on",
     )  # fmt: skip
     _add_duration(replay)
-    return replay
 
 
-def _add_calibration(commands: Commands) -> argparse.ArgumentParser:
-    calibration = commands.add_parser(
+def _fill_calibration(calibration: Parser) -> None:
+    _describe(
+        calibration,
         "calibration",
-        help="write the calibration that belongs to a simulated board",
-        description="Write the factory calibration of exactly the board that `simdevice boards` "
-        "simulates with the same --board and --seed (its first one; the k-th has SEED + k).",
+        "Write the factory calibration of exactly the board that `simdevice boards` "
+        "simulates with the same --kind and --seed (its first one; the k-th has SEED + k).",
     )
-    calibration.add_argument(
-        "--out", type=Path, required=True, metavar="FILE.cal.toml", help="file to write"
-    )
-    calibration.add_argument(
-        "--force", action="store_true", help="replace a file that is no calibration of this board"
+    calibration.former(board="kind")
+    add_out(
+        calibration,
+        "FILE.cal.toml to write",
+        required=True,
+        force="replace a file that is not a calibration of this board",
     )
     _add_identity(calibration)
-    return calibration
 
 
 def _add_identity(group: argparse._ActionsContainer) -> None:
     group.add_argument(
-        "--board", choices=["finger", "anyskin"], default="finger",
+        "--kind", choices=["finger", "anyskin"], default="finger",
         help="finger: 80 taxels, our protocol; anyskin: 5 magnetometers, floats (default finger)",
     )  # fmt: skip
     group.add_argument(
-        "--arrays", type=_arrays, metavar="N+N",
+        "--arrays", type=loaded("sim_device.ports_plan:parse_arrays"), metavar="N+N",
         help="magnetometers of each board on one anyskin controller, as in 5+5 (default 5)",
     )  # fmt: skip
+    add_seeds(group, what="which board: tolerances, noise and faults follow from it", scene=False)
     group.add_argument(
-        "--seed", type=_whole, default=0, metavar="N",
-        help="which board: tolerances, noise and faults follow from it (default 0)",
-    )  # fmt: skip
-    group.add_argument(
-        "--serial", action="append", default=[], type=_serial, metavar="HEX",
+        "--serial", action="append", default=[], metavar="HEX",
+        type=loaded("sim_device.ports_plan:parse_serial"),
         help="serial number, up to 16 hex digits; once for each board (default: from the seed)",
     )  # fmt: skip
 
 
 def _add_duration(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--duration", type=_number(0.001, 1e9), metavar="S", help="end after S s (default: never)"
+        "--duration", type=seconds, metavar="S", help="end after S s (default: never)"
     )
-
-
-def _checked(parse: Callable[[str], object]) -> Callable[[str], object]:
-    """``parse`` for argparse, which shows the message of this error only."""
-
-    def convert(text: str) -> object:
-        try:
-            return parse(text)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(str(error)) from error
-
-    return convert
-
-
-def _number(low: float, high: float) -> Callable[[str], object]:
-    def parse(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not low <= value <= high:
-            raise ValueError(f"{text!r} given; allowed: a number from {low:g} to {high:g}")
-        return value
-
-    return _checked(parse)
-
-
-def _parse_whole(text: str, high: float = 2**32) -> int:
-    if not text.isdecimal() or int(text) > high:
-        raise ValueError(f"{text!r} given; allowed: a whole number from 0 to {high}")
-    return int(text)
-
-
-def _parse_bus(text: str) -> object:
-    from tactile_core.can_bus import CanSpec
-
-    spec = CanSpec.parse(text)
-    if spec.interface == "slcan":
-        raise ValueError(f"{text!r} given; to play an slcan adapter use --slcan LINK")
-    return spec
-
-
-def _parse_rotation(text: str) -> str:
-    from sim_device.skin.environment import parse_rotation
-
-    parse_rotation(text)
-    return text
-
-
-def _parse_window(text: str) -> object:
-    from sim_device.ports_plan import parse_window
-
-    return parse_window(text)
-
-
-def _parse_serial(text: str) -> bytes:
-    from sim_device.ports_plan import parse_serial
-
-    return parse_serial(text)
-
-
-def _parse_arrays(text: str) -> tuple[int, ...]:
-    words = text.split("+")
-    if not all(word.isdecimal() and int(word) for word in words):
-        raise ValueError(f"{text!r} given; allowed: numbers above 0 joined by +, as in 5+5")
-    sizes = tuple(int(word) for word in words)
-    if sum(sizes) > MAX_MAGNETOMETERS:
-        raise ValueError(f"{text!r} given; allowed: at most {MAX_MAGNETOMETERS} magnetometers")
-    return sizes
-
-
-_arrays = _checked(_parse_arrays)
-_whole = _checked(_parse_whole)
-_node = _checked(lambda text: _parse_whole(text, 126))
-_bus = _checked(_parse_bus)
-_rotation = _checked(_parse_rotation)
-_window = _checked(_parse_window)
-_serial = _checked(_parse_serial)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sensor_proto.anyskin import MAX_MAGNETOMETERS
 from sensor_proto.can_transfers import CanFrame
 from sim_device.board.anyskin import CONVERSION_RATE, LOOP_RATE, AnySkinBoard, writer_of
 from sim_device.board.catalogue import build_skin, identity
@@ -103,6 +104,25 @@ def parse_serial(text: str) -> bytes:
     return bytes.fromhex(match[1].rjust(16, "0"))
 
 
+def parse_bus(text: str) -> CanSpec:
+    """CAN bus to play boards on; ValueError."""
+    spec = CanSpec.parse(text)
+    if spec.interface == "slcan":
+        raise ValueError(f"{text!r} given; to play an slcan adapter use --slcan LINK")
+    return spec
+
+
+def parse_arrays(text: str) -> tuple[int, ...]:
+    """Magnetometers of each board of a controller, as in ``5+5``; ValueError."""
+    words = text.split("+")
+    if not all(word.isdecimal() and int(word) for word in words):
+        raise ValueError(f"{text!r} given; allowed: numbers above 0 joined by +, as in 5+5")
+    sizes = tuple(int(word) for word in words)
+    if sum(sizes) > MAX_MAGNETOMETERS:
+        raise ValueError(f"{text!r} given; allowed: at most {MAX_MAGNETOMETERS} magnetometers")
+    return sizes
+
+
 def plan_boards(request: BoardsRequest) -> list[Planned]:
     """Stations for a request, all boards made; ValueError for what does not fit together."""
     buses: list[tuple[SlcanPort | PythonCanPort, CanSpec]] = [
@@ -115,14 +135,14 @@ def plan_boards(request: BoardsRequest) -> list[Planned]:
     buses += [(PythonCanPort(spec), spec) for spec in request.cans]
     if request.board != "anyskin" and (request.arrays or request.format or request.banner):
         raise ValueError(
-            f"--arrays, --format and --banner with --board {request.board}; they are for boards "
-            "that send floats: --board anyskin"
+            f"--arrays, --layout and --banner with --kind {request.board}; they are for boards "
+            "that send floats: --kind anyskin"
         )
     count = len(request.ptys) + len(buses) * len(request.nodes)
     if not count:
         raise ValueError("no port given; allowed: --pty, --slcan and --can, each more than once")
     if buses and request.board == "anyskin":
-        raise ValueError("--board anyskin on a CAN bus; such boards have a serial line: use --pty")
+        raise ValueError("--kind anyskin on a CAN bus; such boards have a serial line: use --pty")
     if request.unplugged and buses:
         raise ValueError("--unplug on a CAN bus; it is for --pty (for CAN: --faults busoff@5s+1s)")
     if len(request.serials) > count:
@@ -140,9 +160,9 @@ def _plan_serial(maker: _Maker, number: int, link: Path) -> Planned:
     request = maker.request
     anyskin = request.board == "anyskin"
     make: MakeBoard[bytes] = maker.anyskin(number) if anyskin else maker.serial(number)
-    connect = f"tactiled --port {link}" + (" --board anyskin" if anyskin else "")
+    connect = f"tactiled --port {link}" + (" --kind anyskin" if anyskin else "")
     if request.format and not request.format.endswith("-text"):
-        connect = f"tactiled --port {link} --board {request.format}"
+        connect = f"tactiled --port {link} --kind {request.format}"
     station = SerialStation(PtyPort(link), make, request.unplugged)
     return Planned(station, str(link), connect, (maker.describe(number),))
 

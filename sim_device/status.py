@@ -1,31 +1,36 @@
-"""One line on a terminal that says how the simulation goes."""
+"""What people see while a simulation runs: a live line on a terminal, and a sum at the end."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
-from typing import TextIO
+from typing import TYPE_CHECKING
 
-from sim_device.ports_plan import Planned
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from tactile_core.cli import LiveLines
+
+if TYPE_CHECKING:
+    from sim_device.ports_plan import Planned
 
 
-class StatusLine:
-    """Rewrites one line on ``stream`` when it is a terminal; at the end, a line for each port."""
+class StatusLine(LiveLines):
+    """Shows how the ports of ``planned`` do, on a terminal alone."""
 
-    def __init__(self, planned: Sequence[Planned], stream: TextIO) -> None:
+    def __init__(self, planned: Sequence[Planned], console: Console | None = None) -> None:
+        super().__init__(console or Console(stderr=True))
         self._planned = planned
-        self._stream = stream
-        self._live = stream.isatty()
-        self._width = 0
         self._last = (0.0, [0] * len(planned))
+        self._text = ""
 
-    def show(self, seconds: float) -> None:
-        """Rates since the last call, and losses so far."""
-        if not self._live:
-            return
+    def show_at(self, elapsed_s: float) -> None:
+        """Show rates since the last call, and losses so far, ``elapsed_s`` after the start."""
         before, counts = self._last
         now = [plan.station.sent for plan in self._planned]
-        self._last = seconds, now
-        span = seconds - before
+        self._last = elapsed_s, now
+        span = elapsed_s - before
         parts = []
         for plan, count, earlier in zip(self._planned, now, counts, strict=True):
             rate = (count - earlier) / span if span > 0 else 0.0
@@ -35,19 +40,23 @@ class StatusLine:
             elif losses := sum(plan.station.losses.values()):
                 part += f" lost {losses}"
             parts.append(part)
-        text = f"{seconds:8.1f} s  " + "  ".join(parts)
-        self._stream.write("\r" + text.ljust(self._width))
-        self._stream.flush()
-        self._width = len(text)
+        self._text = f"{elapsed_s:8.1f} s  " + "  ".join(parts)
+        self.show()
 
-    def end(self) -> None:
-        """Leave the line; say what each port sent and lost."""
-        if self._live and self._width:
-            self._stream.write("\r" + " " * self._width + "\r")
+    def table(self) -> Table:
+        """One row."""
+        table = Table.grid()
+        table.add_row(Text(self._text, no_wrap=True, overflow="ellipsis"))
+        return table
+
+    def lines(self) -> tuple[str, ...]:
+        """Nothing: what was announced and the sum are enough for a file."""
+        return ()
+
+    def sum_up(self) -> None:
+        """Say on standard error what each port sent and lost."""
         for plan in self._planned:
             losses = {k: v for k, v in plan.station.losses.items() if v}
             lost = ", ".join(f"{name} {count}" for name, count in sorted(losses.items()))
-            self._stream.write(
-                f"{plan.name}: {plan.station.sent} sent" + (f"; {lost}" if lost else "") + "\n"
-            )
-        self._stream.flush()
+            text = f"{plan.name}: {plan.station.sent} sent" + (f"; {lost}" if lost else "")
+            print(text, file=sys.stderr, flush=True)

@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
+import argparse
 import logging
 import os
-import signal
 import sys
-import threading
 from collections.abc import Sequence
-from types import FrameType
-
-import numpy as np
-from rich.console import Console
+from functools import partial
+from typing import TYPE_CHECKING
 
 from reachd.arguments import make_parser
-from reachd.daemon import Daemon, StartError
-from reachd.interfaces import Strategy
-from reachd.publish import show
-from reachd.settings import Settings, SettingsError, make_settings
-from reachd.status import StatusLine
-from reachd.strategies import StrategyError, load_strategy
-from reachd.trial import Outcome
-from tactile_core.ending import leave
-from tactile_core.terminal import set_up_logging
+from tactile_core.cli import DONE, FAILED, USAGE, CommandError, set_up_logging
+from tactile_core.daemon import Ending, run, serve
+
+if TYPE_CHECKING:
+    from reachd.daemon import Daemon
+    from reachd.interfaces import Strategy
+    from reachd.settings import Settings
+    from reachd.status import StatusLine
+    from reachd.trial import Outcome
 
 log = logging.getLogger(__name__)
 
-REACHED, FAILED, USAGE, REFUSED = range(4)
-
-REFRESH = 0.1
-"""s between looks of the main thread at the others."""
+REFRESH_S = 0.1
+"""Between looks of the main thread at the others."""
 
 HUNG = 20
 """Looks in a row that see no new cycle after which the control loop is taken to be stuck: 2 s."""
@@ -40,78 +35,63 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Without ``argv`` this is the whole process, which then ends here.
     """
-    code = _main(argv)
-    if argv is None:
-        leave(code)
-    return code
+
+    def parser(ending: Ending) -> argparse.ArgumentParser:
+        parser = make_parser()
+        parser.set_defaults(func=partial(_run, ending))
+        return parser
+
+    return run(parser, argv)
 
 
-def _main(argv: Sequence[str] | None) -> int:
-    options = make_parser().parse_args(argv)
+def _run(ending: Ending, options: argparse.Namespace) -> int:
+    from rich.console import Console
+
     console = Console(stderr=True)
     set_up_logging(console, verbose=options.verbose)
+
+    from reachd.daemon import Daemon
+    from reachd.settings import SettingsError, make_settings
+    from reachd.status import StatusLine
+    from reachd.strategies import StrategyError
+
     try:
         settings = make_settings(options)
         strategy = _load(settings)
     except (SettingsError, StrategyError) as error:
-        print(f"reachd: {error}", file=sys.stderr)
-        return USAGE
-    stopping = threading.Event()
+        raise CommandError(str(error), USAGE) from error
+    daemon = Daemon(settings, strategy)
+    cautions = settings.parameters.safety.cautions
 
-    def stop(number: int, _: FrameType | None) -> None:
-        stopping.set()
-        signal.signal(number, signal.SIG_DFL)  # a second one ends it at once
+    def work() -> int:
+        session = _Session(daemon, ending)
+        with StatusLine(console, daemon.loop, daemon.recorder, cautions) as line:
+            code = session.run(line)
+        if code == FAILED:
+            session.say_why()
+        return code
 
-    before = {n: signal.signal(n, stop) for n in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        return _run(settings, strategy, console, stopping)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    return serve(daemon, ending, "disarmed", work)
 
 
 def _load(settings: Settings) -> Strategy:
     """The strategy; one of the user's own may lie in the folder reachd was started in."""
+    import numpy as np
+
+    from reachd.strategies import load_strategy
+
     if ":" in settings.strategy and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     rng = np.random.default_rng(settings.seed)
     return load_strategy(settings.strategy, settings.parameters, rng)
 
 
-def _run(
-    settings: Settings, strategy: Strategy, console: Console, stopping: threading.Event
-) -> int:
-    daemon = Daemon(settings, strategy)
-    try:
-        daemon.start()
-    except StartError as error:
-        print(f"reachd: {error}", file=sys.stderr)
-        return REFUSED
-    daemon.watchdog.ready("disarmed")
-    session = _Session(daemon, stopping)
-    try:
-        with StatusLine(
-            console, daemon.loop, daemon.recorder, settings.parameters.safety.cautions
-        ) as line:
-            code = session.run(line)
-    except StartError as error:
-        print(f"reachd: {error}", file=sys.stderr)
-        code = REFUSED
-    finally:
-        clean = daemon.stop()
-    code = session.conclude(code)
-    if not clean:
-        log.warning("a thread did not end in time; leaving without it")
-        leave(code)
-    return code
-
-
 class _Session:
     """What the main thread does while the daemon runs."""
 
-    def __init__(self, daemon: Daemon, stopping: threading.Event) -> None:
+    def __init__(self, daemon: Daemon, ending: Ending) -> None:
         self._daemon = daemon
-        self._stopping = stopping
+        self._told = ending.told
         self._outcome: Outcome | None = None
         self._beat = 0
         self._looks = 0
@@ -120,40 +100,29 @@ class _Session:
         """Reach once, or serve until told to stop; the exit status."""
         daemon, settings = self._daemon, self._daemon.settings
         if settings.goal is not None:
-            daemon.wait_ready(self._stopping)
+            daemon.wait_ready(self._told)
             if not self._ended():
                 daemon.reach(settings.goal)
         while not self._ended():
-            self._stopping.wait(REFRESH)
+            self._told.wait(REFRESH_S)
             self._look(line)
             if not settings.serve and not daemon.moving:
                 break
         daemon.cancel("reachd was told to stop")
         self._note_outcome()
         if settings.serve:
-            return REACHED
-        return REACHED if self._outcome is not None and self._outcome.success else FAILED
+            return DONE
+        return DONE if self._outcome is not None and self._outcome.success else FAILED
 
-    def conclude(self, code: int) -> int:
-        """Say how it ended; the exit status."""
-        daemon = self._daemon
-        if daemon.recorder is not None:
-            log.info("log: %s", daemon.recorder.stats.path)
-        if daemon.failure is not None:
-            thread, cause = daemon.failure
-            print(f"reachd: thread {thread} failed: {cause}", file=sys.stderr)
-            return FAILED
-        if self._outcome is None and code == FAILED:
-            cycle = daemon.loop.last
+    def say_why(self) -> None:
+        """Say why there was no reach."""
+        if self._outcome is None and self._daemon.failure is None:
+            cycle = self._daemon.loop.last
             why = "" if cycle is None else cycle.status.text
             print(f"reachd: no reach: {why or 'told to stop before it began'}", file=sys.stderr)
-        if daemon.recorder is not None and (problem := daemon.recorder.trouble) is not None:
-            print(f"reachd: {problem}", file=sys.stderr)
-            return FAILED if code == REACHED else code
-        return code
 
     def _ended(self) -> bool:
-        return self._stopping.is_set() or self._daemon.done.is_set()
+        return self._told.is_set() or self._daemon.done.is_set()
 
     def _look(self, line: StatusLine) -> None:
         self._note_outcome()
@@ -170,6 +139,10 @@ class _Session:
 
     def _note_outcome(self) -> None:
         """Show new outcomes, write them where they are wanted."""
+        from rich.console import Console
+
+        from reachd.publish import show
+
         daemon = self._daemon
         finished = daemon.loop.controller.finished
         while finished:
@@ -183,3 +156,7 @@ class _Session:
                 path.write_text(text + "\n")
             except OSError as error:
                 log.error("cannot write %s: %s", path, error.strerror)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

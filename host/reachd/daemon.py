@@ -37,9 +37,9 @@ from tactile_core.bus.messages import codec
 from tactile_core.bus.session import BusError, close_session, open_session
 from tactile_core.bus.streams import list_alive
 from tactile_core.bus.topics import ARM_STATE, FEATURES, alive_key, commander_key, service_key
+from tactile_core.daemon import Service, StartError
 from tactile_core.log.recorder import Recorder, RecorderError
 from tactile_core.log.retention import DiskWatch
-from tactile_core.supervision import Watchdog
 from tactile_core.types import Echo, Instant, WallClock, monotonic_now, seconds_between
 
 log = logging.getLogger(__name__)
@@ -64,21 +64,15 @@ NAMES_TIMEOUT = 0.5
 """s to ask the bus for the names of boards, for an error message."""
 
 
-class StartError(Exception):
-    """The environment does not allow a reach; the message holds the remedy."""
+class Daemon(Service):
+    """reachd between `start` and `stop`; used from the main thread."""
 
-
-class Daemon:
-    """Everything between `start` and `stop`; used from the main thread.
-
-    ``failure``: what a thread died of. ``done``: set when there is nothing more to do.
-    """
+    prog = "reachd"
+    refusals = (LockError, BusError, RecorderError, ArmError)
 
     def __init__(self, settings: Settings, strategy: Strategy) -> None:
+        super().__init__()
         self.settings = settings
-        self.failure: tuple[str, BaseException] | None = None
-        self.done = threading.Event()
-        self.recorder: Recorder | None = None
         self._wall = WallClock.take()
         self._lock = ArmLock(settings.arm)
         self._session: zenoh.Session | None = None
@@ -90,7 +84,6 @@ class Daemon:
         self._requests: OperatorRequests | None = None
         self._tokens: list[zenoh.LivelinessToken] = []
         self._log_state = "recording"
-        self.watchdog = Watchdog()
         self._disk: DiskWatch | None = None
         self._commanded = False  # the arm was ours once
         self._collected = monotonic_now()
@@ -118,23 +111,15 @@ class Daemon:
             "note": s.parameters.note,
         }
 
-    def start(self) -> None:
-        """Bring everything up, disarmed; `StartError`, and all down again, when that cannot be."""
+    def _start(self) -> None:
         if self._wall.problem:
             log.warning("%s", self._wall.problem)
         try:
-            self._start()
+            self._open()
         except zenoh.ZError as error:
-            self.stop()
-            raise StartError(f"the bus has closed by itself: {error}") from error
-        except (LockError, BusError, RecorderError, ArmError) as error:
-            self.stop()
-            raise StartError(str(error)) from error
-        except StartError:
-            self.stop()
-            raise
+            raise BusError(f"the bus has closed by itself: {error}") from error
 
-    def _start(self) -> None:
+    def _open(self) -> None:
         settings, safety = self.settings, self.settings.parameters.safety
         self._lock.acquire(settings.name)
         sys.setswitchinterval(SWITCH_INTERVAL)
@@ -302,7 +287,6 @@ class Daemon:
         Nothing publishes once the session closes, which it does last. False when a thread is still
         inside somebody's code: it must then be left behind.
         """
-        self.watchdog.stopping("stopping")
         clean = ended = self.loop.stop(STOP_TIMEOUT)
         if self._disk is not None:
             self._disk.stop()
@@ -388,14 +372,6 @@ class Daemon:
         self.watchdog.beat(monotonic_now())  # on the control loop's thread, after its command
         if self._reporter is not None:
             self._reporter.cycle(cycle, sent)
-
-    def fail(self, error: BaseException) -> None:
-        """A thread, the caller's or the one it speaks for, has failed."""
-        if self.failure is None:
-            name = threading.current_thread().name
-            self.failure = (name, error)
-            log.critical("thread %s failed", name, exc_info=error)
-        self.done.set()
 
     def _open_log(self, destination: Path) -> Recorder:
         settings = self.settings

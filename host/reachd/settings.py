@@ -16,6 +16,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from reachd.arguments import DEFAULT_SET, DEFAULT_WAIT_S
 from reachd.interfaces import Goal
 from reachd.services import make_goal, parse_target
 from reachd.strategies.parameter_fields import Parameters
@@ -23,18 +24,10 @@ from reachd.strategies.parameters import SETS, ParameterTable, parameters
 from reachd.trial import Pose
 from tactile_core.bus.session import BusConfig
 from tactile_core.bus.topics import NAME
+from tactile_core.cli import DEFAULT_STRATEGY
 from tactile_core.config import ConfigError, Document, Duration, Metres, unit
 from tactile_core.log.recorder import RecorderSettings
 from tactile_core.options import BusTable, LogTable, bus_config, log_destination
-
-DEFAULT_STRATEGY = "hybrid_event"
-"""The paper's best."""
-
-DEFAULT_SET = "hardware"
-"""The slower one, with every check of the gate switched on."""
-
-DEFAULT_WAIT = 10.0
-"""s for features and arm to come: a board's first tare takes a few."""
 
 DEFAULT_PRIORITY = 20
 """Of the control loop among real-time threads, below those of the kernel's interrupts (50)."""
@@ -60,7 +53,7 @@ class InputsTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     ] = "same"
     wait_s: Annotated[
         Duration, Meta(description="time for features and arm to come; a first tare takes a few s")
-    ] = DEFAULT_WAIT
+    ] = DEFAULT_WAIT_S
 
 
 class LoopTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -179,7 +172,7 @@ def make_settings(options: argparse.Namespace) -> Settings:
         wait=options.wait if options.wait is not None else file.inputs.wait_s,
         priority=file.loop.priority,
         serve=serve,
-        json=options.json,
+        json=options.out,
         log=log_destination(options, file.log),
         recorder=file.log.recorder,
         bus=bus_config(options, file.bus, "reachd"),

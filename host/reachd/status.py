@@ -10,8 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from reachd.control import ControlLoop, Cycle
+from tactile_core.cli import LiveLines
 from tactile_core.log.recorder import Recorder
-from tactile_core.terminal import LiveLines
 
 
 class StatusLine(LiveLines):

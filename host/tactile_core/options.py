@@ -1,10 +1,8 @@
-"""What the command lines and configuration files of all daemons have in common."""
+"""Tables that the configuration files of all daemons have, and what options make of them."""
 
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -12,12 +10,10 @@ import msgspec
 from msgspec import Meta
 
 from tactile_core.bus.keys import TlsConfig
-from tactile_core.bus.session import PORTS, BusConfig, Role
+from tactile_core.bus.session import BusConfig, Role
+from tactile_core.cli import DEFAULT_LOG
 from tactile_core.config import printable
 from tactile_core.log.recorder import RecorderSettings
-
-DEFAULT_LOG = "tactile-logs"
-"""Folder of the logs, below the folder a daemon was started in."""
 
 DEFAULT_LOG_BYTES = 32 << 30
 """Bytes that the logs of one name may take in a folder before the oldest go: about 18 h of one
@@ -55,54 +51,6 @@ class BusTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     ] = False
 
 
-def add_log_and_bus(parser: argparse.ArgumentParser, role: Role) -> None:
-    """Add --log, --no-log, --listen, --connect, --keys and --insecure, for a daemon's ``role``."""
-    add = parser.add_argument_group("log and bus").add_argument
-    add(
-        "--log",
-        metavar="PATH",
-        help=f"MCAP file to write, or folder for dated files (default folder ./{DEFAULT_LOG})",
-    )
-    add("--no-log", action="store_true", help="log nothing")
-    _add_bus(add, role)
-
-
-def add_bus(parser: argparse.ArgumentParser, role: Role) -> None:
-    """Add --listen, --connect, --keys and --insecure."""
-    _add_bus(parser.add_argument_group("bus").add_argument, role)
-
-
-def _add_bus(add: Callable[..., object], role: Role) -> None:
-    tool = role not in PORTS
-    default = "nowhere" if tool else f"{role}.sock in the runtime folder"
-    add(
-        "--listen",
-        action="append",
-        metavar="ENDPOINT",
-        help="zenoh endpoint to listen at: unixsock-stream//FOLDER/NAME.sock, tcp/127.0.0.1:PORT "
-        f"or tls/HOST:PORT (default {default}); may be repeated",
-    )
-    add(
-        "--connect",
-        action="append",
-        metavar="ENDPOINT",
-        help="zenoh endpoint of a peer to join (default: the others in the runtime folder); may be "
-        "repeated",
-    )
-    add(
-        "--keys",
-        metavar="FOLDER",
-        help="folder of keys, made by `tactile bus keys`: join over TLS, with the rights of its "
-        "certificate",
-    )
-    add(
-        "--insecure",
-        action="store_true",
-        help="ask nobody who joins for a proof, and allow endpoints that leave this machine: "
-        "whoever reaches them may read and command; all of a rig say it, or none",
-    )
-
-
 def bus_config(options: argparse.Namespace, table: BusTable, role: Role) -> BusConfig:
     """How to join the bus; flags win over the file."""
     return BusConfig(
@@ -122,16 +70,3 @@ def log_destination(options: argparse.Namespace, table: LogTable) -> Path | None
     if options.log is not None:
         return Path(options.log)
     return Path(table.destination) if table.enabled else None
-
-
-def finite_above_zero(text: str, unit: str) -> float:
-    """Number of a flag; `argparse.ArgumentTypeError` unless finite and above 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(
-            f"{printable(text)} given; allowed: a finite number of {unit} above 0"
-        )
-    return value

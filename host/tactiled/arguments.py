@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Callable, Sequence
-from importlib.metadata import version
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tactile_core.arguments import Parser
-from tactile_core.options import add_log_and_bus, finite_above_zero
-from tactiled.boards.line import KINDS, board_kind
+from tactile_core.cli import (
+    KINDS,
+    Parser,
+    add_log_and_bus,
+    hertz,
+    loaded,
+    seconds,
+    speed,
+    whole,
+)
 from tactiled.sensing.settings import METHODS
-from tactiled.settings import DEFAULT_BAUD, array_sizes
+
+DEFAULT_BAUD = 115_200
 
 EPILOG = """\
 examples:
@@ -24,7 +30,7 @@ examples:
   tactiled --mcap tactile-logs/board0_20250101T120000Z_0000.mcap
 
 boards that write in a way of their own are declared with
---board KIND:nFIELDS[,OPTION...]:
+--kind KIND:nFIELDS[,OPTION...]:
   KIND     floats, doubles (IEEE), int16, uint16 (less 32768), int32, text
   n        chips (magnetometers), 1 to 20
   FIELDS   order of each chip's numbers: x y z in uT, t in C (may be left
@@ -67,10 +73,10 @@ def make_parser() -> argparse.ArgumentParser:
         description="Reads taxel boards and publishes and logs calibrated forces and contact "
         "features.",
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("--version", action="version", version=f"tactiled {version('tactile-reach')}")
+    parser.show_version()
+    parser.former(board="kind")
     add("--list-ports", action="store_true", help="list serial ports and CAN interfaces, and exit")
     add("--config", type=Path, metavar="FILE", help="TOML file; flags win over it")
 
@@ -91,9 +97,9 @@ def make_parser() -> argparse.ArgumentParser:
         help="CAN bus INTERFACE:CHANNEL[@BITRATE][+fd], any python-can interface; may be repeated",
     )
     add(
-        "--board",
+        "--kind",
         action="append",
-        type=_kind,
+        type=loaded("tactiled.boards.line:kind_text"),
         metavar="KIND",
         help=f"what is on a serial port: {', '.join(KINDS)} (default auto: found out), or how it "
         "writes, as in floats:5xyz, text:5txyz, int16:5xyz,big,scale=0.15/0.242 (see below); once "
@@ -102,7 +108,7 @@ def make_parser() -> argparse.ArgumentParser:
     add(
         "--arrays",
         action="append",
-        type=_arrays,
+        type=loaded("tactiled.settings:array_sizes"),
         metavar="N+N",
         help="magnetometers of each AnySkin board on one controller, as in 5+5 (default: as the "
         "calibration file says, else fives)",
@@ -116,13 +122,13 @@ def make_parser() -> argparse.ArgumentParser:
     add(
         "--baud",
         action="append",
-        type=_whole("bit/s"),
+        type=whole("bit/s", least=1),
         metavar="BIT/S",
         help=f"of a serial port with a UART (default {DEFAULT_BAUD}); USB boards ignore it",
     )
     add(
         "--rate",
-        type=_above("Hz"),
+        type=hertz,
         metavar="HZ",
         help="sample rate to set (default: the board's own)",
     )
@@ -149,13 +155,13 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add(
         "--compensation-rate",
-        type=_above("Hz"),
+        type=hertz,
         metavar="HZ",
         help="new fits a second (default: every frame; 3 Hz for ransac, as in the paper)",
     )
     add(
         "--feature-rate",
-        type=_above("Hz"),
+        type=hertz,
         metavar="HZ",
         help="contact features a second (default: every frame; the paper has 15 Hz)",
     )
@@ -164,7 +170,7 @@ def make_parser() -> argparse.ArgumentParser:
 
     group = parser.add_argument_group("running")
     add = group.add_argument
-    add("--duration", type=_above("s"), metavar="S", help="stop after this many seconds")
+    add("--duration", type=seconds, metavar="S", help="stop after this many seconds")
     add(
         "--mcap",
         type=Path,
@@ -173,44 +179,10 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add(
         "--speed",
-        type=_speed,
+        type=speed,
         default=1.0,
         metavar="X",
         help="of a replay: times real time, or inf (default 1)",
     )
     add("--verbose", action="store_true", help="say more")
     return parser
-
-
-def _kind(text: str) -> str:
-    try:
-        board_kind(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-    return text
-
-
-def _arrays(text: str) -> tuple[int, ...]:
-    try:
-        return array_sizes(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def _above(unit: str) -> Callable[[str], float]:
-    return lambda text: finite_above_zero(text, unit)
-
-
-def _whole(unit: str) -> Callable[[str], int]:
-    def parse(text: str) -> int:
-        if not text.isdecimal() or int(text) == 0:
-            raise argparse.ArgumentTypeError(
-                f"{text} given; allowed: a whole number of {unit} above 0"
-            )
-        return int(text)
-
-    return parse
-
-
-def _speed(text: str) -> float:
-    return math.inf if text.lower() == "inf" else finite_above_zero(text, "times real time")

@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-import logging
-import signal
+import argparse
 import sys
-import threading
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from types import FrameType
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-
-from tactile_core.ending import leave
-from tactile_core.terminal import set_up_logging
-from tactile_core.types import monotonic_now, seconds_between
+from tactile_core.cli import DONE, REFUSED, USAGE, CommandError, set_up_logging
+from tactile_core.daemon import Ending, run, serve
 from tactiled.arguments import make_parser
-from tactiled.daemon import Daemon, StartError
-from tactiled.settings import Settings, SettingsError, make_settings
-from tactiled.status import REFRESH, StatusLines
-from tactiled.transports import list_ports
 
-log = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from tactiled.daemon import Daemon
+    from tactiled.status import StatusLines
 
 ARPHRD_CAN = "280"
 """Type of a CAN network in Linux (if_arp.h)."""
-
-DONE, FAILED, USAGE, REFUSED = range(4)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -34,81 +26,51 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Without ``argv`` this is the whole process, which then ends here.
     """
-    code = _main(argv)
-    if argv is None:
-        leave(code)
-    return code
+
+    def parser(ending: Ending) -> argparse.ArgumentParser:
+        parser = make_parser()
+        parser.set_defaults(func=partial(_run, ending))
+        return parser
+
+    return run(parser, argv)
 
 
-def _main(argv: Sequence[str] | None) -> int:
-    options = make_parser().parse_args(argv)
+def _run(ending: Ending, options: argparse.Namespace) -> int:
+    from rich.console import Console
+
     console = Console(stderr=True)
     set_up_logging(console, verbose=options.verbose)
     if options.list_ports:
         return _list_ports()
+
+    from tactiled.daemon import Daemon
+    from tactiled.settings import SettingsError, make_settings
+    from tactiled.status import StatusLines
+
     try:
-        settings = make_settings(options)
+        daemon = Daemon(make_settings(options))
     except SettingsError as error:
-        print(f"tactiled: {error}", file=sys.stderr)
-        return USAGE
-    stopping = threading.Event()
+        raise CommandError(str(error), USAGE) from error
 
-    def stop(number: int, _: FrameType | None) -> None:
-        stopping.set()
-        signal.signal(number, signal.SIG_DFL)  # a second one ends it at once
-
-    before = {n: signal.signal(n, stop) for n in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        return _run(settings, console, stopping)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _run(settings: Settings, console: Console, stopping: threading.Event) -> int:
-    daemon = Daemon(settings)
-    try:
-        daemon.start()
-    except StartError as error:
-        print(f"tactiled: {error}", file=sys.stderr)
-        return REFUSED
-    daemon.watchdog.ready("running")
-    try:
+    def work() -> int:
         with StatusLines(console, daemon.ports, daemon.recorder) as status:
-            trouble = _watch(daemon, status, stopping)
-    finally:
-        clean = daemon.stop()
-    code = _conclude(daemon, trouble)
-    if not clean:
-        log.warning("a thread did not end in time; leaving without it")
-        leave(code)
-    return code
+            trouble = _watch(daemon, status, ending)
+        if trouble is not None and daemon.failure is None:
+            raise CommandError(trouble, REFUSED)
+        return DONE
+
+    return serve(daemon, ending, "running", work)
 
 
-def _conclude(daemon: Daemon, trouble: str | None) -> int:
-    """Say how it ended; the exit status."""
-    if daemon.failure is not None:
-        thread, cause = daemon.failure
-        print(f"tactiled: thread {thread} failed: {cause}", file=sys.stderr)
-        return FAILED
-    if trouble is not None:
-        print(f"tactiled: {trouble}", file=sys.stderr)
-        return REFUSED
-    if daemon.recorder is not None:
-        log.info("log: %s", daemon.recorder.stats.path)
-        problem = daemon.recorder.trouble
-        if problem is not None:
-            print(f"tactiled: {problem}", file=sys.stderr)
-            return FAILED
-    return DONE
-
-
-def _watch(daemon: Daemon, status: StatusLines, stopping: threading.Event) -> str | None:
+def _watch(daemon: Daemon, status: StatusLines, ending: Ending) -> str | None:
     """Wait for the end; what kept the job from being done, None when it was."""
+    from tactile_core.types import monotonic_now, seconds_between
+    from tactiled.status import REFRESH
+
     settings = daemon.settings
     start = monotonic_now()
-    while not stopping.is_set() and not daemon.done.is_set():
-        stopping.wait(REFRESH)
+    while not ending.told.is_set() and not daemon.done.is_set():
+        ending.told.wait(REFRESH)
         status.show()
         trouble = None if settings.wait else daemon.trouble()
         if trouble is not None:
@@ -128,6 +90,8 @@ def _unserved(daemon: Daemon) -> str | None:
 
 
 def _list_ports() -> int:
+    from tactiled.transports import list_ports
+
     ports = list_ports()
     for port in ports:
         print(port)
@@ -135,7 +99,7 @@ def _list_ports() -> int:
     for bus in buses:
         print(f"socketcan:{bus}")
     if not ports and not buses:
-        print("no serial port and no CAN network is there", file=sys.stderr)
+        print("no serial port and no CAN network found", file=sys.stderr)
     return DONE
 
 

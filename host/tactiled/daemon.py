@@ -24,8 +24,8 @@ from tactile_core.bus.session import BusError, close_session, open_session
 from tactile_core.bus.streams import declare_alive
 from tactile_core.bus.topics import DIAGNOSTICS, alive_key
 from tactile_core.calibration import CalibrationError
+from tactile_core.daemon import Service, StartError
 from tactile_core.log.recorder import Recorder, RecorderError
-from tactile_core.supervision import Watchdog
 from tactile_core.types import Instant, WallClock, after, monotonic_now, seconds_between
 from tactiled import diagnostics
 from tactiled.board_session import Station
@@ -74,22 +74,16 @@ STOPPING = ServiceError("tactiled is stopping")
 """What whoever asks for something is told from then on."""
 
 
-class StartError(Exception):
-    """The daemon cannot start as asked; the message holds the remedy."""
+class Daemon(Service):
+    """tactiled between `start` and `stop`; used from the main thread."""
 
-
-class Daemon:
-    """Everything between `start` and `stop`; used from the main thread.
-
-    ``failure``: what a thread died of. ``done``: set when there is nothing more to do.
-    """
+    prog = "tactiled"
+    refusals = (BusError, RecorderError, TransportError, CalibrationError)
 
     def __init__(self, settings: Settings) -> None:
+        super().__init__()
         self.settings = settings
         self.ports: list[Port] = []
-        self.failure: tuple[str, BaseException] | None = None
-        self.done = threading.Event()
-        self.recorder: Recorder | None = None
         self._wall = WallClock.take()
         self._prefix = REPLAY_PREFIX if settings.replay else ""
         self._wake = Wake()
@@ -102,7 +96,6 @@ class Daemon:
         self._stopping = threading.Event()
         self._collector = Collector()
         self._log_state = "recording"
-        self.watchdog = Watchdog()
         self._alarms = Alarms()
         self._thread = threading.Thread(target=self._run, name="pipeline", daemon=True)
         ports = len(settings.ports)
@@ -113,25 +106,17 @@ class Daemon:
         """Boards known so far, in the order of their ports."""
         return [station for port in self.ports for station in list(port.stations.values())]
 
-    def start(self) -> None:
-        """Bring everything up; `StartError`, and everything down again, when that cannot be."""
+    def _start(self) -> None:
         sys.setswitchinterval(SWITCH_INTERVAL)
         return_large_buffers()
         if self._wall.problem:
             log.warning("%s", self._wall.problem)
         try:
-            self._start()
+            self._open()
         except zenoh.ZError as error:
-            self.stop()
-            raise StartError(f"the bus has closed by itself: {error}") from error
-        except (BusError, RecorderError, TransportError, CalibrationError) as error:
-            self.stop()
-            raise StartError(str(error)) from error
-        except StartError:
-            self.stop()
-            raise
+            raise BusError(f"the bus has closed by itself: {error}") from error
 
-    def _start(self) -> None:
+    def _open(self) -> None:
         settings = self.settings
         transports = [_make_transport(port, settings.speed) for port in settings.ports]
         self._session = session = open_session(settings.bus)
@@ -149,7 +134,7 @@ class Daemon:
         settings = self.settings
         replay = wanted.medium == "log"
         inbox = Inbox(self._wake, max_age=None if replay else MAX_AGE)
-        reader = PortReader(transport, inbox, outlet, wanted.name, self._fail, paced=replay)
+        reader = PortReader(transport, inbox, outlet, wanted.name, self.fail, paced=replay)
         self._readers.append(reader)
         reader.open(settings.wait and not replay)
         name = wanted.name
@@ -231,7 +216,6 @@ class Daemon:
         `Outlet.end` on nothing is published, so that no thread meets a closed session. False when
         a thread is still inside a driver, the disk or zenoh: it must be left behind.
         """
-        self.watchdog.stopping("stopping")
         self._stopping.set()
         self._alarms.stop()
         self._wake.ring()
@@ -295,7 +279,7 @@ class Daemon:
                 self._part(port)
             self._abandon_requests()
         except BaseException as error:  # noqa: BLE001 - thread boundary: the daemon must end loudly
-            self._fail(error)
+            self.fail(error)
 
     def _part(self, port: Port) -> None:
         """Let a port take its leave; one that cannot does not keep the others from it."""
@@ -379,13 +363,6 @@ class Daemon:
         text = f"log {stats.path}: {stats.state}" + (f" ({stats.last_error})" if not good else "")
         for station in self.stations:
             station.say_of_log(logging.INFO if good else logging.ERROR, text)
-
-    def _fail(self, error: BaseException) -> None:
-        if self.failure is None:
-            name = threading.current_thread().name
-            self.failure = (name, error)
-            log.critical("thread %s failed", name, exc_info=error)
-        self.done.set()
 
 
 def _as_recorded(

@@ -21,15 +21,15 @@ from tactile_core.bus.topics import NAME
 from tactile_core.calibration import CalibrationError, load
 from tactile_core.calibration.nominal import MAX_ANYSKIN_MAGNETOMETERS
 from tactile_core.can_bus import CanSpec
+from tactile_core.cli import KINDS
 from tactile_core.config import ConfigError, Count, Rate, given, load_toml, table_of, unit
 from tactile_core.log.recorder import RecorderSettings
 from tactile_core.options import BusTable, LogTable, bus_config, log_destination
-from tactiled.boards.line import KINDS, board_kind
+from tactiled.arguments import DEFAULT_BAUD
+from tactiled.boards.line import board_kind
 from tactiled.sensing.settings import PipelineSettings
 from tactiled.transports import listing
 from tactiled.transports.slcan import slcan_commands
-
-DEFAULT_BAUD = 115_200
 
 REPLAY_PREFIX = "replay"
 """First part of every key of a replay, so that nothing old is taken for live."""
@@ -216,9 +216,9 @@ def _ports(
             raise SettingsError(f"{len(names)} names for one log; give --name once: a board in it")
         return (PortSettings(names[0] if names else "", str(options.mcap), "log"),)
     if not given:
-        if names or options.board or options.arrays:
+        if names or options.kind or options.arrays:
             raise SettingsError(
-                "--name, --board and --arrays go with --port or --can; none is given"
+                "--name, --kind and --arrays go with --port or --can; none is given"
             )
         if file.board:
             return _ports_of_file(file.board, path)
@@ -231,13 +231,11 @@ def _ports(
             f"{len(names)} names for {len(given)} ports; give --name for every one, or for none"
         )
     serial = sum(medium == "serial" for medium, _ in given)
-    if not serial and set(options.board or ()) - {"auto", "tactile"}:
-        raise SettingsError(
-            f"--board {options.board[0]}: such boards are serial; give their --port"
-        )
+    if not serial and set(options.kind or ()) - {"auto", "tactile"}:
+        raise SettingsError(f"--kind {options.kind[0]}: such boards are serial; give their --port")
     if not serial and options.arrays:
         raise SettingsError("--arrays: boards on a CAN bus say it themselves; leave it out")
-    kinds = iter(_each("--board", options.board or ["auto"], serial))
+    kinds = iter(_each("--kind", options.kind or ["auto"], serial))
     sizes: list[tuple[int, ...] | None] = options.arrays or [None]
     arrays = iter(_each("--arrays", sizes, serial))
     bauds = iter(_each("--baud", options.baud or [DEFAULT_BAUD], serial))

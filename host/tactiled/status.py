@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from tactile_core.cli import LiveLines
 from tactile_core.geometry import Side
 from tactile_core.log.recorder import Recorder
-from tactile_core.terminal import LiveLines
 from tactile_core.types import Instant, monotonic_now, seconds_between
 from tactiled.blocks import Features
 from tactiled.board_session import Station

@@ -62,7 +62,7 @@ def plan_cupboard(request: CupboardRequest) -> list[Planned]:
         make_world(scene),
         request.settings,
         request.arm_faults,
-        np.random.default_rng([request.seed, 2]),
+        np.random.default_rng([request.boards.seed, 2]),
     )
     server = ArmServer(
         cupboard, request.arm, request.world, request.bus, partial(_another, request), make_world

@@ -115,6 +115,12 @@ _ROTATION = re.compile(
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
+def check_rotation(text: str) -> str:
+    """``text`` if `parse_rotation` takes it; ValueError."""
+    parse_rotation(text)
+    return text
+
+
 def parse_rotation(text: str) -> AttitudeScript:
     """Steady turn such as ``90deg/10s``, ``0.2rad/s``, ``360deg/20s@y`` or ``90deg/s@1,0,1``.
 

@@ -6,11 +6,11 @@ import argparse
 from collections import defaultdict
 
 import pytest
+from tactile_core.arguments import Parser
 
 from reachd.arguments import make_parser as reachd
 from reachd.cli import main
 from sim_device.arguments import make_parser as simdevice
-from tactile_core.arguments import Parser
 from tactile_tools.cli import build_parser as tactile
 from tactiled.arguments import make_parser as tactiled
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.cells import cell_len
 
+from tactile_core.cli import drops_text
 from tactile_core.geometry import Side
-from tactile_core.terminal import drops_text
 from tactiled.boards.line import bus_names
 from tactiled.cli import can_networks
 from tactiled.status import BAR, SIDES, Glimpse, bar, line

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from tactile_core import supervision
+from tactile_core import daemon as supervision
 from tactile_core.log.retention import DiskWatch
 from tactile_core.types import NS_PER_S, Instant, monotonic_now
 from tactile_tools.operate import health
@@ -100,7 +100,7 @@ def test_beats_come_twice_as_often_as_asked_for(
     monkeypatch.setenv(supervision.WATCHDOG_VARIABLE, microseconds)
     if pid is not None:
         monkeypatch.setenv(supervision.WATCHDOG_PID_VARIABLE, pid)
-    assert supervision.Watchdog().period == period
+    assert supervision.Watchdog().period_s == period
 
 
 def test_tactiled_says_when_it_is_ready_alive_and_stopping(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import os
 import subprocess
 import sys
@@ -12,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+from tactile_core.cli import FAILED, REFUSED, CommandError, require, seeds_of, working
 from tactile_tools.plot.series import LogUnreadableError
-from tactile_tools.processes import command, running, socket_at, wait_for
+from tactile_tools.processes import busy_text, command, running, socket_at, wait_for
 
 BOARD = "finger"
 
@@ -29,38 +31,14 @@ TIME_LIMIT_S = 30.0
 """The authors' 20 s, and what a busy machine takes: whatever is stale there holds the arm."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``demo`` to the umbrella command."""
-    parser = subparsers.add_parser(
-        "demo",
-        help="reach into a simulated cupboard with three processes, leave a log and a picture",
-        description="Starts a simulated cupboard with arm and finger, tactiled on the finger's "
-        "board, and reachd; prints the outcome, leaves a log and a picture of the reach. "
-        "Exit: 0 reached, 1 not reached, 2 bad argument, 3 refused by the system.",
-    )
-    parser.add_argument("--out", type=Path, default=Path("demo.mcap"), help="log to leave")
-    parser.add_argument("--png", type=Path, default=Path("demo.png"), help="picture to leave")
-    parser.add_argument("--strategy", default="hybrid_event", help="default %(default)s")
-    parser.add_argument("--scene", default="authors_sim", help="default %(default)s")
-    parser.add_argument(
-        "--seed",
-        type=int,
-        default=SEED,
-        help="of scene and trial (default %(default)s)",
-    )
-    parser.set_defaults(func=run)
-
-
 def run(options: argparse.Namespace) -> int:
     """Run the demo; the exit code says whether the target was reached."""
-    for flag, path in (("--out", options.out), ("--png", options.png)):
-        if not path.resolve().parent.is_dir():
-            print(
-                f"tactile demo: {flag} {path}: there is no folder {path.parent}; create it or "
-                "name another",
-                file=sys.stderr,
-            )
-            return 2
+    require("mujoco", extra="sim")
+    require("matplotlib", "scipy", extra="plot")
+    options.log, options.png = demo_files("demo", options)
+    options.scene_seed, options.seed = seeds_of(options, SEED)
+    if busy := busy_text():
+        print(f"note: {busy}; the reach may be held now and then, and fail", file=sys.stderr)
     from reachd.strategies import StrategyError, load_strategy
     from reachd.strategies.parameters import parameters
     from tactile_tools.plot.reach import draw_reach
@@ -72,28 +50,27 @@ def run(options: argparse.Namespace) -> int:
             code = _run(options, Path(name))
         if code not in (0, 1):
             return code
-        draw_reach(options.out, options.png)
-    except (BadArgumentError, StrategyError) as error:
-        print(f"tactile demo: {error}", file=sys.stderr)
-        return 2
+        with working("drawing"):
+            draw_reach(options.log, options.png)
+    except StrategyError as error:
+        raise CommandError(str(error)) from error
     except BrokenPipeError:
         raise  # whoever read our words has gone, which is the umbrella's affair
     except (RuntimeError, OSError, LogUnreadableError) as error:
-        print(f"tactile demo: {error}", file=sys.stderr)
-        return 3
-    print(f"wrote {options.out} and {options.png}")
+        busy = busy_text()
+        raise CommandError(f"{error}{'; ' if busy else ''}{busy}", REFUSED) from error
+    print(what_next(options.log, options.png))
+    if code == FAILED:
+        why = busy_text() or "the machine was not busy: the picture and the log say what held it"
+        print(f"tactile demo: the target was not reached; {why}", file=sys.stderr)
     return code
 
 
-class BadArgumentError(Exception):
-    """One of our commands refused what it was given; the text is its own."""
-
-
 def _ask(words: list[str]) -> str:
-    """What a command printed; `BadArgumentError` when it refused."""
+    """What a command printed; `CommandError` when it refused."""
     done = subprocess.run(words, check=False, capture_output=True, text=True)
     if done.returncode == 2:
-        raise BadArgumentError(done.stderr.strip().splitlines()[-1])
+        raise CommandError(done.stderr.strip().splitlines()[-1])
     if done.returncode != 0:
         raise RuntimeError(done.stderr.strip() or f"{words[0]} ended with {done.returncode}")
     return done.stdout.strip()
@@ -104,11 +81,41 @@ def _start_of(path: Path) -> bytes:
         return file.read(len(MAGIC))
 
 
-def _make_room(log: Path) -> None:
-    """Delete the log of an earlier demo; `BadArgumentError` for what is no log."""
+def demo_files(stem: str, options: argparse.Namespace) -> tuple[Path, Path]:
+    """Log and picture that a demo leaves: as named, or the first free numbers; `CommandError`.
+
+    Nothing is overwritten without --force, and with it only a log.
+    """
+    log, png = options.log, options.png
+    if log is None:
+        numbers = itertools.count(2)
+        log = Path(f"{stem}.mcap")
+        while not options.force and (log.exists() or (png is None and _beside(log).exists())):
+            log = Path(f"{stem}-{next(numbers)}.mcap")
+    png = _beside(log) if png is None else png
+    for flag, path in (("--log", log), ("--png", png)):
+        if not path.resolve().parent.is_dir():
+            raise CommandError(
+                f"{flag} {path}: no such folder: {path.parent}; create it or name another"
+            )
+        if path.exists() and not options.force:
+            raise CommandError(f"{flag} {path} exists: name another, or overwrite it with --force")
     if log.is_dir() or (log.exists() and _start_of(log) != MAGIC):
-        raise BadArgumentError(f"--out {log} is there and is no log: name another")
-    log.unlink(missing_ok=True)
+        raise CommandError(f"--log {log} exists and is not a log: name another")
+    return log, png
+
+
+def _beside(log: Path) -> Path:
+    return log.with_suffix(".png")
+
+
+def what_next(log: Path, png: Path) -> str:
+    """What was left, and what to do with it."""
+    return (
+        f"wrote {log} and {png}\n"
+        f"Next: open {png}; `tactile log info {log}` says what the log holds, `tactile plot {log} "
+        "--what forces` draws it otherwise, and Foxglove plays it."
+    )
 
 
 def _set(options: argparse.Namespace) -> str:
@@ -120,18 +127,29 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
     simdevice, tactiled, reachd = command("simdevice"), command("tactiled"), command("reachd")
     board = folder / BOARD
     calibration = folder / "finger.cal.toml"
-    scene = ["--scene", options.scene, "--seed", str(options.seed)]
+    scene = ["--scene", options.scene, "--scene-seed", str(options.scene_seed)]
     goal = _ask([simdevice, "cupboard", *scene, "--print-goal"])
     _ask([simdevice, "calibration", "--seed", str(options.seed), "--out", str(calibration)])
-    _make_room(options.out)
+    options.log.unlink(missing_ok=True)
     arm, skin, reach = (socket_at(folder, n) for n in ("arm", "tactiled", "reachd"))
-    cupboard = [simdevice, "cupboard", *scene, "--pty", str(board), "--listen", arm]
+    cupboard = [
+        simdevice,
+        "cupboard",
+        *scene,
+        "--seed",
+        str(options.seed),
+        "--pty",
+        str(board),
+        "--listen",
+        arm,
+    ]
     sensing = [
         *(tactiled, "--port", str(board), "--name", BOARD, "--calibration", str(calibration)),
         *("--listen", skin, "--connect", arm, "--no-log"),
     ]
     print(
-        f"A cupboard ({options.scene} {options.seed}), the target at {goal} m, three processes.",
+        f"A cupboard ({options.scene} {options.scene_seed}), the target at {goal} m, three "
+        "processes.",
         flush=True,
     )
     with contextlib.ExitStack() as stack:
@@ -143,7 +161,7 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
             [
                 *(reachd, "--strategy", options.strategy, "--target", goal),
                 *("--set", _set(options), "--time-limit", f"{TIME_LIMIT_S:g}"),
-                *("--board", BOARD, "--seed", str(options.seed), "--log", str(options.out)),
+                *("--board", BOARD, "--seed", str(options.seed), "--log", str(options.log)),
                 *("--listen", reach, "--connect", arm, "--connect", skin),
             ],
             # Its arm is its own: another reach on this machine is no reason to refuse this one.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -12,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_device.skin.indenter import load_script
+from tactile_core.cli import REFUSED, CommandError, require, working
 from tactile_core.geometry import finger
 from tactile_core.types import monotonic_now
+from tactile_tools.demo import demo_files, what_next
 from tactile_tools.plot.series import BoardSeries, LogUnreadableError, read_boards
-from tactile_tools.processes import command, running, socket_at, wait_for
+from tactile_tools.processes import busy_text, command, running, socket_at, wait_for
 
 SEED = 1
 ROTATE = "90deg/10s"
@@ -58,36 +59,16 @@ hold_s = 3.0
 """
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``demo-skin`` to the umbrella command."""
-    parser = subparsers.add_parser(
-        "demo-skin",
-        help="press and rotate simulated boards under tactiled, leave a log and a picture",
-        description="Starts a simulated finger (serial) and a simulated AnySkin board, runs "
-        "tactiled on both, presses and turns the finger, and leaves a log and a picture.",
-    )
-    parser.add_argument("--out", type=Path, default=Path("demo-skin.mcap"), help="log to leave")
-    parser.add_argument("--png", type=Path, default=Path("demo-skin.png"), help="picture to leave")
-    parser.add_argument(
-        "--duration", type=float, default=24.0, metavar="S", help="how long, s (default 24)"
-    )
-    parser.set_defaults(func=run)
-
-
 def run(options: argparse.Namespace) -> int:
     """Run the demo; 0 only when a log with contacts and a picture were left."""
-    if not options.duration > 0 or options.duration > 600:
-        print(
-            f"tactile demo-skin: --duration {options.duration:g}; allowed: above 0, at most 600 s",
-            file=sys.stderr,
-        )
-        return 2
+    require("matplotlib", "scipy", extra="plot")
+    options.log, options.png = demo_files("demo-skin", options)
     with tempfile.TemporaryDirectory(prefix="tactile-demo-") as folder:
         try:
             return _run(options, Path(folder))
         except (RuntimeError, LogUnreadableError, OSError) as error:
-            print(f"tactile demo-skin: {error}", file=sys.stderr)
-            return 3
+            busy = busy_text()
+            raise CommandError(f"{error}{'; ' if busy else ''}{busy}", REFUSED) from error
 
 
 def _run(options: argparse.Namespace, folder: Path) -> int:
@@ -101,14 +82,14 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
         stdout=subprocess.DEVNULL,
     )
     boards = [simdevice, "boards", "--seed", str(SEED), "--rotate", ROTATE]
-    options.out.unlink(missing_ok=True)
+    options.log.unlink(missing_ok=True)
     print(
         f"A simulated finger turning {ROTATE} in a 50 µT field while it is pressed, "
         "and a simulated AnySkin board."
     )
     with (
         running([*boards, "--pty", str(finger_port), "--press", str(press)], folder / "a") as first,
-        running([*boards, "--pty", str(skin_port), "--board", "anyskin"], folder / "b") as second,
+        running([*boards, "--pty", str(skin_port), "--kind", "anyskin"], folder / "b") as second,
     ):
         wait_for(finger_port, first, folder / "a")
         power_on = monotonic_now()
@@ -125,22 +106,23 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
                     str(calibration),
                 ),
                 *("--port", str(skin_port), "--name", "skin"),
-                *("--log", str(options.out), "--duration", str(options.duration)),
+                *("--log", str(options.log), "--duration", str(options.duration)),
                 *("--listen", socket_at(folder, "tactiled")),
             ],
             check=False,
         )
     if done.returncode != 0:
         raise RuntimeError(f"tactiled ended with exit code {done.returncode}; see above")
-    series = read_boards(options.out)
+    series = read_boards(options.log)
     board = series["finger"]
     time = np.asarray(board.feature_time)
     applied = _applied(press, time + (board.start_ns - power_on) * 1e-9)
     _summarise(board, applied)
     from tactile_tools.plot.skin import draw
 
-    draw(board, options.png, applied=(time, applied.sum(axis=1)))
-    print(f"wrote {options.out} and {options.png}")
+    with working("drawing"):
+        draw(board, options.png, applied=(time, applied.sum(axis=1)))
+    print(what_next(options.log, options.png))
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import signal
 import socket
@@ -13,6 +14,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 PORT_WAIT_S = 60.0  # a loaded machine needs some seconds to import numpy twice
+
+
+def busy_text() -> str:
+    """That this machine is busy, if so: more processes want to run than it has cores."""
+    load, cores = os.getloadavg()[0], os.cpu_count() or 1
+    if load < 1.5 * cores:
+        return ""
+    return f"the machine is busy (load {load:.1f} on {cores} cores): try again when it is not"
 
 
 def free_port() -> int:

@@ -154,19 +154,19 @@ class Diagnosis:
                 "(tactiled --list-ports)",
             )
         other = "auto or tactile" if self._kind not in ("auto", "tactile") else "auto"
-        kind = f", or give --board {other}" if self._kind != "auto" else ""
+        kind = f", or give --kind {other}" if self._kind != "auto" else ""
         baud = f"the baud rate may be wrong (--baud, now {self._baud}), or " if self._uart else ""
         return Diagnosed(
             f"{port} sends {self._total} bytes in {asked} and no valid frame among them",
             f"{baud}the device speaks something else than our protocol or AnySkin's: declare it "
-            f"with --board (see tactiled --help){kind}",
+            f"with --kind (see tactiled --help){kind}",
         )
 
     def _declare(self, finding: Finding) -> str:
         """How to have ``finding`` read."""
         if not finding.declare:
-            return "see sensor_proto/PROTOCOL.md, section 9, for what can be declared with --board"
-        remedy = f"declare it with --board {' or --board '.join(finding.declare)}"
+            return "see sensor_proto/PROTOCOL.md, section 9, for what can be declared with --kind"
+        remedy = f"declare it with --kind {' or --kind '.join(finding.declare)}"
         if finding.declare[0].partition(":")[0] in COUNTS:
             xy, _, z = COUNT_UT
             remedy += f" (scale={xy:g}/{z:g} µT a count is meant: the MLX90393 at gain 7)"

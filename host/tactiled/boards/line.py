@@ -16,6 +16,7 @@ from sensor_proto.framing import SerialDecoder, encode_serial
 from sensor_proto.layouts import FORM, Framing, Kind, Layout, LayoutDecoder, TextDecoder
 from sensor_proto.packets import FloatSamples, HostMessage, Identify, Message, Received, Reject
 from sensor_proto.survey import Finding, Survey
+from tactile_core.cli import KINDS
 from tactile_core.types import NS_PER_S, Instant, after
 from tactiled.blocks import Chunk
 from tactiled.boards.board import BoardLink, State
@@ -23,9 +24,6 @@ from tactiled.boards.diagnosis import NOTHING_AFTER, Diagnosis
 from tactiled.boards.events import Diagnosed, Event, Found, Identity, Refusal
 from tactiled.boards.float_board import FloatLink
 from tactiled.transports.base import Medium
-
-KINDS = ("auto", "tactile", "anyskin", "reskin", "eflesh")
-"""What --board takes besides a layout; the last three are the same boards."""
 
 FLOAT_MODEL = "anyskin"
 """What calibrations call boards that send floats."""
@@ -282,12 +280,18 @@ USUAL = Layout(Kind.FLOATS, 1, "txyz", framing=Framing(end=b"\r\n"))
 
 
 def board_kind(text: str) -> Layout | None:
-    """Layout that ``--board`` declares, None for one of `KINDS`; ValueError for anything else."""
+    """Layout that ``--kind`` declares, None for one of `KINDS`; ValueError for anything else."""
     if text in KINDS:
         return None
     if ":" not in text:
         raise ValueError(f"board kind {text!r}; allowed: {', '.join(KINDS)}, or a layout: {FORM}")
     return Layout.parse(text)
+
+
+def kind_text(text: str) -> str:
+    """``text`` if it is a kind of board, see `board_kind`; ValueError."""
+    board_kind(text)
+    return text
 
 
 # A CAN bus as a line: boards found by a broadcast question, one link each. Pure.

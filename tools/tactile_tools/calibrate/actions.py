@@ -21,26 +21,21 @@ from tactile_core.calibration import (
     save,
 )
 from tactile_core.calibration.file import SUFFIX
+from tactile_core.cli import DONE, REFUSED, CommandError, require
 
 if TYPE_CHECKING:
     from tactile_tools.calibrate.evaluate import Judged
     from tactile_tools.calibrate.recording import Recording
 
-BAD_INPUT, REFUSED = 2, 3
 
-
-class ActionError(Exception):
-    """Why a command cannot go on, and the exit code that says so."""
-
-    def __init__(self, message: str, code: int = BAD_INPUT) -> None:
-        super().__init__(message)
-        self.code = code
+class ActionError(CommandError):
+    """Why a command cannot go on."""
 
 
 def guarded(
     run: Callable[[argparse.Namespace], None],
 ) -> Callable[[argparse.Namespace], int]:
-    """Command that prints what was refused, never a traceback."""
+    """``run`` as a command: what was refused is a `CommandError`."""
 
     def command(options: argparse.Namespace) -> int:
         from tactile_tools.calibrate.recording import RecordingError
@@ -48,17 +43,10 @@ def guarded(
         try:
             run(options)
         except (RecordingError, CalibrationError) as error:
-            return _complain(str(error), BAD_INPUT)
-        except ActionError as error:
-            return _complain(str(error), error.code)
-        return 0
+            raise ActionError(str(error)) from error
+        return DONE
 
     return command
-
-
-def _complain(message: str, code: int) -> int:
-    print(f"tactile calibrate: {message}", file=sys.stderr)
-    return code
 
 
 def _info(options: argparse.Namespace) -> None:
@@ -71,14 +59,22 @@ def _info(options: argparse.Namespace) -> None:
         Console(soft_wrap=True).print(as_text(calibration), markup=False, highlight=False)
 
 
+def _require(options: argparse.Namespace) -> None:
+    """Refuse what needs the extra ``calibrate`` where it is not installed."""
+    require("scipy", "sklearn", extra="calibrate")
+    if options.report is not None:
+        require("matplotlib", extra="calibrate", what="--report")
+
+
 def _evaluate(options: argparse.Namespace) -> None:
+    _require(options)
     from tactile_tools.calibrate.assemble import group
     from tactile_tools.calibrate.evaluate import leave_one_out, tail20
     from tactile_tools.calibrate.fit import require_alike
     from tactile_tools.calibrate.results import as_json, table
     from tactile_tools.calibrate.source import open_recordings
 
-    recordings = open_recordings(options.recordings, options.name, options.target)
+    recordings = open_recordings(options.recordings, options.board, options.measured)
     _check_folder(options.report)
     judged = []
     with _watching() as progress:
@@ -102,6 +98,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 
 def _fit(options: argparse.Namespace) -> None:
+    _require(options)
     from tactile_tools.calibrate.assemble import board, fitted, group
     from tactile_tools.calibrate.describe import as_text
     from tactile_tools.calibrate.fit import require_alike
@@ -114,7 +111,7 @@ def _fit(options: argparse.Namespace) -> None:
         raise ActionError(f"--out {out}: there is no folder {out.parent}; create it", REFUSED)
     if out.is_dir():
         raise ActionError(f"--out {out} is a folder; name a file", REFUSED)
-    recordings = open_recordings(options.recordings, options.name, options.target)
+    recordings = open_recordings(options.recordings, options.board, options.measured)
     require_alike(recordings)
     _check_folder(options.report)
     base = _base(options.base, recordings[0])

@@ -1,63 +1,80 @@
-"""``tactile calibrate``: fit, evaluate, info, record."""
+"""The command line of ``tactile calibrate``."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from tactile_core.options import add_bus, finite_above_zero
-from tactile_tools.calibrate import actions
+from tactile_core.cli import (
+    KINDS,
+    Command,
+    Parser,
+    add_board,
+    add_bus,
+    add_commands,
+    add_json,
+    add_out,
+    add_path,
+    later,
+    seconds,
+    shown,
+)
+
+HERE = "tactile_tools.calibrate.cli"
+ACTIONS = "tactile_tools.calibrate.actions"
+
+COMMANDS = {
+    "fit": Command("choose and fit a model, write a calibration file", f"{HERE}:_fit"),
+    "evaluate": Command("errors of models on samples they were not fitted to", f"{HERE}:_evaluate"),
+    "record": Command("record rest, presses and turns of a board for `fit`", f"{HERE}:_record"),
+    "info": Command("what a calibration file says of itself", f"{HERE}:_info"),
+}
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``calibrate`` to the umbrella command."""
-    parser = subparsers.add_parser(
-        "calibrate",
-        help="fit models of a board's own force to recordings, and judge them",
-        description="Makes calibration files from recordings: a folder with sensor.csv and "
-        "states.csv, or a log (.mcap) with a reference force in it, such as `record` writes.",
+def fill(parser: Parser) -> None:
+    """Add the options of ``tactile calibrate``."""
+    parser.description = (
+        "Makes calibration files from recordings: a folder with sensor.csv and "
+        "states.csv, or a log (.mcap) with a reference force in it, such as `record` writes."
     )
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    _add_fit(commands)
-    _add_evaluate(commands)
-    _add_record(commands)
-    info = commands.add_parser("info", help="what a calibration file says of itself")
-    info.add_argument("file", type=Path, metavar="FILE", help="a .cal.toml file")
-    info.add_argument("--json", action="store_true", help="as JSON on standard output")
-    info.set_defaults(func=actions.info)
+    add_commands(parser, COMMANDS)
 
 
-def _add_recordings(parser: argparse.ArgumentParser) -> None:
+def _info(parser: Parser) -> None:
+    parser.add_argument("file", type=Path, metavar="FILE", help="a .cal.toml file")
+    add_json(parser)
+    parser.set_defaults(func=later(f"{ACTIONS}:info"))
+
+
+def _add_recordings(parser: Parser) -> None:
+    parser.former(name="board", target="measured")
     parser.add_argument(
         "recordings", type=Path, nargs="+", metavar="RECORDING", help="log, or folder of a CSV pair"
     )
-    parser.add_argument("--name", help="board to read of a log that holds several")
+    add_board(parser, "to read of a log that holds several")
     parser.add_argument(
-        "--target",
+        "--measured",
         choices=("normal", "shear"),
         help="what the load cell of a CSV pair measured (default: shear if the folder's name "
         "begins so, else normal)",
     )
-    parser.add_argument(
-        "--report",
-        type=Path,
-        metavar="FOLDER",
-        help="write pictures of what the model does, and a page that shows them, to FOLDER",
+    add_path(
+        parser, "--report", "folder for pictures of what the model does, and a page that shows them"
     )
 
 
-def _add_fit(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = commands.add_parser(
-        "fit",
-        help="choose and fit a model, write a calibration file",
-        description="Chooses among linear, cubic and history-aware models by cross-validation that "
+def _fit(parser: Parser) -> None:
+    parser.description = (
+        "Chooses among linear, cubic and history-aware models by cross-validation that "
         "leaves out blocks of time and whole recordings, fits the best to everything, and writes "
         "it with its error figures. Recordings of different targets (force, place) make one model "
-        "each, in one file.",
+        "each, in one file."
     )
     _add_recordings(parser)
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="FILE.cal.toml")
-    parser.add_argument("--serial", help="serial number of the board (a log has its own)")
+    add_out(parser, "FILE.cal.toml to write", required=True, force="")
+    parser.add_argument(
+        "--serial", metavar="HEX", help="serial number of the board (a log has its own)"
+    )
     parser.add_argument(
         "--base",
         type=Path,
@@ -65,34 +82,35 @@ def _add_fit(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         help="calibration to take places and matrices of taxels from (default: what the log was "
         "recorded with, or typical figures)",
     )
-    parser.set_defaults(func=actions.fit_command)
+    parser.set_defaults(func=later(f"{ACTIONS}:fit_command"))
 
 
-def _add_evaluate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = commands.add_parser(
-        "evaluate",
-        help="errors of models on samples they were not fitted to",
-        description="tail20: each recording by itself, chosen and fitted on its first 80 % of "
+def _evaluate(parser: Parser) -> None:
+    parser.description = (
+        "tail20: each recording by itself, chosen and fitted on its first 80 % of "
         "frames, tested on the rest. leave-one-out: each recording whole, by a model of all the "
-        "others. Labels of -1 (no reading) are not scored.",
+        "others. Labels of -1 (no reading) are not scored."
     )
     _add_recordings(parser)
     parser.add_argument("--split", choices=("tail20", "leave-one-out"), default="tail20")
-    parser.add_argument("--json", action="store_true", help="as JSON on standard output")
-    parser.set_defaults(func=actions.evaluate_command)
+    add_json(parser)
+    parser.set_defaults(func=later(f"{ACTIONS}:evaluate_command"))
 
 
-def _add_record(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = commands.add_parser(
-        "record",
-        help="ask for rest, presses and turns, and record them for `fit`",
-        description="Records one board of a running tactiled (or, with --port, of its own) while "
-        "you press it with known weights or a force gauge. Answers are read from standard input.",
+def _record(parser: Parser) -> None:
+    parser.description = (
+        "Records one board of a running tactiled (or, with --port, of its own) while "
+        "you press it with known weights or a force gauge. Answers are read from standard input."
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="FILE.mcap, new")
-    parser.add_argument("--name", default="board0", help="board, as tactiled names it (board0)")
-    parser.add_argument("--port", help="serial port to run tactiled on (default: one that runs)")
-    parser.add_argument("--board", default="auto", help="kind of board on --port (auto)")
+    parser.former(name="board")
+    add_out(parser, "FILE.mcap, new", required=True, force="")
+    add_board(parser, "as tactiled has it (default board0)", default="board0", type=_not_a_kind)
+    parser.add_argument(
+        "--port", metavar="P", help="serial port to run tactiled on (default: one that runs)"
+    )
+    parser.add_argument(
+        "--kind", default="auto", metavar="KIND", help="of board on --port (default auto)"
+    )
     parser.add_argument(
         "--calibration", type=Path, metavar="FILE", help="what tactiled runs the board with"
     )
@@ -102,11 +120,16 @@ def _add_record(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         ("turn", 20.0, "recorded of the turning board"),
     ):
         parser.add_argument(
-            f"--{name}", type=_seconds, default=default, metavar="S", help=f"s {what} ({default:g})"
+            f"--{name}", type=seconds, default=default, metavar="S", help=f"s {what} ({default:g})"
         )
     add_bus(parser, "tool")
-    parser.set_defaults(func=actions.record_command)
+    parser.set_defaults(func=later(f"{ACTIONS}:record_command"))
 
 
-def _seconds(text: str) -> float:
-    return finite_above_zero(text, "s")
+def _not_a_kind(text: str) -> str:
+    """A board's name: --board took a kind until it came to be a name in every command."""
+    if text in KINDS or ":" in text:
+        raise argparse.ArgumentTypeError(
+            f"{shown(text)} is a kind of board, not a name: give it with --kind"
+        )
+    return text

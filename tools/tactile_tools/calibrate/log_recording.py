@@ -187,7 +187,7 @@ def _which(path: Path, boards: dict[str, _Board], name: str | None) -> str:
             "make such a log with `tactile calibrate record`"
         )
     if len(usable) > 1:
-        raise RecordingError(f"{path}: holds boards {', '.join(usable)}; say which with --name")
+        raise RecordingError(f"{path}: holds boards {', '.join(usable)}; say which with --board")
     return usable[0]
 
 

@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from tactile_core.bus.session import BusConfig, BusError, close_session, open_session
+from tactile_core.cli import REFUSED
 from tactile_core.log.recorder import Recorder, RecorderError, RecorderSettings
 from tactile_core.options import BusTable, bus_config
-from tactile_tools.calibrate.actions import REFUSED, ActionError
+from tactile_tools.calibrate.actions import ActionError
 from tactile_tools.calibrate.live import LiveBoard, refuse_existing
 from tactile_tools.calibrate.wizard import Timing, Wizard, WizardError
 from tactile_tools.processes import command, running, socket_at
@@ -37,7 +38,7 @@ def record(options: argparse.Namespace) -> None:
         except RecorderError as error:
             raise ActionError(str(error), REFUSED) from error
         try:
-            presses = _record(options, LiveBoard(session, recorder, options.name), ended)
+            presses = _record(options, LiveBoard(session, recorder, options.board), ended)
         except WizardError as error:
             raise ActionError(str(error), REFUSED) from error
         except EOFError as error:
@@ -80,8 +81,8 @@ def _bus(options: argparse.Namespace) -> Iterator[tuple[BusConfig, Callable[[], 
         return
     with tempfile.TemporaryDirectory(prefix="tactile-record-") as folder:
         endpoint = socket_at(Path(folder), "tactiled")
-        words = [command("tactiled"), "--port", options.port, "--name", options.name, "--no-log"]
-        words += ["--board", options.board, "--listen", endpoint]
+        words = [command("tactiled"), "--port", options.port, "--name", options.board, "--no-log"]
+        words += ["--kind", options.kind, "--listen", endpoint]
         if options.calibration is not None:
             words += ["--calibration", str(options.calibration)]
         said = Path(folder) / "tactiled"

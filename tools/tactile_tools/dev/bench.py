@@ -19,6 +19,7 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from sim_device.world.engines import EngineMissing
+from tactile_core.cli import CommandError
 
 Figures = dict[str, float]
 
@@ -189,63 +190,33 @@ AIMS: Mapping[str, Aim] = {
 }
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``bench`` to the umbrella command."""
-    parser = subparsers.add_parser(
-        "bench",
-        help="measure every promised figure",
-        description="Measures every promised figure in one run. What is compared is measured side "
-        "by side, because machines are shared and noisy. Groups: "
-        + "; ".join(f"{g.name} ({g.what})" for g in GROUPS)
-        + ".",
-    )
-    parser.add_argument(
-        "--json",
-        type=Path,
-        metavar="FILE",
-        help="write the figures to FILE; with --only, those of other groups in it are kept",
-    )
-    parser.add_argument(
-        "--only",
-        nargs="+",
-        type=_group_of,
-        metavar="NAME",
-        help="measure these groups only, or the groups of these figures",
-    )
-    parser.add_argument(
-        "--quick",
-        action="store_true",
-        help="shorter runs (some minutes in all); rougher figures",
-    )
-    parser.set_defaults(func=run)
-
-
 def _group_of(name: str) -> str:
     """Name of the group that is called ``name`` or has a figure called so."""
     for group in GROUPS:
         if name in (group.name, *group.promised):
             return group.name
     groups = ", ".join(g.name for g in GROUPS)
-    raise argparse.ArgumentTypeError(
-        f"{name!r} is no group and no figure; groups: {groups}; figures: {', '.join(AIMS)}"
+    raise CommandError(
+        f"{name!r} is not a group or a figure; groups: {groups}; figures: {', '.join(AIMS)}"
     )
 
 
 def run(options: argparse.Namespace) -> int:
     """Measure and print; 0 when every group ran, whether or not its aims were met."""
     console = Console()
-    chosen = [g for g in GROUPS if (not g.asked if not options.only else g.name in options.only)]
-    if options.json is not None and not options.json.resolve().parent.is_dir():
+    only = None if not options.only else [_group_of(name) for name in options.only]
+    chosen = [g for g in GROUPS if (not g.asked if only is None else g.name in only)]
+    if options.out is not None and not options.out.resolve().parent.is_dir():
         print(
-            f"tactile bench: --json {options.json}: there is no folder {options.json.parent}; "
+            f"tactile bench: --out {options.out}: there is no folder {options.out.parent}; "
             "create it or name another",
             file=sys.stderr,
         )
         return 2
     try:
-        kept = {} if options.only is None else _earlier(options.json)
+        kept = {} if only is None else _earlier(options.out)
     except ValueError as error:
-        print(f"tactile bench: --json {options.json}: {error}", file=sys.stderr)
+        print(f"tactile bench: --out {options.out}: {error}", file=sys.stderr)
         return 2
     figures: Figures = {}
     loads: dict[str, object] = {}
@@ -270,7 +241,7 @@ def run(options: argparse.Namespace) -> int:
             progress.update(task, total=1, completed=1)
     console.print(table(figures))
     console.print(f"load average (1 min) while measuring: {_range_of_loads(loads)}")
-    if options.json is not None:
+    if options.out is not None:
         all_figures = kept.get("figures", {}) | figures
         report = {
             "version": version("tactile-reach"),
@@ -284,8 +255,8 @@ def run(options: argparse.Namespace) -> int:
             },
             "groups": kept.get("groups", {}) | loads,
         }
-        options.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-        console.print(f"wrote {options.json}")
+        options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        console.print(f"wrote {options.out}")
     return 0
 
 

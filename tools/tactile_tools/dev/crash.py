@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import shutil
 import signal
@@ -28,7 +27,6 @@ from rich.progress import Progress
 from tactile_core.log.info import LogInfo, info
 from tactile_core.log.records import LogError
 from tactile_core.log.recovery import recover
-from tactile_core.options import finite_above_zero
 from tactile_core.types import NS_PER_S
 from tactile_tools.dev.crash_writer import TRUTH
 
@@ -80,50 +78,6 @@ class Result:
     problems: list[str] = field(default_factory=list)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``crash`` to the ``tactile`` command."""
-    parser = subparsers.add_parser(
-        "crash",
-        help="kill processes that log, and check that every file reads and recovers",
-        description="Start processes that log, kill -9 each at a random moment, and check that "
-        "every file they leave reads and recovers with at most 1 s lost.",
-    )
-    parser.add_argument("--kills", type=_positive, default=1000, help="kills in all (1000)")
-    parser.add_argument("--writers", type=_positive, default=6, help="processes at a time (6)")
-    parser.add_argument("--seed", type=int, default=0, help="of the random moments (0)")
-    parser.add_argument(
-        "--processes",
-        action="store_true",
-        help="kill simulator, tactiled and reachd while they reach, and check that the arm rests",
-    )
-    parser.add_argument(
-        "--from-kill", type=_natural, default=0, metavar="N", help="with --processes: go on at N"
-    )
-    parser.add_argument(
-        "--seconds",
-        type=lambda text: finite_above_zero(text, "s"),
-        default=math.inf,
-        metavar="S",
-        help="with --processes: begin no kill after so many seconds",
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the result here")
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the logs of failed kills")
-    parser.set_defaults(func=run)
-
-
-def _positive(text: str) -> int:
-    value = int(text) if text.isdecimal() else 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} given; allowed: a whole number above 0")
-    return value
-
-
-def _natural(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} given; allowed: a whole number, 0 or more")
-    return int(text)
-
-
 def _run_processes(options: argparse.Namespace) -> int:
     """Kill the three processes; 0 when the arm rested each time and every log was read."""
     from tactile_tools.dev.process_kills import run_kills, write_json
@@ -131,9 +85,9 @@ def _run_processes(options: argparse.Namespace) -> int:
     console = Console(stderr=True)
 
     def save(values: dict[str, Any]) -> None:
-        if options.json is not None:
-            options.json.parent.mkdir(parents=True, exist_ok=True)
-            write_json(options.json, values)
+        if options.out is not None:
+            options.out.parent.mkdir(parents=True, exist_ok=True)
+            write_json(options.out, values)
 
     try:
         with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
@@ -142,7 +96,7 @@ def _run_processes(options: argparse.Namespace) -> int:
                 options.kills,
                 options.seed,
                 first=options.from_kill,
-                seconds=options.seconds,
+                seconds=options.duration,
                 progress=lambda done: bar.advance(task, done),
                 save=save,
             )
@@ -185,12 +139,12 @@ def run(options: argparse.Namespace) -> int:
     result.cores, result.load_average = os.cpu_count() or 0, round(os.getloadavg()[1], 1)
     result.seconds = round(time.monotonic() - started, 1)
     text = json.dumps(asdict(result), indent=2)
-    if options.json is not None:
+    if options.out is not None:
         try:
-            options.json.parent.mkdir(parents=True, exist_ok=True)
-            options.json.write_text(text + "\n", encoding="utf-8")
+            options.out.parent.mkdir(parents=True, exist_ok=True)
+            options.out.write_text(text + "\n", encoding="utf-8")
         except OSError as error:
-            print(f"tactile crash: cannot write {options.json}: {error.strerror}", file=sys.stderr)
+            print(f"tactile crash: cannot write {options.out}: {error.strerror}", file=sys.stderr)
             return 3
     print(text)
     return 1 if result.problems else 0

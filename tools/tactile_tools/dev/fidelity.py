@@ -18,10 +18,9 @@ from rich.progress import track
 from rich.table import Table
 
 from reachd.strategies.parameters import parameters
-from sim_device.world.engines import ENGINES, make_world
+from sim_device.world.engines import make_world
 from sim_device.world.recorded_scenes import load_outcomes, load_recorded
 from sim_device.world.scene_loading import (
-    FOLDER_VARIABLE,
     RECORDED_SCENES,
     find_recorded,
 )
@@ -59,52 +58,12 @@ class Trial:
     ejected: int
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``fidelity`` to the umbrella command."""
-    parser = subparsers.add_parser(
-        "fidelity",
-        help="compare our engine with recorded outcomes of the authors' simulator",
-        description="Runs every strategy on recorded scenes and compares outcomes trial by trial "
-        "with the reference, beside the agreement of our own repeated runs with starts moved by "
-        "0.1 mm: the ceiling that chance allows.",
-    )
-    parser.add_argument(
-        "--scenes",
-        type=Path,
-        metavar="FILE",
-        help=f"recorded scenes (default: {RECORDED_SCENES} in the folder that {FOLDER_VARIABLE} "
-        "names)",
-    )
-    parser.add_argument(
-        "--outcomes",
-        type=Path,
-        metavar="FILE",
-        help="what the reference did there (default: beside the scenes, outcomes_1_60.csv of "
-        "scenes_1_60.json.gz)",
-    )
-    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
-    parser.add_argument("--depth", choices=("contacts", "taxels"), default="contacts")
-    parser.add_argument(
-        "--repeats", type=int, default=2, help="perturbed runs (default 2; 0: no ceiling)"
-    )
-    parser.add_argument("--most", type=int, help="scenes to use (default all)")
-    parser.add_argument("--jobs", type=int, default=multiprocessing.cpu_count())
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    parser.set_defaults(func=run)
-
-
 def run(options: argparse.Namespace) -> int:
     """Run, print and write the comparison; 0 when all of it ran."""
     console = Console()
-    if options.repeats < 0 or options.jobs < 1 or (options.most is not None and options.most < 1):
-        print(
-            "tactile fidelity: --repeats is at least 0, --jobs and --most are at least 1",
-            file=sys.stderr,
-        )
-        return 2
     try:
-        file = options.scenes or find_recorded(RECORDED_SCENES)
-        scenes = load_recorded(file)[: options.most]
+        file = options.recorded or find_recorded(RECORDED_SCENES)
+        scenes = load_recorded(file)[: options.limit]
         outcomes = load_outcomes(options.outcomes or outcomes_of(file))
     except (SceneError, OSError) as error:
         print(f"tactile fidelity: {error}", file=sys.stderr)
@@ -129,7 +88,7 @@ def run(options: argparse.Namespace) -> int:
         for strategy in STRATEGIES
     }
     console.print(_table(summary, len(scenes)))
-    if options.json is not None:
+    if options.out is not None:
         report = {
             "engine": options.engine,
             "depth": options.depth,
@@ -142,8 +101,8 @@ def run(options: argparse.Namespace) -> int:
             },
             "trials": [asdict(t) for t in trials],
         }
-        options.json.write_text(json.dumps(report) + "\n", encoding="utf-8")
-        console.print(f"wrote {options.json}")
+        options.out.write_text(json.dumps(report) + "\n", encoding="utf-8")
+        console.print(f"wrote {options.out}")
     return 0
 
 

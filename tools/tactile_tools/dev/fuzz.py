@@ -11,19 +11,16 @@ import json
 import logging
 import math
 import multiprocessing
-import os
 import platform
 import sys
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_core.options import finite_above_zero
 from tactile_tools.dev.fuzzers.can import CanFuzzer
 from tactile_tools.dev.fuzzers.serial import SerialFuzzer
 
@@ -212,78 +209,22 @@ def _add(total: Totals, more: Totals) -> None:
             total[name] = total.get(name, 0) + value
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the subcommand ``fuzz``."""
-    parser = subparsers.add_parser(
-        "fuzz",
-        help="spoil frames and check that none is accepted wrongly",
-        description="Spoil serial frames and CAN transfers in every way and check that every "
-        "message that the decoders accept is one that was sent. Exit code 1 if one was not.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    parser.add_argument("--frames", type=_positive, default=1_000_000, help="frames to spoil")
-    parser.add_argument("--seed", type=_natural, default=1, help="of all random choices")
-    parser.add_argument(
-        "--through",
-        choices=("decoder", "pipeline"),
-        default="decoder",
-        help="decoder: spoilt frames; pipeline: frames with right CRCs that say anything",
-    )
-    parser.add_argument(
-        "--from-block",
-        type=_natural,
-        default=0,
-        metavar="N",
-        help="of the pipeline: go on from, or repeat, this block",
-    )
-    parser.add_argument(
-        "--seconds",
-        type=_above_zero,
-        default=math.inf,
-        metavar="S",
-        help="of the pipeline: begin no block after so many seconds",
-    )
-    parser.add_argument("--jobs", type=_positive, default=os.cpu_count() or 1, help="processes")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the totals here")
-    parser.set_defaults(func=_main)
-
-
-def _positive(text: str) -> int:
-    value = _natural(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text}: at least 1")
-    return value
-
-
-def _natural(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number") from None
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text}: at least 0")
-    return value
-
-
-def _above_zero(text: str) -> float:
-    return finite_above_zero(text, "s")
-
-
-def _main(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
+    """Fuzz; 1 when something was accepted wrongly or gave way."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
-    if options.json is not None and not options.json.parent.is_dir():
-        print(f"{options.json}: no directory {options.json.parent}; make it first", file=sys.stderr)
+    if options.out is not None and not options.out.parent.is_dir():
+        print(f"{options.out}: no directory {options.out.parent}; make it first", file=sys.stderr)
         return 2
     columns = ("[progress.description]{task.description}", BarColumn(), MofNCompleteColumn())
     with Progress(*columns, TimeRemainingColumn()) as bar:
         task = bar.add_task("frames spoilt", total=options.frames)
         result = _fuzz(options, lambda done: bar.advance(task, done))
-    if options.json is not None:
+    if options.out is not None:
         try:
-            options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+            options.out.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
         except OSError as error:
-            print(f"{options.json}: {error.strerror}; name another file", file=sys.stderr)
+            print(f"{options.out}: {error.strerror}; name another file", file=sys.stderr)
             return 3
     if options.through == "pipeline":
         return _tell_pipeline(result)
@@ -304,7 +245,7 @@ def _fuzz(options: argparse.Namespace, progress: Progress) -> Totals:
         progress,
         options.jobs,
         first=options.from_block,
-        seconds=options.seconds,
+        seconds=options.duration,
     )
 
 

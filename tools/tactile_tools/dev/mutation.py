@@ -215,14 +215,14 @@ def _judge_all(package: Path, tests: Sequence[str], options: argparse.Namespace)
     multiprocessing.get_context("forkserver").set_forkserver_preload(
         ["pytest", "numpy", "hypothesis", "scipy.integrate"]
     )
-    if judge(package, None, tests, options.limit) != "survived":
+    if judge(package, None, tests, options.patience) != "survived":
         print("the tests fail on the package as it is: mend that first", file=sys.stderr)
         return 3
     verdicts = []
     console = Console()
     with Progress(console=console, transient=True) as bar, ThreadPoolExecutor(options.jobs) as pool:
         task = bar.add_task(f"{len(made)} of {total} mutants", total=len(made))
-        jobs = {pool.submit(judge, package, m, tests, options.limit): m for m in made}
+        jobs = {pool.submit(judge, package, m, tests, options.patience): m for m in made}
         for job in as_completed(jobs):
             verdicts.append(Verdict(jobs[job], job.result()))
             bar.advance(task)
@@ -247,8 +247,8 @@ def _report(
         f"{len(verdicts)} mutants of {total}: {len(verdicts) - len(survivors)} killed "
         f"({slow} by the time limit), {len(survivors)} survived"
     )
-    if options.json:
-        _write(options.json, len(verdicts), survivors, slow)
+    if options.out:
+        _write(options.out, len(verdicts), survivors, slow)
     allowed = options.max_survivors
     return 1 if allowed is not None and len(survivors) > allowed else 0
 
@@ -265,29 +265,3 @@ def _write(path: Path, judged: int, survivors: list[Mutant], slow: int) -> None:
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-
-
-def add_parser(subparsers: Any) -> None:
-    """Add ``mutation`` to the umbrella command."""
-    parser = subparsers.add_parser(
-        "mutation", help="mutate the safety gate and report what its tests miss"
-    )
-    parser.add_argument(
-        "--file", nargs="+", default=list(FILES), choices=FILES, help="default: %(default)s"
-    )
-    parser.add_argument("--jobs", type=_positive, default=os.cpu_count() or 1, help="at a time")
-    parser.add_argument("--sample", type=_positive, help="this many, chosen at random")
-    parser.add_argument("--seed", type=int, default=0, help="of the sample (default: 0)")
-    parser.add_argument(
-        "--limit", type=_positive, default=120, help="s for one mutant (default: 120)"
-    )
-    parser.add_argument("--max-survivors", type=int, help="exit with 1 when more survive")
-    parser.add_argument("--json", type=Path, help="write the report to this file")
-    parser.set_defaults(func=run)
-
-
-def _positive(text: str) -> int:
-    value = int(text) if text.isdigit() else 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
-    return value

@@ -21,7 +21,6 @@ from rich.progress import Progress
 
 from tactile_core.bus.services import ServiceError, call
 from tactile_core.bus.topics import service_key
-from tactile_core.options import finite_above_zero
 from tactile_tools.processes import command, running, socket_at, wait_for
 
 if TYPE_CHECKING:
@@ -82,45 +81,10 @@ class Soak:
     problems: list[str] = field(default_factory=list)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``soak`` to the umbrella command."""
-    parser = subparsers.add_parser(
-        "soak",
-        help="pull boards out and plug them in for an hour, and watch memory and descriptors",
-        description="Runs a tactiled with its log on simulated boards, one of which is pulled out "
-        "and plugged in every second. Exit: 0 nothing grew and every board came back; 1 something "
-        "did not; 2 bad argument; 3 it could not be run.",
-    )
-    number = parser.add_argument
-    number("--minutes", type=_above("min"), default=60.0, help="how long (default 60)")
-    number("--boards", type=_count, default=BOARDS, help="how many (default 4)")
-    number(
-        "--replug",
-        type=_above("s"),
-        default=REPLUG_PERIOD_S,
-        metavar="S",
-        help="s from one pulling out to the next (default 1)",
-    )
-    number("--rate", type=_above("Hz"), default=100.0, metavar="HZ", help="of boards that obey")
-    number("--json", type=Path, metavar="FILE", help="write the result here")
-    parser.set_defaults(func=run)
-
-
-def _above(unit: str) -> Any:
-    return lambda text: finite_above_zero(text, unit)
-
-
-def _count(text: str) -> int:
-    value = int(text) if text.isdecimal() else 0
-    if not 1 <= value <= 16:
-        raise argparse.ArgumentTypeError(f"{text} given; allowed: a whole number from 1 to 16")
-    return value
-
-
 def run(options: argparse.Namespace) -> int:
     """Run it; 0 when nothing grew and every board came back."""
-    if options.json is not None and not options.json.parent.is_dir():
-        print(f"tactile soak: --json {options.json}: there is no folder for it", file=sys.stderr)
+    if options.out is not None and not options.out.parent.is_dir():
+        print(f"tactile soak: --out {options.out}: there is no folder for it", file=sys.stderr)
         return 2
     if options.replug * options.boards <= 2 * AWAY_S:
         print(
@@ -136,8 +100,8 @@ def run(options: argparse.Namespace) -> int:
         print(f"tactile soak: {error}", file=sys.stderr)
         return 3
     text = json.dumps(asdict(soak), indent=2)
-    if options.json is not None:
-        options.json.write_text(text + "\n", encoding="utf-8")
+    if options.out is not None:
+        options.out.write_text(text + "\n", encoding="utf-8")
     print(text)
     return 1 if soak.problems else 0
 
@@ -166,7 +130,7 @@ def _soak(soak: Soak) -> None:
         daemon += ["--listen", endpoint]
         for index, board in enumerate(names):
             daemon += ["--port", str(folder / board), "--name", board]
-            daemon += ["--board", "anyskin" if KINDS[index % 2] == "anyskin" else "auto"]
+            daemon += ["--kind", "anyskin" if KINDS[index % 2] == "anyskin" else "auto"]
         process = stack.enter_context(running(daemon, folder / "tactiled.txt"))
         session = open_session(BusConfig(listen=(), connect=(endpoint,)))
         stack.callback(close_session, session)
@@ -189,7 +153,7 @@ def _simulator(soak: Soak, pty: Path, index: int, seconds: float) -> list[str]:
     """A board that is away for `AWAY_S` in its turn, until `QUIET_S` before the end."""
     kind = KINDS[index % 2]
     words = [command("simdevice"), "boards", "--pty", str(pty), "--seed", str(index + 1)]
-    words += ["--board", kind]
+    words += ["--kind", kind]
     if kind != "anyskin":
         words += ["--rate", f"{soak.rate_hz:g}"]
     period = soak.replug_period_s * soak.boards

@@ -2,18 +2,41 @@
 
 from __future__ import annotations
 
-import argparse
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 from sim_device.world.engines import ENGINES
+from tactile_core.cli import (
+    Command,
+    Parser,
+    add_commands,
+    add_out,
+    add_path,
+    add_seeds,
+    add_strategies,
+    count,
+    later,
+    seed,
+)
+from tactile_tools.cli import add_depth, add_engine, add_strategy
 
-STRATEGY_NAMES = "straight burrow excavate hybrid_clock hybrid_event"
 AXIS_NAMES = (
     "density", "friction_objects", "friction_all", "force", "width", "time", "noise", "rate", "dead"
 )  # fmt: skip
 """As in `axes`, which takes half a second to import: a test holds them equal."""
+
+HERE = "tactile_tools.experiments.cli"
+
+COMMANDS = {
+    "strategies": Command("every strategy in every scene", f"{HERE}:_strategies"),
+    "sweep": Command("the paper's 10 × 10 grids of a primitive's parameters", f"{HERE}:_sweep"),
+    "robustness": Command(
+        "every strategy while one condition at a time is varied", f"{HERE}:_robustness"
+    ),
+    "compare": Command("two runs side by side, trial by trial where paired", f"{HERE}:_compare"),
+    "report": Command("report.html and PNGs of a run", f"{HERE}:_report"),
+    "trial": Command("any row again, bit for bit, with its log and picture", f"{HERE}:_trial"),
+}
 
 EXAMPLES = """\
 examples:
@@ -32,39 +55,24 @@ Exit: 0 done, 1 some trials could not be run or a row came out different, 2 bad 
 """
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``experiment`` to the umbrella command."""
-    parser = subparsers.add_parser(
-        "experiment",
-        help="repeat the paper's studies: strategies, sweep, robustness, statistics, report",
-        description="Many trials, one row each, on all cores or a Dask cluster; and what the rows "
-        "say. The same options give the same rows, whoever runs them.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+def fill(parser: Parser) -> None:
+    """Add the options of ``tactile experiment``."""
+    parser.description = (
+        "Many trials, one row each, on all cores or a Dask cluster; and what the rows "
+        "say. The same options give the same rows, whoever runs them."
     )
-    words = parser.add_subparsers(dest="experiment", metavar="WORD", required=True)
-    _strategies(words)
-    _sweep(words)
-    _robustness(words)
-    _compare(words)
-    _report(words)
-    _trial(words)
+    parser.epilog = EXAMPLES
+    add_commands(parser, COMMANDS)
 
 
-Words = argparse._SubParsersAction
-
-
-def _strategies(words: Words[argparse.ArgumentParser]) -> None:
-    parser = words.add_parser("strategies", help="every strategy in every scene")
+def _strategies(parser: Parser) -> None:
     _study_options(parser, scenes=300)
-    _strategy_option(parser)
-    parser.set_defaults(func=_call("strategies"))
+    add_strategies(parser, "names or module:Class (default: the paper's five)")
+    parser.former(strategies="strategy")
+    parser.set_defaults(func=later("tactile_tools.experiments.commands:strategies"))
 
 
-def _sweep(words: Words[argparse.ArgumentParser]) -> None:
-    parser = words.add_parser(
-        "sweep", help="the paper's 10 × 10 grids of a primitive's parameters, beside straight"
-    )
+def _sweep(parser: Parser) -> None:
     _study_options(parser, scenes=50)
     parser.add_argument(
         "--primitive",
@@ -79,65 +87,64 @@ def _sweep(words: Words[argparse.ArgumentParser]) -> None:
         help="how the paper's f_bur is read: rad/s, as its simulator takes it, Hz, as it is "
         "printed, or both (default)",
     )
-    parser.set_defaults(func=_call("sweep"))
+    parser.set_defaults(func=later("tactile_tools.experiments.commands:sweep"))
 
 
-def _robustness(words: Words[argparse.ArgumentParser]) -> None:
-    parser = words.add_parser(
-        "robustness", help="success of every strategy while one condition at a time is varied"
-    )
+def _robustness(parser: Parser) -> None:
     _study_options(parser, scenes=30)
-    _strategy_option(parser)
+    add_strategies(parser, "names or module:Class (default: the paper's five)")
+    parser.former(strategies="strategy")
     parser.add_argument(
         "--axis",
         nargs="+",
+        action="extend",
         choices=AXIS_NAMES,
-        default=list(AXIS_NAMES),
         help="what is varied (default all: %(choices)s)",
         metavar="AXIS",
     )
-    parser.set_defaults(func=_call("robustness"))
+    parser.set_defaults(func=later("tactile_tools.experiments.commands:robustness"))
 
 
-def _compare(words: Words[argparse.ArgumentParser]) -> None:
-    parser = words.add_parser("compare", help="two runs side by side, trial by trial where paired")
+def _compare(parser: Parser) -> None:
     parser.add_argument("first", type=Path, metavar="RUN_A")
     parser.add_argument("second", type=Path, metavar="RUN_B")
-    parser.add_argument("--csv", type=Path, metavar="FILE", help="write the table there too")
-    parser.set_defaults(func=_call("compare"))
+    parser.former(csv="out")
+    add_out(parser, "write the table to this file too, as CSV", force="")
+    parser.set_defaults(func=later("tactile_tools.experiments.commands:compare"))
 
 
-def _report(words: Words[argparse.ArgumentParser]) -> None:
-    parser = words.add_parser("report", help="report.html and PNGs of a run")
+def _report(parser: Parser) -> None:
     parser.add_argument("run", type=Path, metavar="RUN")
-    parser.add_argument(
+    add_path(
+        parser,
         "--out",
-        type=Path,
-        metavar="DIR",
-        help="where the report, its PNGs and a small CSV of each table go (default: RUN)",
+        "folder for the report, its PNGs and a small CSV of each table (default: RUN)",
     )
     parser.add_argument(
         "--rows",
         action="store_true",
         help="put the table of trials there too, small, so that --out can be used as RUN",
     )
-    parser.set_defaults(func=_call("report"))
+    parser.set_defaults(func=later("tactile_tools.experiments.commands:report"))
 
 
-def _trial(words: Words[argparse.ArgumentParser]) -> None:
-    parser = words.add_parser("trial", help="any row again, bit for bit, with its log and picture")
+def _trial(parser: Parser) -> None:
     parser.add_argument(
         "--row", metavar="RUN:N", help="row N (0 is the first) of a run's table; says if it differs"
     )
-    parser.add_argument("--scene-seed", type=int, default=0)
-    parser.add_argument("--trial-seed", type=int, help="(default: --scene-seed)")
-    parser.add_argument("--strategy", default="hybrid_event", help="name or module:Class")
-    parser.add_argument("--set", default="authors_sim")
+    parser.former(trial_seed="seed")
+    add_seeds(parser)
+    add_strategy(parser)
     parser.add_argument(
-        "--source", help="scenes (default: those of --set): authors_sim_recorded, recorded:FILE"
+        "--set", default="authors_sim", metavar="SET", help="parameter set (default %(default)s)"
     )
-    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
-    parser.add_argument("--depth", choices=("contacts", "taxels"), default="contacts")
+    parser.add_argument(
+        "--source",
+        metavar="SCENE",
+        help="scenes (default: those of --set): authors_sim_recorded, recorded:FILE",
+    )
+    add_engine(parser)
+    add_depth(parser)
     _param_option(parser)
     parser.add_argument(
         "--condition",
@@ -146,69 +153,64 @@ def _trial(words: Words[argparse.ArgumentParser]) -> None:
         metavar="NAME=VALUE",
         help="a condition of the robustness map, such as finger_width=0.04",
     )
-    parser.add_argument("--log", type=Path, metavar="FILE", help="MCAP file of the trial")
-    parser.add_argument("--png", type=Path, metavar="FILE", help="picture of it; needs --log")
-    parser.set_defaults(func=_call("trial"))
+    add_path(parser, "--log", "MCAP file of the trial")
+    add_path(parser, "--png", "picture of the trial; needs --log")
+    parser.set_defaults(func=later("tactile_tools.experiments.commands:trial"))
 
 
-def _study_options(parser: argparse.ArgumentParser, *, scenes: int) -> None:
+def _study_options(parser: Parser, *, scenes: int) -> None:
+    parser.former(seed="scene-seed")
     parser.add_argument(
-        "--scenes", type=_count, default=scenes, metavar="N", help=f"how many (default {scenes})"
+        "--scenes", type=count, default=scenes, metavar="N", help=f"how many (default {scenes})"
     )
     parser.add_argument(
-        "--seed", type=int, default=0, help="of the first scene; the others follow (default 0)"
+        "--scene-seed",
+        type=seed,
+        default=0,
+        metavar="N",
+        help="of the first scene; the others follow (default 0)",
     )
     parser.add_argument(
         "--set",
         nargs="+",
-        default=["authors_sim"],
+        action="extend",
         metavar="SET",
         help="parameter sets: authors_sim (default), hardware, or both",
     )
     parser.add_argument(
         "--engine",
         nargs="+",
+        action="extend",
         choices=ENGINES,
-        default=[ENGINES[0]],
-        help=f"physics (default {ENGINES[0]})",
+        help=f"physics engines (default {ENGINES[0]})",
     )
     parser.add_argument(
         "--depth",
         nargs="+",
+        action="extend",
         choices=("contacts", "taxels"),
-        default=["contacts"],
         help="what is felt: the engine's contacts (default), or the whole chain of taxels",
     )
     parser.add_argument(
         "--source",
+        metavar="SCENE",
         help="scenes of another generator, authors_sim_recorded or recorded:FILE "
         "(default: the set's)",
     )
     _param_option(parser)
     where = parser.add_mutually_exclusive_group()
+    cores = os.cpu_count() or 1
     where.add_argument(
-        "--jobs", type=_count, default=os.cpu_count() or 1, help="processes (default %(default)s)"
+        "--jobs", type=count, default=cores, metavar="N", help=f"processes (default {cores})"
     )
     where.add_argument("--dask", metavar="ADDRESS", help="run on the cluster of this scheduler")
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder of the run (default runs/WORD)"
-    )
+    add_path(parser, "--out", "folder of the run (default runs/WORD)")
     parser.add_argument(
         "--retry", action="store_true", help="when resuming, run trials again that failed"
     )
 
 
-def _strategy_option(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--strategies",
-        nargs="+",
-        default=STRATEGY_NAMES.split(),
-        metavar="NAME",
-        help="names or module:Class (default: the paper's five)",
-    )
-
-
-def _param_option(parser: argparse.ArgumentParser) -> None:
+def _param_option(parser: Parser) -> None:
     parser.add_argument(
         "--param",
         action="append",
@@ -216,25 +218,3 @@ def _param_option(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help="a parameter that differs from the set's, such as time_limit=30; may be repeated",
     )
-
-
-def _count(text: str) -> int:
-    """A whole number above 0."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 1")
-    return value
-
-
-def _call(word: str) -> Callable[[argparse.Namespace], int]:
-    """The command ``word``, imported when it is wanted: physics and plots take their time."""
-
-    def run(options: argparse.Namespace) -> int:
-        from tactile_tools.experiments.commands import run_command
-
-        return run_command(word, options)
-
-    return run

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,8 +18,11 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from sim_device.world.engines import ENGINES
+from tactile_core.cli import REFUSED, STRATEGIES, CommandError, require, working
 from tactile_tools.experiments.arguments import named_values
 from tactile_tools.experiments.backends import Backend, BackendError, Processes
+from tactile_tools.experiments.cli import AXIS_NAMES
 from tactile_tools.experiments.dask_backend import DaskCluster
 from tactile_tools.experiments.journal import DiskError, FolderError
 from tactile_tools.experiments.rows import Row, TableError, describe
@@ -34,58 +36,74 @@ from tactile_tools.experiments.studies import (
     sweep_study,
 )
 
+SETS, DEPTHS = ("authors_sim",), ("contacts",)
+"""Of a study that names none."""
+
 TOLD_EVERY_S = 30.0
 """s between lines of progress where there is no terminal to draw a bar on."""
 
 
-def run_command(word: str, options: argparse.Namespace) -> int:
-    """Do ``word``; its exit code. Every failure that a user can cause is one line on stderr."""
-    commands: dict[str, Callable[[argparse.Namespace], int]] = {
-        "strategies": lambda o: _study(strategies_study(_common(o), tuple(o.strategies)), o),
-        "sweep": lambda o: _study(
-            sweep_study(
-                _common(o),
-                ("burrow", "excavate") if o.primitive == "both" else (o.primitive,),
-                tuple(READINGS) if o.frequency == "both" else (o.frequency,),
-            ),
-            o,
-        ),
-        "robustness": lambda o: _study(
-            robustness_study(_common(o), tuple(o.strategies), tuple(o.axis)), o
-        ),
-        "trial": _trial,
-        "report": _report,
-        "compare": _compare,
-    }
-    try:
-        return commands[word](options)
-    except (FolderError, TableError, ValueError) as error:
-        # Settings, strategies and scenes that cannot be are ValueErrors, each with its remedy.
-        print(f"tactile experiment {word}: {error}", file=sys.stderr)
-        return 2
-    except (DiskError, BackendError) as error:
-        print(f"tactile experiment {word}: {error}", file=sys.stderr)
-        return 3
+def _told(work: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
+    """``work`` as a command: every failure that a user can cause is a `CommandError`."""
+
+    def command(options: argparse.Namespace) -> int:
+        try:
+            return work(options)
+        except (FolderError, TableError, ValueError) as error:
+            # Settings, strategies and scenes that cannot be are ValueErrors, with their remedy.
+            raise CommandError(str(error)) from error
+        except (DiskError, BackendError) as error:
+            raise CommandError(str(error), REFUSED) from error
+
+    return command
 
 
 def _common(options: argparse.Namespace) -> Options:
-    if options.seed < 0:
-        raise ValueError(f"--seed is {options.seed}; seeds are 0 or above")
     return Options(
         scenes=options.scenes,
-        seed=options.seed,
-        sets=tuple(dict.fromkeys(options.set)),
-        engines=tuple(dict.fromkeys(options.engine)),
-        depths=tuple(dict.fromkeys(options.depth)),
+        seed=options.scene_seed,
+        sets=tuple(dict.fromkeys(options.set or SETS)),
+        engines=tuple(dict.fromkeys(options.engine or ENGINES[:1])),
+        depths=tuple(dict.fromkeys(options.depth or DEPTHS)),
         source=options.source,
         parameters=named_values("--param", options.param),
     )
 
 
-def _study(study: Study, options: argparse.Namespace) -> int:
+def _studied(make: Callable[[argparse.Namespace], Study], word: str) -> Any:
+    """A study as a command."""
+
+    def run(options: argparse.Namespace) -> int:
+        require("pyarrow", extra="experiments")
+        return _study(make(options), options, word)
+
+    return _told(run)
+
+
+def _sweep(options: argparse.Namespace) -> Study:
+    both = options.primitive == "both"
+    return sweep_study(
+        _common(options),
+        ("burrow", "excavate") if both else (options.primitive,),
+        tuple(READINGS) if options.frequency == "both" else (options.frequency,),
+    )
+
+
+def _chosen(options: argparse.Namespace) -> tuple[str, ...]:
+    return tuple(options.strategy or STRATEGIES)
+
+
+strategies = _studied(lambda o: strategies_study(_common(o), _chosen(o)), "strategies")
+sweep = _studied(_sweep, "sweep")
+robustness = _studied(
+    lambda o: robustness_study(_common(o), _chosen(o), tuple(o.axis or AXIS_NAMES)), "robustness"
+)
+
+
+def _study(study: Study, options: argparse.Namespace, word: str) -> int:
     """Run ``study``, tell how it goes and what came out."""
     check(study)
-    directory: Path = options.out or Path("runs") / options.experiment
+    directory: Path = options.out or Path("runs") / word
     backend: Backend = DaskCluster(options.dask) if options.dask else Processes(options.jobs)
     console = Console()
     bar = Progress(
@@ -98,7 +116,7 @@ def _study(study: Study, options: argparse.Namespace) -> int:
         console=console,
         disable=not console.is_terminal,
     )
-    told = _Told(console, bar)
+    told = _Teller(console, bar)
     try:
         with bar:
             summary = run_study(study, directory, backend, told, retry=options.retry)
@@ -112,7 +130,7 @@ def _study(study: Study, options: argparse.Namespace) -> int:
     return 1 if summary["errors"] else 0
 
 
-class _Told:
+class _Teller:
     """Tells how far a run is, and remembers the first failures."""
 
     def __init__(self, console: Console, bar: Progress) -> None:
@@ -143,7 +161,7 @@ class _Told:
             self._console.print(f"{finished} of {total} trials, {left / 60:.1f} min left")
 
 
-def _say(console: Console, summary: dict[str, Any], told: _Told, directory: Path) -> None:
+def _say(console: Console, summary: dict[str, Any], told: _Teller, directory: Path) -> None:
     session = summary["this_session"]
     if session["damaged_lines"]:
         console.print(
@@ -179,24 +197,35 @@ def _say(console: Console, summary: dict[str, Any], told: _Told, directory: Path
     console.print(f"wrote {directory}/trials.parquet, trials.csv and summary.json")
 
 
-def _trial(options: argparse.Namespace) -> int:
+@_told
+def trial(options: argparse.Namespace) -> int:
+    """``tactile experiment trial``."""
+    if options.png is not None:
+        require("matplotlib", "scipy", extra="plot")
     from tactile_tools.experiments.rerun_trial import run_again
 
     return run_again(options)
 
 
-def _report(options: argparse.Namespace) -> int:
+@_told
+def report(options: argparse.Namespace) -> int:
+    """``tactile experiment report``."""
+    require("pyarrow", "scipy", "jinja2", "matplotlib", extra="experiments")
     from tactile_tools.experiments.report import write_report
 
     try:
-        path = write_report(options.run, options.out or options.run, rows=options.rows)
+        with working("drawing the report"):
+            path = write_report(options.run, options.out or options.run, rows=options.rows)
     except OSError as error:
         raise DiskError(f"cannot write the report: {error}") from error
     print(f"wrote {path}")
     return 0
 
 
-def _compare(options: argparse.Namespace) -> int:
+@_told
+def compare(options: argparse.Namespace) -> int:
+    """``tactile experiment compare``."""
+    require("pyarrow", "scipy", extra="experiments")
     from tactile_tools.experiments.compare import compare_runs
 
-    return compare_runs(options.first, options.second, options.csv)
+    return compare_runs(options.first, options.second, options.out)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from tactile_core.cli import seeds_of
 from tactile_core.log.recorder import RecorderError
 from tactile_tools.experiments.arguments import named_values
 from tactile_tools.experiments.conditions import scene_of
@@ -74,15 +75,15 @@ def _recorded(text: str) -> Row:
 def _spec(options: argparse.Namespace) -> TrialSpec:
     """The trial that the options describe, by the columns' names."""
     conditions = canonical(named_values("--condition", options.condition))
-    seed = options.scene_seed
+    scene_seed, seed = seeds_of(options)
     return TrialSpec(
         source=options.source or options.set,
-        scene_seed=seed,
+        scene_seed=scene_seed,
         set=options.set,
         engine=options.engine,
         depth=options.depth,
         strategy=options.strategy,
-        trial_seed=seed if options.trial_seed is None else options.trial_seed,
+        trial_seed=seed,
         parameters=canonical(named_values("--param", options.param)),
         conditions=Conditions.from_json(conditions).to_json(),
     )

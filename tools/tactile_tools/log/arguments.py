@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -18,9 +17,6 @@ from tactile_tools.log.terminal import ToolError
 END_NS = (1 << 64) - 1
 """Later than anything: log times are unsigned 64-bit numbers."""
 
-SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kMG]i?)?B?", re.IGNORECASE)
-POWERS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "ki": 1 << 10, "mi": 1 << 20, "gi": 1 << 30}
-
 
 @dataclass(frozen=True, slots=True)
 class Selection:
@@ -32,34 +28,6 @@ class Selection:
     start_ns: int
 
 
-def add_files(parser: argparse.ArgumentParser) -> None:
-    """Add the files: a log may be several."""
-    parser.add_argument(
-        "files",
-        nargs="+",
-        type=Path,
-        metavar="FILE",
-        help="MCAP log, a folder of them, or what the names of the files of one log share",
-    )
-
-
-def add_selection(parser: argparse.ArgumentParser, until: str = "--to") -> None:
-    """Add --topic, --from and --to (``until`` where that means something else)."""
-    parser.add_argument(
-        "--topic",
-        action="append",
-        metavar="PATTERN",
-        help="only these, with * and ? (quote them); may be repeated",
-    )
-    for name, which in (("--from", "first"), (until, "last")):
-        parser.add_argument(
-            name,
-            dest=f"{which}_time",
-            metavar="TIME",
-            help=f"{which} log time: s since the start of the log, or UTC as 2026-01-31T12:00:00",
-        )
-
-
 def select(options: argparse.Namespace) -> Selection:
     """What the options of `add_files` and `add_selection` mean; ToolError, LogError."""
     logs = find_series(options.files)
@@ -68,7 +36,7 @@ def select(options: argparse.Namespace) -> Selection:
     window = None
     if options.first_time is not None or options.last_time is not None:
         first = 0 if options.first_time is None else moment("--from", options.first_time, start)
-        last = END_NS if options.last_time is None else moment("end", options.last_time, start)
+        last = END_NS if options.last_time is None else moment("--until", options.last_time, start)
         if first > last:
             raise ToolError(
                 f"the time {options.first_time} is after {options.last_time}: nothing is between"
@@ -95,22 +63,6 @@ def moment(flag: str, text: str, start_ns: int) -> int:
     when = when.replace(tzinfo=UTC) if when.tzinfo is None else when
     whole = when.replace(microsecond=0)
     return max(0, int(whole.timestamp()) * NS_PER_S + when.microsecond * 1000)
-
-
-def size_bytes(text: str) -> int:
-    """Bytes of a size such as 500MB, 1.5GiB or 4096; argparse's error when it is none."""
-    match = SIZE.fullmatch(text.strip())
-    if match is not None:
-        size = float(match[1]) * POWERS[(match[2] or "").lower()]
-        if 1 <= size < 1 << 60:
-            return int(size)
-    raise argparse.ArgumentTypeError(f"{text} given; allowed: a size such as 500MB or 2GiB")
-
-
-def add_output(parser: argparse.ArgumentParser, what: str, *, required: bool = False) -> None:
-    """Add --out and --force."""
-    parser.add_argument("--out", type=Path, metavar="OUT", help=what, required=required)
-    parser.add_argument("--force", action="store_true", help="overwrite what is there")
 
 
 def check_output(out: Path, force: bool, sources: Sequence[Series] = ()) -> Path:

@@ -9,31 +9,13 @@ from typing import Any, TextIO
 
 from tactile_core.bus.messages import DecodeError
 from tactile_core.types import NS_PER_S
-from tactile_tools.log.arguments import add_files, add_selection, select
+from tactile_tools.log.arguments import select
 from tactile_tools.log.decode import Decoder, finite
 from tactile_tools.log.stream import Reading, Record, read_merged
 from tactile_tools.log.terminal import FAULTY, clock_text, complain, json_text, shown
 
 SHOWN = 6
 """Elements of an array shown to people; --json has them all."""
-
-
-def fill(parser: argparse.ArgumentParser) -> None:
-    """Give ``tactile log cat`` its arguments."""
-    parser.description = (
-        "Print the messages of a log, one a line: time since its start, topic, fields. "
-        "Several logs are printed in the order of time."
-    )
-    add_files(parser)
-    add_selection(parser)
-    parser.add_argument("--json", action="store_true", help="one JSON object a line, complete")
-    parser.add_argument(
-        "--absolute", action="store_true", help="UTC time instead of seconds since the start"
-    )
-    parser.add_argument(
-        "--limit", type=int, metavar="N", help="stop after N messages (default: all)"
-    )
-    parser.set_defaults(func=run)
 
 
 def run(options: argparse.Namespace) -> int:

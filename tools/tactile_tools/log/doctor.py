@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from tactile_core.bus.messages import DecodeError
+from tactile_core.cli import progress
 from tactile_core.log.info import LogInfo, info_of
 from tactile_core.log.records import ChannelRecord, Message, SchemaRecord
 from tactile_core.types import NS_PER_S
-from tactile_tools.log.arguments import add_files
 from tactile_tools.log.decode import Decoder
 from tactile_tools.log.sources import Series, find_series
 from tactile_tools.log.stream import Stream, stream_of
@@ -28,7 +28,6 @@ from tactile_tools.log.terminal import (
     bytes_text,
     clock_text,
     plain_console,
-    progress,
     seconds_text,
     shown,
 )
@@ -53,18 +52,6 @@ class Finding:
     fault: bool
     text: str
     remedy: str = ""
-
-
-def fill(parser: argparse.ArgumentParser) -> None:
-    """Give ``tactile log doctor`` its arguments."""
-    parser.description = (
-        "Read a log from end to end and say what is wrong with it, what of it can be "
-        "had all the same, and which command repairs it. Exit: 0 healthy, 1 it has faults, "
-        "2 bad argument or no log, 3 refused by the system."
-    )
-    add_files(parser)
-    parser.add_argument("--json", action="store_true", help="machine-readable, on standard output")
-    parser.set_defaults(func=run)
 
 
 def run(options: argparse.Namespace) -> int:

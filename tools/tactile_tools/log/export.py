@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from tactile_core.bus.messages import DecodeError
 from tactile_core.bus.topics import RAW, find_topic
-from tactile_tools.log.arguments import Selection, add_files, add_selection, select
+from tactile_core.cli import progress
+from tactile_tools.log.arguments import Selection, select
 from tactile_tools.log.stream import Reading, Record, Stream, read_merged
 from tactile_tools.log.terminal import (
     FAULTY,
@@ -24,7 +25,6 @@ from tactile_tools.log.terminal import (
     cannot_write,
     complain,
     plain_console,
-    progress,
 )
 
 if TYPE_CHECKING:
@@ -39,25 +39,6 @@ MAX_FILES = 65_536
 CONTENTS = "columns.json"
 """Says what the columns of every file are, with units as the definitions tell them; a folder that
 has it was made by this tool, and may be overwritten with --force."""
-
-
-def fill(parser: argparse.ArgumentParser) -> None:
-    """Give ``tactile log export`` its arguments."""
-    parser.description = (
-        "Write a folder with one table a topic. Nested fields are flattened "
-        f"(header.stamp_ns, wrench.force.x); {CONTENTS} says what each column is. Lists of numbers "
-        "are columns name.0, name.1 … in CSV, lists in Parquet, matrices in npz; lists of messages "
-        "are JSON in CSV, lists of structures in Parquet, flat arrays with offsets in npz. Raw "
-        "bytes of boards are left out unless --topic names them."
-    )
-    add_files(parser)
-    parser.add_argument("--to", dest="format", choices=FORMATS, required=True, help="format")
-    parser.add_argument(
-        "--out", type=Path, metavar="FOLDER", help="new folder (default: FILE's name and format)"
-    )
-    parser.add_argument("--force", action="store_true", help="overwrite an earlier export")
-    add_selection(parser, until="--until")
-    parser.set_defaults(func=run)
 
 
 def run(options: argparse.Namespace) -> int:

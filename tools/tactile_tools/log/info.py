@@ -13,17 +13,16 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from tactile_core.cli import progress
 from tactile_core.log.info import AttachmentInfo, LogInfo, info_of
 from tactile_core.log.reader import LogReader
 from tactile_core.log.records import Damage
-from tactile_tools.log.arguments import add_files
 from tactile_tools.log.sources import Series, find_series, siblings
 from tactile_tools.log.terminal import (
     bytes_text,
     clock_text,
     complain,
     plain_console,
-    progress,
     seconds_text,
     shown,
 )
@@ -36,23 +35,6 @@ TEXT_SHOWN = 400
 
 FEW = 200
 """Channels up to which they are shown as a table fit to the window; laying one out takes long."""
-
-
-def fill(parser: argparse.ArgumentParser) -> None:
-    """Give ``tactile log info`` its arguments."""
-    parser.description = (
-        "Read a log from end to end and say what it holds: channels and rates, what "
-        "was dropped and where, calibration, outcome and software, and whether every byte is "
-        "readable. Files of one log are taken together."
-    )
-    add_files(parser)
-    parser.add_argument("--json", action="store_true", help="machine-readable, on standard output")
-    parser.add_argument(
-        "--quick",
-        action="store_true",
-        help="only what the summary at the end of each file says: nothing is read or checked",
-    )
-    parser.set_defaults(func=run)
 
 
 def run(options: argparse.Namespace) -> int:

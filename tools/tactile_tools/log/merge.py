@@ -12,10 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from tactile_core.cli import progress
 from tactile_core.log.records import MetadataRecord
 from tactile_core.log.writer import GAP
 from tactile_core.types import NS_PER_S
-from tactile_tools.log.arguments import add_output, check_output
+from tactile_tools.log.arguments import check_output
 from tactile_tools.log.ordering import InOrder, Stretches
 from tactile_tools.log.sources import FILE, Series, find_series
 from tactile_tools.log.stream import (
@@ -27,7 +28,7 @@ from tactile_tools.log.stream import (
     common_profile,
     read_series,
 )
-from tactile_tools.log.terminal import ToolError, complain, plain_console, progress
+from tactile_tools.log.terminal import ToolError, complain, plain_console
 from tactile_tools.log.writing import LogOutput
 
 COPY_WITHIN_NS = 10 * NS_PER_S
@@ -43,29 +44,6 @@ SHOWN = 20
 CLOCKS_APART_NS = NS_PER_S // 20
 
 SOFTWARE, OFFSET = "software", "clock_offset_ns"
-
-
-def fill(parser: argparse.ArgumentParser) -> None:
-    """Give ``tactile log merge`` its arguments."""
-    parser.description = (
-        "Write several logs, such as those of both daemons, as one: messages in the "
-        "order of time, all attachments and tables. What one daemon logged of what another said, "
-        "and that one logged too (same bytes, same stamp of the sender), is kept once."
-    )
-    parser.add_argument(
-        "files", nargs="+", type=Path, metavar="FILE", help="logs, folders, names of split logs"
-    )
-    add_output(parser, "new log", required=True)
-    parser.add_argument(
-        "--keep-duplicates", action="store_true", help="keep messages that several logs have"
-    )
-    parser.add_argument(
-        "--align",
-        action="store_true",
-        help="put the clocks of the logs together by the monotonic clock of the machine, if its "
-        "clock was set between their starts",
-    )
-    parser.set_defaults(func=run)
 
 
 def run(options: argparse.Namespace) -> int:

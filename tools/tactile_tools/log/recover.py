@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-from pathlib import Path
 
+from tactile_core.cli import progress
 from tactile_core.log.recovery import RecoveryError, RecoveryReport, recover
 from tactile_tools.log.arguments import check_output
 from tactile_tools.log.info import show_damages
@@ -17,29 +17,8 @@ from tactile_tools.log.terminal import (
     bytes_text,
     clock_text,
     plain_console,
-    progress,
     seconds_text,
 )
-
-
-def fill(parser: argparse.ArgumentParser) -> None:
-    """Give ``tactile log recover`` its arguments."""
-    parser.description = (
-        "Write everything readable of each FILE to a new, finished log. The files are only read."
-    )
-    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="MCAP log, or several")
-    parser.add_argument(
-        "--out", type=Path, metavar="OUT", help="new log (default: FILE's name with _recovered)"
-    )
-    parser.add_argument("--force", action="store_true", help="overwrite what is there")
-    parser.add_argument(
-        "--keep-suspect",
-        action="store_true",
-        help="also what looks readable of blocks and attachments whose checksum is wrong, as after "
-        "a flipped bit; the new log says which messages these are",
-    )
-    parser.add_argument("--json", action="store_true", help="report as JSON")
-    parser.set_defaults(func=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -13,11 +13,12 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from tactile_core.bus.topics import find_topic
-from tactile_core.options import BusTable, add_bus, bus_config, finite_above_zero
+from tactile_core.cli import progress
+from tactile_core.options import BusTable, bus_config
 from tactile_core.types import NS_PER_S
-from tactile_tools.log.arguments import Selection, add_files, add_selection, select
+from tactile_tools.log.arguments import Selection, select
 from tactile_tools.log.stream import Reading, Record, Stream, read_merged
-from tactile_tools.log.terminal import REFUSED, ToolError, complain, plain_console, progress
+from tactile_tools.log.terminal import REFUSED, ToolError, complain, plain_console
 
 if TYPE_CHECKING:
     import zenoh
@@ -32,31 +33,6 @@ LATE_NS = NS_PER_S // 10
 
 SETTLE = 0.3
 """s for links to others to come about before the first message."""
-
-
-def fill(parser: argparse.ArgumentParser) -> None:
-    """Give ``tactile log replay`` its arguments."""
-    parser.description = (
-        "Publish the messages of a log with the spacing they had, each under "
-        f"{PREFIX}/ and its key, never under the live keys. Raw bytes, which were never on the "
-        "bus, are left out unless --topic names them. Ctrl-C ends it."
-    )
-    add_files(parser)
-    add_selection(parser)
-    parser.add_argument(
-        "--speed",
-        type=_speed,
-        default=1.0,
-        metavar="X",
-        help="times real time, or inf for as fast as can be (default 1)",
-    )
-    parser.add_argument("--loop", action="store_true", help="begin again at the end")
-    add_bus(parser, "tool")
-    parser.set_defaults(func=run)
-
-
-def _speed(text: str) -> float:
-    return math.inf if text.lower() == "inf" else finite_above_zero(text, "times real time")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -8,10 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactile_tools.log.arguments import add_files, add_output, check_output
+from tactile_core.cli import progress
+from tactile_tools.log.arguments import check_output
 from tactile_tools.log.sources import Series, find_series
 from tactile_tools.log.stream import read_series
-from tactile_tools.log.terminal import ToolError, plain_console, progress
+from tactile_tools.log.terminal import ToolError, plain_console
 from tactile_tools.log.writing import LogOutput
 
 if TYPE_CHECKING:  # the daemon's rooms take a while to import: only where they are needed
@@ -20,33 +21,6 @@ if TYPE_CHECKING:  # the daemon's rooms take a while to import: only where they 
     from tactiled.sensing.settings import PipelineSettings
 
 METHODS = ("off", "ransac", "consensus")
-
-
-def fill(parser: argparse.ArgumentParser) -> None:
-    """Give ``tactile log reprocess`` its arguments."""
-    parser.description = (
-        "Run field, compensation, force and features again over the raw bytes of a "
-        "log. With the settings and calibration of the log they come out the same to the bit; "
-        "with others, as they would have been. Everything else is carried over."
-    )
-    add_files(parser)
-    add_output(parser, "new log (default: FILE's name with _reprocessed)")
-    parser.add_argument(
-        "--calibration",
-        action="append",
-        type=Path,
-        metavar="FILE",
-        help="*.cal.toml instead of the one in the log, by serial number; may be repeated",
-    )
-    parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="TOML of tactiled: [sensing], [compensation]"
-    )
-    parser.add_argument("--compensation", choices=METHODS, help="default: as in the log")
-    parser.add_argument(
-        "--compensation-rate", type=float, metavar="HZ", help="default: as in the log"
-    )
-    parser.add_argument("--feature-rate", type=float, metavar="HZ", help="default: as in the log")
-    parser.set_defaults(func=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -17,11 +17,11 @@ from rosbags.rosbag2.metadata import dump_qos_v8, parse_qos
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from tactile_core.cli import progress
 from tactile_core.log.info import LogInfo, info
 from tactile_core.log.recorder import LATCHED_QOS, QOS, is_latched
 from tactile_core.log.records import ChannelRecord, LogError
 from tactile_core.log.recovery import RecoveryError, recover
-from tactile_tools.log.arguments import add_files
 from tactile_tools.log.sources import Series, find_series
 from tactile_tools.log.stream import Reading, Stream, read_series
 from tactile_tools.log.terminal import (
@@ -29,27 +29,12 @@ from tactile_tools.log.terminal import (
     ToolError,
     cannot_write,
     plain_console,
-    progress,
 )
 
 METADATA = "metadata.yaml"
 
 VERSION = 5
 """Of the file: the newest whose fields every ROS 2 since Galactic reads the same way."""
-
-
-def fill(parser: argparse.ArgumentParser) -> None:
-    """Give ``tactile log rosbag`` its arguments."""
-    parser.description = (
-        f"Write {METADATA} for a log: beside its files, or with --out in a new folder "
-        "with the files (hard links where that can be, else copies; files that were cut off, or "
-        "have no indexes, which ros2 bag needs, are written anew). Types of tactile_msgs have to "
-        "be built in the workspace to be played."
-    )
-    add_files(parser)
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="new folder (default: beside)")
-    parser.add_argument("--force", action="store_true", help=f"overwrite a {METADATA}")
-    parser.set_defaults(func=run)
 
 
 def run(options: argparse.Namespace) -> int:

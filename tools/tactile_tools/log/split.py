@@ -8,12 +8,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from tactile_core.cli import progress
 from tactile_core.log.recorder import is_latched
 from tactile_core.log.records import MetadataRecord
 from tactile_core.log.writer import GAP
-from tactile_core.options import finite_above_zero
 from tactile_core.types import NS_PER_S
-from tactile_tools.log.arguments import add_files, check_output, moment, size_bytes
+from tactile_tools.log.arguments import check_output, moment
 from tactile_tools.log.sources import FILE, find_series
 from tactile_tools.log.stream import (
     Attachment,
@@ -25,7 +25,7 @@ from tactile_tools.log.stream import (
     first_ns,
     read_series,
 )
-from tactile_tools.log.terminal import ToolError, bytes_text, cannot_write, plain_console, progress
+from tactile_tools.log.terminal import ToolError, bytes_text, cannot_write, plain_console
 from tactile_tools.log.writing import LogOutput
 
 REPEATED_BYTES = 1 << 20
@@ -33,35 +33,6 @@ REPEATED_BYTES = 1 << 20
 configurations have kilobytes."""
 
 MAX_PARTS = 9999
-
-
-def fill(parser: argparse.ArgumentParser) -> None:
-    """Give ``tactile log split`` its arguments."""
-    parser.description = (
-        "Write a log as several files, which the other tools take as one again, nothing twice. "
-        "Each begins with the tables, small attachments and latched messages that hold there, so "
-        "that it can be used alone."
-    )
-    add_files(parser)
-    how = parser.add_mutually_exclusive_group(required=True)
-    how.add_argument(
-        "--every",
-        type=lambda text: finite_above_zero(text, "s"),
-        metavar="S",
-        help="s of each file",
-    )
-    how.add_argument("--size", type=size_bytes, metavar="SIZE", help="of each file, such as 500MB")
-    how.add_argument(
-        "--at",
-        action="append",
-        metavar="TIME",
-        help="cut there: s since the start, or UTC as 2026-01-31T12:00:00; may be repeated",
-    )
-    parser.add_argument(
-        "--out", type=Path, metavar="FOLDER", help="folder (default: FILE's name with _split)"
-    )
-    parser.add_argument("--force", action="store_true", help="overwrite files of the same names")
-    parser.set_defaults(func=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -7,17 +7,14 @@ import json
 import math
 import re
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from tactile_core.cli import CommandError
 from tactile_core.log.records import LogError
-from tactile_core.log.records import Progress as Report
 from tactile_core.types import NS_PER_S
 
 FAULTY, BAD_ARGUMENT, REFUSED = 1, 2, 3
@@ -29,12 +26,8 @@ PLAIN_WIDTH = 160
 """Columns of a table that goes into a pipe or a file."""
 
 
-class ToolError(Exception):
-    """What the user asked for cannot be done; the text names the remedy."""
-
-    def __init__(self, text: str, code: int = BAD_ARGUMENT) -> None:
-        super().__init__(text)
-        self.code = code
+class ToolError(CommandError):
+    """What the user asked of a log cannot be done."""
 
 
 def shown(text: object, limit: int | None = None) -> str:
@@ -91,19 +84,6 @@ def cannot_write(what: object, error: OSError) -> ToolError:
     full = error.errno in (errno.ENOSPC, errno.EDQUOT)
     remedy = "make room, or name a place on another disk" if full else "name a place to write to"
     return ToolError(f"cannot write {what}: {error.strerror or error}; {remedy}", REFUSED)
-
-
-@contextmanager
-def progress(what: str) -> Iterator[Report | None]:
-    """A progress bar in bytes, on a terminal alone (else None); it goes away when done."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    console = Console(stderr=True)
-    columns = (TextColumn(what), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(what)
-        yield lambda done, size: bar.update(task, completed=done, total=size)
 
 
 class PlainConsole(Console):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import sys
 import time
 from collections.abc import Callable, Iterator
 
@@ -13,9 +12,8 @@ import zenoh
 from tactile_core.bus.services import ServiceError
 from tactile_core.bus.session import BusError, close_session, open_session
 from tactile_core.bus.streams import list_alive
-from tactile_core.options import BusTable, add_bus, bus_config
-
-DONE, FAILED, USAGE, REFUSED = range(4)
+from tactile_core.cli import DONE, REFUSED, USAGE, CommandError
+from tactile_core.options import BusTable, bus_config
 
 FIND_S = 3.0
 """s for a tactiled to be found on the bus."""
@@ -27,37 +25,20 @@ STATUS_S = 3.0
 """s for a tactiled to answer what takes it no time."""
 
 
-class BoardError(Exception):
-    """What was asked cannot be done; the text names the remedy. ``code``: the exit status."""
-
-    def __init__(self, text: str, code: int) -> None:
-        super().__init__(text)
-        self.code = code
+class BoardError(CommandError):
+    """What was asked of a board cannot be done."""
 
 
-def add_board(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add BOARD and the flags of the bus."""
-    parser.add_argument(
-        "board", nargs="?", metavar="BOARD", help=f"name of the board {what}, as tactiled has it"
-    )
-    add_bus(parser, "tool")
-
-
-def run(name: str, work: Callable[[argparse.Namespace], None]) -> Callable[..., int]:
-    """``work`` as a command ``tactile name``: errors become one sentence and an exit status."""
+def told(work: Callable[[argparse.Namespace], None]) -> Callable[[argparse.Namespace], int]:
+    """``work`` as a command: what the bus or a daemon refuses is a `CommandError`."""
 
     def command(options: argparse.Namespace) -> int:
         try:
             work(options)
-        except BoardError as error:
-            print(f"tactile {name}: {error}", file=sys.stderr)
-            return error.code
         except BusError as error:
-            print(f"tactile {name}: {error}", file=sys.stderr)
-            return USAGE
+            raise BoardError(str(error), USAGE) from error
         except ServiceError as error:
-            print(f"tactile {name}: {error}", file=sys.stderr)
-            return REFUSED
+            raise BoardError(str(error), REFUSED) from error
         return DONE
 
     return command

@@ -8,7 +8,7 @@ import sys
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from tactile_core.options import BusTable, add_bus, bus_config, finite_above_zero
+from tactile_core.options import BusTable, bus_config
 
 if TYPE_CHECKING:
     import zenoh
@@ -41,36 +41,6 @@ class Part:
         self.problems.append(problem)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``health`` to the umbrella command."""
-    parser = subparsers.add_parser(
-        "health",
-        help="say in one line whether a rig is well",
-        description="Asks every board, reach and arm on the bus how it is. Exit: 0 all well; 1 to "
-        "be looked at (an alarm, features not valid, a late loop); 2 bad argument; 3 nobody "
-        "answers, or the bus cannot be joined; 4 failed (a board silent or refused, a log that is "
-        "not written, one that was named and is not there).",
-    )
-    for kind in KINDS:
-        parser.add_argument(
-            f"--{CALLED[kind]}",
-            action="append",
-            default=[],
-            metavar="NAME",
-            help=f"{CALLED[kind]} that must be there; may be repeated (default: those that are)",
-        )
-    parser.add_argument(
-        "--timeout",
-        type=lambda text: finite_above_zero(text, "s"),
-        default=2.0,
-        metavar="S",
-        help="how long to wait for answers (s; default %(default)g)",
-    )
-    parser.add_argument("--json", action="store_true", help="print all of it as JSON")
-    add_bus(parser, "tool")
-    parser.set_defaults(func=run)
-
-
 def run(options: argparse.Namespace) -> int:
     """Ask and tell; the exit status says how it is."""
     from tactile_core.bus.session import BusError, close_session, open_session
@@ -82,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
         return NOBODY
     try:
         wanted = {kind: list(getattr(options, CALLED[kind])) for kind in KINDS}
-        parts = look(session, wanted, options.timeout)
+        parts = look(session, wanted, options.wait)
     finally:
         close_session(session)
     level = max((part.level for part in parts), default=NOBODY)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-OK, REFUSED = 0, 3
+from tactile_core.cli import DONE, REFUSED, CommandError
 
 CONFIGURATION = Path("etc/tactile")
 PLACES = {
@@ -29,10 +29,6 @@ NAMES = {"tactile.sysusers": "tactile.conf"}
 """Names they have there, where they differ."""
 
 UNITS = ("tactiled.service", "reachd.service")
-
-
-class ServiceProblem(Exception):  # noqa: N818 - a refusal, with its remedy
-    """The system does not allow what was asked for."""
 
 
 @dataclass(frozen=True)
@@ -63,72 +59,41 @@ class Plan:
         )
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``service`` to the umbrella command."""
-    parser = subparsers.add_parser(
-        "service",
-        help="install tactiled and reachd as systemd services, or take them away",
-        description="Installs units, udev rules, a user and first configurations, or takes them "
-        "away; how to run them: docs/operations.md. Needs root, unless --root or --dry-run is "
-        "given.",
-    )
-    tools = parser.add_subparsers(dest="service_tool", metavar="TOOL", required=True)
-    install = tools.add_parser("install", help="put the files in place; nothing is started")
-    remove = tools.add_parser("uninstall", help="stop the services and delete the files")
-    for tool, what in ((install, "written"), (remove, "deleted")):
-        tool.add_argument(
-            "--root",
-            type=Path,
-            default=Path("/"),
-            metavar="DIR",
-            help="folder to take for the root of the system (default /)",
-        )
-        tool.add_argument(
-            "--dry-run", action="store_true", help=f"say what would be {what}, and do nothing"
-        )
-    install.add_argument(
-        "--bin",
-        type=Path,
-        metavar="DIR",
-        help="folder of tactiled and reachd (default: where this command is)",
-    )
-    install.set_defaults(func=lambda options: _guarded(_install, options))
-    remove.add_argument(
-        "--purge", action="store_true", help="delete configurations in /etc/tactile as well"
-    )
-    remove.set_defaults(func=lambda options: _guarded(_uninstall, options))
+def install(options: argparse.Namespace) -> int:
+    """``tactile service install``."""
+    return _guarded(_put, options)
+
+
+def uninstall(options: argparse.Namespace) -> int:
+    """``tactile service uninstall``."""
+    return _guarded(_take_away, options)
 
 
 def _guarded(work: Callable[[argparse.Namespace], object], options: argparse.Namespace) -> int:
     if not options.root.is_dir():
-        print(f"tactile service: --root {options.root}: there is no such folder", file=sys.stderr)
-        return 2
+        raise CommandError(f"--root {options.root}: no such folder")
     try:
         work(options)
-    except ServiceProblem as problem:
-        print(f"tactile service: {problem}", file=sys.stderr)
-        return REFUSED
     except PermissionError as error:
-        print(
-            f"tactile service: {error.filename}: {error.strerror}; run it as root, or with --root",
-            file=sys.stderr,
-        )
-        return REFUSED
+        raise CommandError(
+            f"{error.filename}: {error.strerror}; run it as root, or with --root", REFUSED
+        ) from error
     except OSError as error:
-        print(f"tactile service: {error.filename}: {error.strerror}", file=sys.stderr)
-        return REFUSED
-    return OK
+        raise CommandError(f"{error.filename}: {error.strerror}", REFUSED) from error
+    return DONE
 
 
-def _install(options: argparse.Namespace) -> None:
+def _put(options: argparse.Namespace) -> None:
     programs = (options.bin or Path(sys.argv[0]).parent).absolute()
     if not (programs / "tactiled").exists():
         programs = Path(sys.executable).parent
     missing = [name for name in ("tactiled", "reachd") if not (programs / name).exists()]
     if missing:
-        raise ServiceProblem(f"{programs} has no {missing[0]}: name their folder with --bin")
+        raise CommandError(f"{programs} has no {missing[0]}: name their folder with --bin", REFUSED)
     if any(c in str(programs) for c in " \t%$\"'\\"):
-        raise ServiceProblem(f"{programs}: a unit cannot name this path; install it elsewhere")
+        raise CommandError(
+            f"{programs}: a unit cannot name this path; install it elsewhere", REFUSED
+        )
     plan = Plan(options.root, programs, options.dry_run)
     for name, folder in PLACES.items():
         target = plan.target(name)
@@ -154,7 +119,7 @@ def _install(options: argparse.Namespace) -> None:
     )
 
 
-def _uninstall(options: argparse.Namespace) -> None:
+def _take_away(options: argparse.Namespace) -> None:
     plan = Plan(options.root, Path("/"), options.dry_run)
     if plan.live:
         _tell(["systemctl", "disable", "--now", *UNITS])

@@ -17,22 +17,6 @@ INDENT = 13
 """Columns before what is said of each matter."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``status`` to the umbrella command."""
-    parser = subparsers.add_parser(
-        "status",
-        help="how the boards of a running tactiled do",
-        description="Says of each board what it feels, whether that can be relied on and if not "
-        "why, its rest, rate, clock, losses, taxels, calibration and log.",
-        epilog="exit status: 0 told; 2 no such board; 3 no tactiled.",
-    )
-    boards.add_board(parser, "(default: all)")
-    parser.add_argument(
-        "--json", action="store_true", help="everything tactiled knows, an object by board"
-    )
-    parser.set_defaults(func=boards.run("status", status))
-
-
 def status(options: argparse.Namespace) -> None:
     """Print what tactiled says of one board, or of all."""
     with boards.bus(options) as session:
@@ -51,6 +35,9 @@ def status(options: argparse.Namespace) -> None:
     width = shutil.get_terminal_size().columns
     for name, values in told.items():
         print("\n".join(describe(name, values, width)))
+
+
+run = boards.told(status)
 
 
 def describe(name: str, values: Mapping[str, Any], width: int) -> list[str]:

@@ -8,8 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tactile_core.cli import progress, require, working
 from tactile_tools.log.sources import find_series
-from tactile_tools.log.terminal import ToolError, progress
+from tactile_tools.log.terminal import ToolError
 
 if TYPE_CHECKING:
     from tactile_tools.plot.series import BoardSeries
@@ -17,68 +18,12 @@ if TYPE_CHECKING:
 WHATS = ("reach", "taxels", "forces", "field", "timing")
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``plot`` to the umbrella command."""
-    parser = subparsers.add_parser(
-        "plot",
-        help="draw a reach, taxel maps, forces, the field removed or the timing of a log",
-        description="Draw a log. reach: the cupboard from above and what happened; taxels: maps of "
-        "each side at the strongest moments (circles: normal force, arrows: shear); forces: "
-        "features and events over time; field: what compensation removed; timing: clock and "
-        "latency. No display is needed.",
-    )
-    parser.add_argument(
-        "files",
-        nargs="+",
-        type=Path,
-        metavar="FILE",
-        help="MCAP log, whole or cut off; a folder; or the name that the files of a log share",
-    )
-    parser.add_argument(
-        "--out", type=Path, metavar="PICTURE", help="default: FILE with .png, or with --format"
-    )
-    parser.add_argument(
-        "--what",
-        choices=WHATS,
-        help="default: the reach if the log holds one, else an overview of the skin",
-    )
-    parser.add_argument("--name", help="board to draw (default: the one with the most taxels)")
-    parser.add_argument(
-        "--reach",
-        type=int,
-        metavar="N",
-        help="which of several reaches to draw, in the order they began (default: the last)",
-    )
-    parser.add_argument("--arm", help="arm of the reach (default: the one heard most)")
-    parser.add_argument(
-        "--size",
-        choices=("screen", "page", "column"),
-        default="screen",
-        help="how wide: for a screen (default), a paper's page (180 mm) or its column (89 mm)",
-    )
-    parser.add_argument("--format", choices=("png", "pdf", "svg"), help="default: by --out, or png")
-    parser.add_argument(
-        "--dpi",
-        type=int,
-        metavar="N",
-        help="dots an inch, 30 to 600 (default: 100 for a screen, 300 for a paper)",
-    )
-    parser.add_argument(
-        "--at",
-        type=float,
-        action="append",
-        metavar="S",
-        help="moment of the taxel maps, s since the first cycle (default: the strongest); may be "
-        "repeated",
-    )
-    parser.set_defaults(func=run)
-
-
 def run(options: argparse.Namespace) -> int:
     """Draw; 0 when the picture was written, 2 for a bad argument, 3 for an unreadable log."""
     from tactile_core.log.records import LogError
     from tactile_tools.plot.series import LogUnreadableError
 
+    require("matplotlib", "scipy", extra="plot")
     try:
         first = find_series(options.files)[0].paths[0]
         out = options.out or first.with_suffix(f".{options.format or 'png'}")
@@ -143,16 +88,16 @@ def _draw_skin(options: argparse.Namespace, out: Path) -> str:
     with progress("reading") as report:
         boards = read_boards(options.files, report)
     held = sorted(boards)
-    if options.name is not None and options.name not in boards:
-        raise ToolError(f"no board {options.name!r} in the log; it holds {', '.join(held)}")
-    name = options.name or max(held, key=lambda n: boards[n].force[0].size)
+    if options.board is not None and options.board not in boards:
+        raise ToolError(f"no board {options.board!r} in the log; it holds {', '.join(held)}")
+    name = options.board or max(held, key=lambda n: boards[n].force[0].size)
     board: BoardSeries = boards[name]
     for at in options.at or ():
         if not board.first - 1.0 <= at <= board.last + 1.0:
             raise ToolError(
                 f"--at {at:g}; the log of {name} goes from {board.first:.2f} to {board.last:.2f} s"
             )
-    look = LOOKS[options.size]
+    look = LOOKS[options.width]
     title = of_several("board", name, held) if len(held) > 1 else ""
     style: dict[str, Any] = {"look": look, "dpi": options.dpi, "title": title}
     drawers: dict[str, Callable[[], Any]] = {
@@ -161,13 +106,14 @@ def _draw_skin(options: argparse.Namespace, out: Path) -> str:
         "field": lambda: draw_field(board, out, **style),
         "timing": lambda: draw_timing(board, out, **style),
     }
-    if options.what in drawers:
-        drawers[options.what]()
-    else:
-        draw(board, out, at=options.at[0] if options.at else None, **style)
-    if len(held) == 1 or options.name is not None:
+    with working("drawing"):
+        if options.what in drawers:
+            drawers[options.what]()
+        else:
+            draw(board, out, at=options.at[0] if options.at else None, **style)
+    if len(held) == 1 or options.board is not None:
         return ""
-    return f"drawn: {of_several('board', name, held, most=len(held))}; choose with --name"
+    return f"drawn: {of_several('board', name, held, most=len(held))}; choose with --board"
 
 
 def _draw_reach(options: argparse.Namespace, out: Path, *, must: bool) -> str | None:
@@ -178,12 +124,14 @@ def _draw_reach(options: argparse.Namespace, out: Path, *, must: bool) -> str | 
     from tactile_tools.plot.series import LogUnreadableError
 
     try:
-        reach = read_reach(options.files, options.reach, options.name, options.arm)
+        with working("reading"):
+            reach = read_reach(options.files, options.reach, options.board, options.arm)
     except LogUnreadableError:
         if must:
             raise
         return None
-    draw(reach, out, LOOKS[options.size], options.dpi)
+    with working("drawing"):
+        draw(reach, out, LOOKS[options.width], options.dpi)
     said = []
     if len(reach.all_reaches) > 1 and options.reach is None:
         said.append(
@@ -191,7 +139,7 @@ def _draw_reach(options: argparse.Namespace, out: Path, *, must: bool) -> str | 
             + listed(reach.all_reaches)
         )
     for what, flag, asked, name, held in (
-        ("board", "--name", options.name, reach.board_name, reach.boards),
+        ("board", "--board", options.board, reach.board_name, reach.boards),
         ("arm", "--arm", options.arm, reach.arm_name, reach.arms),
     ):
         if len(held) > 1 and asked is None:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import io
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import pytest
 from rich.console import Console
 from rich.table import Table
 
+from tactile_core.cli import LiveLines
 from tactile_core.log.recorder import Recorder
-from tactile_core.terminal import LiveLines
 
 
 class Lines(LiveLines):
@@ -55,12 +55,13 @@ def test_a_terminal_shows_the_rows_and_below_them_the_log(recorder: Recorder) ->
 def test_elsewhere_there_are_plain_lines_now_and_then(
     recorder: Recorder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    now: list[Any] = [0]
-    monkeypatch.setattr("tactile_core.terminal.monotonic_now", lambda: now[0])
+    now: list[float] = [0.0]
+    monkeypatch.setattr("tactile_core.cli.monotonic", lambda: now[0])
     out = io.StringIO()
     caplog.set_level("INFO")
     with Lines(Console(file=out), recorder) as lines:
-        for now[0] in range(0, 12_000_000_000, 200_000_000):
+        for step in range(60):
+            now[0] = step * 0.2
             lines.show()
     assert (
         caplog.messages
