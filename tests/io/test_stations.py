@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from sensor_proto.can_transfers import BusState, CanDecoder, CanEncoder
 from sensor_proto.packets import Samples, Start
@@ -188,23 +189,22 @@ def test_virtual_buses_may_be_served_too() -> None:
     plan.station.close()
 
 
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
-def test_the_status_says_rates_and_losses_on_a_terminal_only(request_of: BoardsRequest) -> None:
+def test_the_status_says_rates_and_losses_on_a_terminal_only(
+    request_of: BoardsRequest, capsys: pytest.CaptureFixture[str]
+) -> None:
     planned = plan_boards(replace(request_of, ptys=request_of.ptys[:1]))
     station: Any = planned[0].station
-    terminal, pipe = Terminal(), io.StringIO()
-    for stream in (terminal, pipe):
+    terminal, pipe = io.StringIO(), io.StringIO()
+    for stream, terminal_like in ((terminal, True), (pipe, False)):
         station.sent = 0
-        status = StatusLine(planned, stream)
-        status.show(0.0)
-        station.sent = 50
-        station.port.send(b"abc")  # it is closed: lost
-        status.show(0.5)
-        status.end()
+        console = Console(file=stream, force_terminal=terminal_like, width=160)
+        with StatusLine(planned, console) as status:
+            status.show_at(0.0)
+            station.sent = 50
+            station.port.send(b"abc")  # it is closed: lost
+            status.show_at(0.5)
+    status.sum_up()
     name = str(request_of.ptys[0])
     assert f"0.5 s  {name} 100/s lost 3" in terminal.getvalue()
-    assert pipe.getvalue() == f"{name}: 50 sent; unplugged_bytes 6\n"
+    assert pipe.getvalue() == ""
+    assert capsys.readouterr().err == f"{name}: 50 sent; unplugged_bytes 6\n"

@@ -14,6 +14,7 @@ import pytest
 
 from tactile_core.log.mcap_file import DiskStorage
 from tactile_core.log.records import LogError
+from tactile_tools.cli import make_parser
 from tactile_tools.log import cat, doctor, export, info, recover
 from tactile_tools.log.terminal import ToolError, fail
 
@@ -23,9 +24,7 @@ READ = 6
 
 
 def options(tool: Any, *words: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    tool.fill(parser)
-    return parser.parse_args(words)
+    return make_parser().parse_args(["log", tool.__name__.rpartition(".")[2], *words])
 
 
 def outcome(run: Callable[[argparse.Namespace], int], given: argparse.Namespace) -> int:

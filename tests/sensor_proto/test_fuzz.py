@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from sensor_proto import packets
+from tactile_tools.cli import main
 from tactile_tools.dev import fuzz
 from tactile_tools.dev.fuzzers.can import KINDS as CAN_KINDS
 from tactile_tools.dev.fuzzers.messages import random_messages
@@ -74,16 +73,12 @@ def test_misuse_is_refused(arguments: tuple[int, int, int]) -> None:
 
 
 def run(*words: str) -> int:
-    parser = argparse.ArgumentParser()
-    fuzz.add_parser(parser.add_subparsers())
-    options = parser.parse_args(["fuzz", *words])
-    code: Any = options.func(options)
-    return int(code)
+    return main(["fuzz", *words])
 
 
 def test_the_command_writes_its_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "fuzz.json"
-    assert run("--frames", "500", "--seed", "4", "--jobs", "1", "--json", str(out)) == 0
+    assert run("--frames", "500", "--seed", "4", "--jobs", "1", "--out", str(out)) == 0
     assert json.loads(out.read_text())["wrong"] == 0
     assert "0 accepted wrongly" in capsys.readouterr().out
 
@@ -99,5 +94,5 @@ def test_bad_arguments_exit_with_2(words: list[str], capsys: pytest.CaptureFixtu
 def test_a_missing_directory_is_named_before_the_work(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run("--json", str(tmp_path / "absent" / "fuzz.json")) == 2
+    assert run("--out", str(tmp_path / "absent" / "fuzz.json")) == 2
     assert "absent" in capsys.readouterr().err
