@@ -79,7 +79,6 @@ def cupboard(arguments: argparse.Namespace) -> int:
     """``simdevice cupboard``."""
     from sim_device.arm.cupboard_plan import goal_text, plan_cupboard, scene_of
     from sim_device.world.base import WorldError
-    from sim_device.world.engines import EngineMissing
 
     try:
         request = _cupboard_request(arguments)
@@ -87,7 +86,7 @@ def cupboard(arguments: argparse.Namespace) -> int:
             print(goal_text(scene_of(request)))
             return DONE
         planned = plan_cupboard(request)
-    except (EngineMissing, WorldError) as error:
+    except WorldError as error:
         raise CommandError(str(error), REFUSED) from error
     except ValueError as error:
         raise CommandError(str(error)) from error

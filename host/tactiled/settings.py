@@ -21,7 +21,7 @@ from tactile_core.bus.topics import NAME
 from tactile_core.calibration import CalibrationError, load
 from tactile_core.calibration.nominal import MAX_ANYSKIN_MAGNETOMETERS
 from tactile_core.can_bus import CanSpec
-from tactile_core.cli import KINDS
+from tactile_core.cli import KINDS, require
 from tactile_core.config import ConfigError, Count, Rate, given, load_toml, table_of, unit
 from tactile_core.log.recorder import RecorderSettings
 from tactile_core.options import BusTable, LogTable, bus_config, log_destination
@@ -370,9 +370,12 @@ def pipeline_settings(file: ConfigFile) -> PipelineSettings:
 def _pipeline(options: argparse.Namespace, file: ConfigFile, path: Path | None) -> PipelineSettings:
     try:
         settings = pipeline_settings(file)
+        method = options.compensation or settings.method
+        if method == "ransac":  # before a board is opened, not on the pipeline's thread
+            require("sklearn", extra="calibrate", what="compensation ransac")
         return replace(
             settings,
-            method=options.compensation or settings.method,
+            method=method,
             compensation_rate_hz=options.compensation_rate or settings.compensation_rate_hz,
             feature_rate_hz=options.feature_rate or settings.feature_rate_hz,
         )

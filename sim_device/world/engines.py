@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, cast, get_args
+
+from tactile_core.cli import EXTRAS, MissingExtraError, require
 
 if TYPE_CHECKING:
     from sim_device.world.base import World
@@ -21,12 +22,8 @@ _CLASSES: Final[dict[str, str]] = {
     "pymunk": "PymunkWorld",
     "pybullet": "PybulletWorld",
 }
-_EXTRAS: Final[dict[str, str]] = {"pymunk": "crosscheck", "pybullet": "reference"}
-"""Optional extra that brings an engine."""
-
-
-class EngineMissing(ValueError):  # noqa: N818 - names a state of the installation
-    """The engine asked for is not installed; the message says how to get it."""
+EngineMissing = MissingExtraError
+"""The engine asked for is not installed; the message says how to get it."""
 
 
 class WorldMaker(Protocol):
@@ -41,10 +38,7 @@ def world_maker(engine: str) -> WorldMaker:
     """How to build a world in ``engine``; `EngineMissing`, or ValueError: there is none such."""
     if engine not in _CLASSES:
         raise ValueError(f"unknown engine {engine!r}; there are: {', '.join(ENGINES)}")
-    if find_spec(engine) is None:
-        raise EngineMissing(
-            f"engine {engine!r} is not installed: pip install 'tactile-reach[{_EXTRAS[engine]}]'"
-        )
+    require(engine, extra=EXTRAS[engine], what=f"engine {engine!r}")
     module: Any = import_module(f"sim_device.world.{engine}_world")
     return cast("WorldMaker", getattr(module, _CLASSES[engine]))
 

@@ -60,7 +60,7 @@ def test_a_text_sketch_a_declared_board_and_a_mute_adapter_stream_and_replay(
 @pytest.mark.parametrize(
     ("sent", "words", "said"),
     [
-        (("--format", "floats:5xyz"), (), "--board floats:5xyz"),
+        (("--format", "floats:5xyz"), (), "--kind floats:5xyz"),
         (("--arrays", "5+5"), ("--arrays", "5+4"), "5+4 names 9 magnetometers"),
     ],
 )

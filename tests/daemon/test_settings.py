@@ -155,7 +155,7 @@ def test_rates_and_times_are_finite_and_above_zero(
     assert caught.value.code == 2
     told = capsys.readouterr().err
     assert flag in told
-    assert f"{value} given; allowed" in told
+    assert f"{value!r} given; allowed" in told
 
 
 def test_exit_status_of_the_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -98,11 +98,11 @@ def test_a_board_streams_that_is_plain_or_declared(
     ("sent", "words", "board"),
     [
         ("floats:5xyz,end=crlf", "62 bytes ending in CR LF: 15 floats, no temperatures",
-         "--board floats:5xyz"),
-        ("floats:4xyz,end=crlf", "12 floats, no temperatures", "--board floats:4xyz"),
+         "--kind floats:5xyz"),
+        ("floats:4xyz,end=crlf", "12 floats, no temperatures", "--kind floats:4xyz"),
         ("int16:5xyz,big,start=aa55,check=sum,end=none", "big-endian 16-bit integers",
-         "--board int16:5xyz,big,start=aa55,check=sum,end=none"),
-        ("text:5xyz", "lines of 15 numbers", "--board text:5xyz"),
+         "--kind int16:5xyz,big,start=aa55,check=sum,end=none"),
+        ("text:5xyz", "lines of 15 numbers", "--kind text:5xyz"),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("uart", [False, True])

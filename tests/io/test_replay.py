@@ -176,7 +176,7 @@ def test_a_recording_goes_whole_through_simdevice_and_a_terminal(tmp_path: Path)
     )  # fmt: skip
     assert process.stdout is not None
     said = process.stdout.readline()
-    assert f"tactiled --port {link} --board anyskin" in said
+    assert f"tactiled --port {link} --kind anyskin" in said
     host = SerialTransport(str(link))
     host.open()
     data = read_to_the_end(host)

@@ -228,13 +228,13 @@ def test_calibration_is_of_the_very_board_that_boards_simulates(
 
 BAD = [
     (["boards"], "no port given; allowed: --pty, --slcan and --can"),
-    (["boards", "--pty", "p", "--rate", "-5"], "'-5' given; allowed: a number from 0.1 to 1000"),
+    (["boards", "--pty", "p", "--rate", "-5"], "Hz from 0.1 to 1000"),
     (["boards", "--pty", "p", "--rate", "nan"], "'nan' given"),
     (["boards", "--pty", "p", "--rate", "900"], "900"),
     (["boards", "--pty", "p", "--duration", "0"], "'0' given; allowed"),
     (["boards", "--pty", "p", "--duration", "inf"], "'inf' given; allowed"),
     (["boards", "--pty", "p", "--seed", "-1"], "allowed: a whole number from 0"),
-    (["boards", "--pty", "p", "--temperature", "500"], "allowed: a number from -40 to 85"),
+    (["boards", "--pty", "p", "--temperature", "500"], "°C from -40 to 85"),
     (["boards", "--pty", "p", "--rotate", "fast"], "'fast' is not understood"),
     (["boards", "--pty", "p", "--faults", "gremlins=1"], "'gremlins=1' is not understood; allowed"),
     (["boards", "--pty", "p", "--faults", "flip=2"], "probability from 0 to 1"),

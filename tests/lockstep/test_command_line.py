@@ -22,8 +22,8 @@ BAD = [
     (["--seed", "seven"], "allowed: a whole number from 0"),
     (["--trial-seed", "1e3"], "allowed: a whole number from 0"),
     (["--set", "mine"], "there are: hardware, authors_sim"),
-    (["--depth", "skin"], "'contacts', 'taxels'"),
-    (["--engine", "bullet"], "'mujoco', 'pymunk'"),
+    (["--depth", "skin"], "allowed: contacts, taxels"),
+    (["--engine", "bullet"], "allowed: mujoco, pymunk"),
     (["--png", "x.png"], "give --log as well"),
     (["--log", "x.mcap", "--png", "nowhere/x.png"], "there is no folder nowhere"),
 ]
@@ -129,8 +129,8 @@ def test_a_strategy_of_ones_own_lies_in_the_folder_and_may_fail(
         (["--scene", "attic"], 2, "allowed: authors_sim, hardware"),
         (["--strategy", "luck"], 2, "there are: straight, burrow"),
         (["--seed", "-1"], 2, "allowed: a whole number"),
-        (["--out", "nowhere/x.mcap"], 2, "there is no folder nowhere"),
-        (["--png", "nowhere/x.png"], 2, "there is no folder nowhere"),
+        (["--log", "nowhere/x.mcap"], 2, "no such folder: nowhere"),
+        (["--png", "nowhere/x.png"], 2, "no such folder: nowhere"),
     ],
 )
 def test_demo_refuses_what_it_cannot_do(
@@ -146,8 +146,10 @@ def test_demo_deletes_no_file_that_is_no_log(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("thesis.txt").write_text("years of work")
-    assert code_of(["demo", "--out", "thesis.txt"]) == 2
-    assert "thesis.txt is there and is no log" in capsys.readouterr().err
+    assert code_of(["demo", "--log", "thesis.txt"]) == 2
+    assert "overwrite it with --force" in capsys.readouterr().err
+    assert code_of(["demo", "--log", "thesis.txt", "--force"]) == 2
+    assert "thesis.txt exists and is not a log" in capsys.readouterr().err
     assert Path("thesis.txt").read_text() == "years of work"
 
 

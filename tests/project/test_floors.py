@@ -109,7 +109,7 @@ def test_the_pure_rooms_of_tactiled_own_no_thread_file_or_clock(room: str) -> No
         assert not imported(path) & IO_MODULES, path.name
 
 
-@pytest.mark.parametrize("module", ["tactiled.cli", "sim_device.cli", "tactile_tools.log.cli"])
+@pytest.mark.parametrize("module", ["tactiled.daemon", "reachd.daemon", "sim_device.runner"])
 def test_start_up_waits_for_no_slow_library(module: str) -> None:
     code = (
         f"import {module}, sys; "

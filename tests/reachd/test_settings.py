@@ -137,7 +137,7 @@ def test_times_and_sizes_are_finite_and_above_zero(
     with pytest.raises(SystemExit) as caught:
         settings("--target", "0.3,0", f"{flag}={value}")
     assert caught.value.code == 2
-    assert f"{value} given; allowed" in capsys.readouterr().err
+    assert f"{value!r} given; allowed" in capsys.readouterr().err
 
 
 def test_an_unknown_strategy_lists_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:

@@ -79,7 +79,7 @@ def test_boards_of_one_controller_sit_on_different_sides() -> None:
     [{"arrays": (5, 5)}, {"format": "reskin-text"}, {"banner": True}],
 )
 def test_only_boards_that_send_floats_write_otherwise(options: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="--board anyskin"):
+    with pytest.raises(ValueError, match="--kind anyskin"):
         plan_boards(BoardsRequest(ptys=(Path("a"),), **options))  # type: ignore[arg-type]
     (planned,) = plan_boards(BoardsRequest(ptys=(Path("a"),), board="anyskin", **options))  # type: ignore[arg-type]
     assert planned.connect.startswith("tactiled --port a")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 from collections.abc import Sequence
@@ -29,6 +30,7 @@ from tactile_core.cli import (
     positive,
     run_command,
     seconds,
+    seed,
     whole,
 )
 
@@ -315,7 +317,7 @@ def _fill_reach(parser: Parser) -> None:
     add_strategy(parser)
     add_seeds(parser)
     # Until --seed became the trial's alone.
-    parser.add_argument("--trial-seed", type=natural, help="==SUPPRESS==")
+    parser.add_argument("--trial-seed", type=seed, help=argparse.SUPPRESS)
     add_scene(parser)
     parser.add_argument("--set", metavar="SET", help="parameter set (default: that of the scene)")
     add_depth(parser)

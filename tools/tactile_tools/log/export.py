@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from tactile_core.bus.messages import DecodeError
 from tactile_core.bus.topics import RAW, find_topic
-from tactile_core.cli import progress
+from tactile_core.cli import progress, require
 from tactile_tools.log.arguments import Selection, select
 from tactile_tools.log.stream import Reading, Record, Stream, read_merged
 from tactile_tools.log.terminal import (
@@ -43,6 +43,8 @@ has it was made by this tool, and may be overwritten with --force."""
 
 def run(options: argparse.Namespace) -> int:
     """Export; 0 when every message was written, 1 when some were lost or could not be decoded."""
+    if options.format != "npz":
+        require("pyarrow", extra="export")
     chosen = select(options)
     left_out: set[str] = set()
     if chosen.wanted is None:
