@@ -6,90 +6,96 @@ STAMP := $(VENV)/.installed
 SOAK_MINUTES ?= 60
 KILLS ?= 1000
 
-.PHONY: setup test test-random lint docs-reference demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage stress soak fuzz-pipeline kills docs pictures clean
+.DEFAULT_GOAL := help
+.PHONY: help setup test test-random lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage stress soak fuzz-pipeline kills docs docs-reference pictures clean
 
-setup: $(STAMP)
+help:  ## list the targets (what `make` alone does)
+	@echo "make TARGET, where TARGET is one of:"
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  \1\t\2/' | expand -t 18
+
+setup: $(STAMP)  ## make .venv with everything the tests need: minutes, several hundred MB
 
 $(STAMP): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; name one with make PYTHON=python3.12")'
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@echo "Setting up $(VENV): takes some minutes and fetches several hundred MB the first time."
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --disable-pip-version-check --editable '.[dev]'
 	@touch $@
 
-lint: setup
+lint: setup  ## style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: lint
+test: lint  ## set everything up, pass lint and all tests
 	$(BIN)/python -m pytest -n 2
 
 # The property tests on new examples; `make test` draws the same ones every time. RUNS=20: as often.
 RUNS ?= 1
-test-random: setup
+test-random: setup  ## the property tests on new examples; RUNS=20: as often
 	@for run in $$(seq $(RUNS)); do \
 	  $(BIN)/python -m pytest -q -n 2 --hypothesis-profile=random -m "hypothesis or random" || exit 1; done
 
 # The reference of every configuration file, from the code that reads them.
-docs-reference: setup
+docs-reference: setup  ## the reference of configuration files, from the code
 	$(BIN)/python -m tactile_tools.dev.config_reference docs/configuration.md
 
-demo: setup
-	$(BIN)/tactile demo --out demo.mcap --png demo.png
+demo: setup  ## reach into a simulated cupboard, leave a log and a picture
+	$(BIN)/tactile demo
 
-demo-skin: setup
-	$(BIN)/tactile demo-skin --out demo-skin.mcap --png demo-skin.png
+demo-skin: setup  ## press simulated boards, leave a log and a picture
+	$(BIN)/tactile demo-skin
 
 # The longer runs. Each leaves its result where docs/results keeps it.
-bench: setup
+bench: setup  ## measure every promised figure
 	$(BIN)/tactile bench --out docs/results/bench.json
 
-fuzz: setup
+fuzz: setup  ## ten million corrupted frames
 	$(BIN)/tactile fuzz --frames 10000000 --out docs/results/fuzz.json
 
-crash: setup
+crash: setup  ## a thousand kills of processes that log
 	$(BIN)/tactile crash --kills 1000 --out docs/results/crash.json
 
-fidelity: setup
+fidelity: setup  ## compare with the authors' recorded outcomes
 	$(BIN)/tactile fidelity --out docs/results/fidelity.json
 
-mutation: setup
+mutation: setup  ## mutate the safety gate
 	$(BIN)/tactile mutation --out docs/results/mutation.json
 
 # A million random inputs through the safety gate.
-gate-random: setup
+gate-random: setup  ## a million random inputs through the safety gate
 	REACH_RANDOM_INPUTS=1000000 REACH_RANDOM_JSON=docs/results/gate.json $(BIN)/python -m pytest -q tests/reach/test_gate_random.py
 
 # Every branch of the safety gate is taken by its tests, or this fails.
-gate-coverage: setup
+gate-coverage: setup  ## every branch of the safety gate is taken by its tests
 	REACH_RANDOM_INPUTS=4000 $(BIN)/python -m coverage run --branch --source=host/reachd -m pytest -q tests/reach -k gate
 	$(BIN)/python -m coverage report -m --fail-under=100 --include='*/gate/*.py'
 
 # An hour of reaching while the machine is loaded and its memory churned.
-stress: setup
+stress: setup  ## an hour of reaching while the machine is loaded
 	$(BIN)/tactile bench --only stress --out docs/results/stress.json
 
 # An hour of four boards, one of them pulled out and plugged in each second.
-soak: setup
+soak: setup  ## an hour of four boards, one replugged each second
 	$(BIN)/tactile soak --minutes $(SOAK_MINUTES) --out docs/results/soak.json
 
 # A million frames with right CRCs that say anything, through links and pipeline.
-fuzz-pipeline: setup
+fuzz-pipeline: setup  ## a million hostile frames through the pipeline
 	$(BIN)/tactile fuzz --through pipeline --frames 1000000 --out docs/results/fuzz-pipeline.json
 
 # A thousand kills of simulator, tactiled and reachd while they reach; two to three hours.
-kills: setup
+kills: setup  ## a thousand kills while they reach; two to three hours
 	$(BIN)/tactile crash --processes --kills $(KILLS) --out docs/results/kills.json
 
 # The documents as a site in build/site, offline.
-docs: setup
+docs: setup  ## the documents as a site in build/site
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	$(BIN)/mkdocs build --strict
 
 # Pages and pictures that are made from the code.
-pictures: setup
+pictures: setup  ## pages and pictures that are made from the code
 	$(BIN)/python -m tactile_tools.dev.architecture docs/pictures
 	$(BIN)/python -m tactile_tools.dev.topics_page docs/topics.md
 
-clean:
+clean:  ## delete .venv and what tools leave
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache

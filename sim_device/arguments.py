@@ -139,7 +139,7 @@ def _fill_boards(boards: Parser) -> None:
         help="boards behind a simulated USB-CAN adapter (slcan) on a pseudo-terminal",
     )  # fmt: skip
     ports.add_argument(
-        "--can", action="append", default=[], metavar="BUS",
+        "--can", action="append", default=[], metavar="SPEC",
         type=loaded("sim_device.ports_plan:parse_bus"),
         help="boards on a bus of python-can: socketcan:vcan0, virtual:0 (same process only), "
         "with +fd for CAN FD",

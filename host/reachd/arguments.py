@@ -57,7 +57,7 @@ def make_parser() -> argparse.ArgumentParser:
     add = reach.add_argument
     add(
         "--strategy",
-        metavar="S",
+        metavar="NAME",
         help=f"{', '.join(STRATEGIES)}, one of an installed package, or module:Class "
         f"(default {DEFAULT_STRATEGY})",
     )

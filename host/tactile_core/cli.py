@@ -117,6 +117,12 @@ class Formatter(argparse.HelpFormatter):
     def __init__(self, prog: str, **options: Any) -> None:
         super().__init__(prog, **({"max_help_position": 26} | options))
 
+    def add_argument(self, action: argparse.Action) -> None:
+        """Add a line; commands stand two columns further in, which argparse forgets."""
+        super().add_argument(action)
+        if isinstance(action, argparse._SubParsersAction):
+            self._action_max_length += 2
+
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         if "\n" not in text.strip():
             return super()._fill_text(text, width, indent)
@@ -277,10 +283,15 @@ def add_commands(
     parser.set_defaults(func=list_them)
 
 
-def later(place: str) -> Callable[[argparse.Namespace], int]:
-    """The function "module:function", imported when it is called."""
+def later(place: str, *needed: str, extra: str = "") -> Callable[[argparse.Namespace], int]:
+    """The function "module:function", imported when it is called.
+
+    ``needed``: optional modules without which it cannot be imported, from our ``extra``.
+    """
 
     def call(options: argparse.Namespace) -> int:
+        if needed:
+            require(*needed, extra=extra)
         module, _, function = place.partition(":")
         code: int = getattr(import_module(module), function)(options)
         return code

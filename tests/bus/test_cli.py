@@ -257,7 +257,6 @@ def core_only(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         (("tactile_tools.cli", "bus", "keys", "lab"), "keys"),
         (("tactile_tools.cli", "completion", "bash"), "completion"),
         (("sim_device.cli", "cupboard"), "sim"),
-        (("sim_device.cli", "cupboard", "--engine", "pymunk"), "crosscheck"),
         (("tactiled.cli", "--port", "x", "--compensation", "ransac"), "calibrate"),
     ],
     ids=" ".join,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from sim_device.world.engines import ENGINES
@@ -55,6 +57,15 @@ Exit: 0 done, 1 some trials could not be run or a row came out different, 2 bad 
 """
 
 
+NEEDED = ("mujoco", "pyarrow", "scipy", "jinja2", "matplotlib")
+
+
+def _work(
+    word: str, *needed: str, extra: str = "experiments"
+) -> Callable[[argparse.Namespace], int]:
+    return later(f"tactile_tools.experiments.commands:{word}", *(needed or NEEDED), extra=extra)
+
+
 def fill(parser: Parser) -> None:
     """Add the options of ``tactile experiment``."""
     parser.description = (
@@ -69,7 +80,7 @@ def _strategies(parser: Parser) -> None:
     _study_options(parser, scenes=300)
     add_strategies(parser, "names or module:Class (default: the paper's five)")
     parser.former(strategies="strategy")
-    parser.set_defaults(func=later("tactile_tools.experiments.commands:strategies"))
+    parser.set_defaults(func=_work("strategies"))
 
 
 def _sweep(parser: Parser) -> None:
@@ -87,7 +98,7 @@ def _sweep(parser: Parser) -> None:
         help="how the paper's f_bur is read: rad/s, as its simulator takes it, Hz, as it is "
         "printed, or both (default)",
     )
-    parser.set_defaults(func=later("tactile_tools.experiments.commands:sweep"))
+    parser.set_defaults(func=_work("sweep"))
 
 
 def _robustness(parser: Parser) -> None:
@@ -102,7 +113,7 @@ def _robustness(parser: Parser) -> None:
         help="what is varied (default all: %(choices)s)",
         metavar="AXIS",
     )
-    parser.set_defaults(func=later("tactile_tools.experiments.commands:robustness"))
+    parser.set_defaults(func=_work("robustness"))
 
 
 def _compare(parser: Parser) -> None:
@@ -110,7 +121,7 @@ def _compare(parser: Parser) -> None:
     parser.add_argument("second", type=Path, metavar="RUN_B")
     parser.former(csv="out")
     add_out(parser, "write the table to this file too, as CSV", force="")
-    parser.set_defaults(func=later("tactile_tools.experiments.commands:compare"))
+    parser.set_defaults(func=_work("compare"))
 
 
 def _report(parser: Parser) -> None:
@@ -125,7 +136,7 @@ def _report(parser: Parser) -> None:
         action="store_true",
         help="put the table of trials there too, small, so that --out can be used as RUN",
     )
-    parser.set_defaults(func=later("tactile_tools.experiments.commands:report"))
+    parser.set_defaults(func=_work("report"))
 
 
 def _trial(parser: Parser) -> None:
@@ -155,7 +166,7 @@ def _trial(parser: Parser) -> None:
     )
     add_path(parser, "--log", "MCAP file of the trial")
     add_path(parser, "--png", "picture of the trial; needs --log")
-    parser.set_defaults(func=later("tactile_tools.experiments.commands:trial"))
+    parser.set_defaults(func=_work("trial", "mujoco", extra="sim"))
 
 
 def _study_options(parser: Parser, *, scenes: int) -> None:

@@ -74,7 +74,6 @@ def _studied(make: Callable[[argparse.Namespace], Study], word: str) -> Any:
     """A study as a command."""
 
     def run(options: argparse.Namespace) -> int:
-        require("pyarrow", extra="experiments")
         return _study(make(options), options, word)
 
     return _told(run)
@@ -210,7 +209,6 @@ def trial(options: argparse.Namespace) -> int:
 @_told
 def report(options: argparse.Namespace) -> int:
     """``tactile experiment report``."""
-    require("pyarrow", "scipy", "jinja2", "matplotlib", extra="experiments")
     from tactile_tools.experiments.report import write_report
 
     try:
@@ -225,7 +223,6 @@ def report(options: argparse.Namespace) -> int:
 @_told
 def compare(options: argparse.Namespace) -> int:
     """``tactile experiment compare``."""
-    require("pyarrow", "scipy", extra="experiments")
     from tactile_tools.experiments.compare import compare_runs
 
     return compare_runs(options.first, options.second, options.out)
