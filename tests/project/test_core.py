@@ -1,0 +1,46 @@
+"""The core stays light: which libraries it needs, and that a board computer has wheels of them."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from pathlib import Path
+
+from tactile_core.cli import EXTRAS
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+WHEELS = json.loads((ROOT / "tests/data/core_wheels.json").read_text(encoding="utf-8"))["wheels"]
+CORE = {
+    "numpy", "pyserial", "python-can", "eclipse-zenoh", "mcap", "zstandard", "rosbags", "msgspec",
+    "rich", "psutil",
+}  # fmt: skip
+
+
+def names(requirements: list[str]) -> set[str]:
+    return {re.split(r"[\[<>=!~ ]", each)[0] for each in requirements}
+
+
+def test_the_core_needs_these_libraries_and_no_other() -> None:
+    assert names(PROJECT["dependencies"]) == CORE
+
+
+def test_every_python_named_has_wheels_of_the_core_on_aarch64() -> None:
+    """As recorded with `pip download --platform manylinux…_aarch64 --only-binary=:all:`."""
+    marker = "Programming Language :: Python :: 3."
+    named = {c.rpartition(" ")[2] for c in PROJECT["classifiers"] if c.startswith(marker)}
+    assert named == set(WHEELS)
+    for python, wheels in WHEELS.items():
+        assert set(wheels) == CORE
+        for wheel in wheels.values():
+            assert wheel.endswith(("-none-any.whl", "aarch64.whl")), f"{python}: {wheel}"
+
+
+def test_every_extra_that_a_command_names_exists_and_all_holds_them() -> None:
+    extras = PROJECT["optional-dependencies"]
+    assert set(EXTRAS.values()) | {"experiments"} <= set(extras)
+    (everything,) = extras["all"]
+    held = set(re.search(r"\[(.*)\]", everything)[1].split(","))  # type: ignore[index]
+    assert held == set(extras) - {"all", "dev", "reference"}
+    assert "tactile-reach[all]" in extras["dev"]
