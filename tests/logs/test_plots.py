@@ -97,7 +97,7 @@ def test_of_two_boards_it_is_said_which_is_drawn(
     words = ["plot", str(log), "--what", "forces"]
     assert main(words) == 0
     said = capsys.readouterr().out
-    assert "drawn: board finger (of 2: finger, thumb_2); choose with --name" in said
+    assert "drawn: board finger (of 2: finger, thumb_2); choose with --board" in said
     assert main([*words, "--name", "thumb_2"]) == 0
     assert "choose" not in capsys.readouterr().out
 
