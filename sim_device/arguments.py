@@ -35,7 +35,8 @@ DIALECTS = (
     "overrun",
     "buserror",
 )
-"""Firmware of CAN adapters; a test holds it equal to `sim_device.board.slcan_adapter`, and the next likewise."""
+"""Firmware of CAN adapters, as in `sim_device.board.slcan_adapter`; a test compares them, and the
+next likewise."""
 
 SKETCHES = (
     "anyskin",

@@ -12,7 +12,6 @@ from msgspec import Meta
 from tactile_core.bus.keys import TlsConfig
 from tactile_core.bus.session import BusConfig, Role
 from tactile_core.cli import DEFAULT_LOG
-from tactile_core.config import printable
 from tactile_core.log.recorder import RecorderSettings
 
 DEFAULT_LOG_BYTES = 32 << 30

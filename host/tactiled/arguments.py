@@ -17,7 +17,7 @@ from tactile_core.cli import (
     speed,
     whole,
 )
-from tactiled.sensing.settings import METHODS
+from tactiled.sensing import METHODS
 
 DEFAULT_BAUD = 115_200
 

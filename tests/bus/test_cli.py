@@ -276,7 +276,8 @@ def test_a_missing_extra_is_named_in_one_sentence(
 def test_the_daemons_need_no_extra(core_only: dict[str, str]) -> None:
     modules = ("tactiled.daemon", "tactiled.status", "reachd.daemon", "reachd.strategies",
                "sim_device.runner", "sim_device.ports_plan", "tactile_tools.log.info",
-               "tactile_tools.operate.status", "tactile_tools.operate.health", "tactile_tools.operate.service")  # fmt: skip
+               "tactile_tools.operate.status", "tactile_tools.operate.health",
+               "tactile_tools.operate.service")  # fmt: skip
     code = "import " + ", ".join(modules)
     subprocess.run([sys.executable, "-c", code], env=core_only, check=True)
 

@@ -69,10 +69,10 @@ INSIDE = {
         "arm": {"", "skin", "world"},
     },
     "tactile_tools": {
-        "log": set(),
+        "log": {""},
         "plot": {"log"},
         "reach": {"", "plot"},
-        "experiments": {"plot", "reach"},
+        "experiments": {"", "plot", "reach"},
         "calibrate": {""},
         "operate": set(),
         "dev": {"", "log", "plot", "reach", "experiments"},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, get_args
+from typing import Annotated
 
 from msgspec import Meta
 
@@ -16,11 +16,7 @@ from tactile_core.config import (
     check_fields,
     written,
 )
-
-Method = Literal["off", "ransac", "consensus"]
-"""How the ambient field is taken off."""
-
-METHODS: tuple[Method, ...] = get_args(Method)
+from tactiled.sensing import Method
 
 RANSAC_RATE_HZ = 3.0
 """Compensation rate of the paper."""

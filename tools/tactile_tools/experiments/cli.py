@@ -20,7 +20,7 @@ from tactile_core.cli import (
     later,
     seed,
 )
-from tactile_tools.cli import add_depth, add_engine, add_strategy
+from tactile_tools.options import add_depth, add_engine, add_strategy
 
 AXIS_NAMES = (
     "density", "friction_objects", "friction_all", "force", "width", "time", "noise", "rate", "dead"

@@ -24,8 +24,8 @@ from tactile_core.cli import (
     seconds,
     speed,
 )
-from tactile_tools.cli import add_log_files
-from tactiled.sensing.settings import METHODS
+from tactile_tools.options import add_log_files
+from tactiled.sensing import METHODS
 
 HERE = "tactile_tools.log.cli"
 
