@@ -294,6 +294,30 @@ def test_over_plain_tcp_only_the_secret_lets_in(
     assert call(join(listen=(), connect=(endpoint,)), "arm/arm/srv/limits") == {}
 
 
+def test_at_a_unix_socket_a_stranger_without_the_secret_is_not_heard(
+    rig: Path, join: Any, plain: Any, until: Any
+) -> None:
+    """Somebody who got as far as the socket (its group, a folder opened by mistake)."""
+    arm = join(role="arm", connect=())
+    endpoint = f"unixsock-stream/{rig / 'bus' / 'arm.sock'}"
+    obeyed: list[bytes] = []
+    _tap = arm.declare_subscriber("arm/arm/cmd_vel", lambda s: obeyed.append(s.payload.to_bytes()))
+    wrong = {"transport/auth/usrpwd/user": "rig", "transport/auth/usrpwd/password": "0" * 64}
+    evil = [plain(endpoint), plain(endpoint, **wrong)]
+    friend = join(connect=(endpoint,), listen=())
+
+    def send() -> None:
+        for session in evil:
+            session.put("arm/arm/cmd_vel", b"evil")
+        friend.put("arm/arm/cmd_vel", b"friend")
+
+    until(lambda: send() or len(obeyed) > 50)
+    assert set(obeyed) == {b"friend"}
+    assert [list(session.info.peers_zid()) for session in evil] == [[], []]
+    for session in evil:
+        assert list(session.get("arm/arm/srv/limits", timeout=0.3)) == []
+
+
 def test_insecure_by_name_lets_everybody_in(
     join: Any, plain: Any, free_port: Any, until: Any
 ) -> None:

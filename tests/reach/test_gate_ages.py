@@ -154,7 +154,9 @@ def test_motion_ends_before_the_arms_state_is_50_ms_old(
     age: int, moves: bool, rig: Callable, codes: Callable, passes: Callable
 ) -> None:
     for captured, received in ((age, 0), (0, age), (age, age)):
-        r, off = rig(), rig(Check.ARM_STALE)
+        # Its stamps go back from those of the state before, which is a fault of its own.
+        r = rig(Check.CLOCK_BACKWARDS)
+        off = rig(Check.ARM_STALE, Check.CLOCK_BACKWARDS)
         for one, expected in ((r, moves), (off, True)):
             now = one.now + one.period
             arm = replace(one.arm, captured=now - captured, received=now - received)
@@ -264,3 +266,14 @@ def test_a_creep_is_not_the_motion_that_was_told(name: str, step: float, rig: Ca
         for k in range(40):
             decision = r.step(STEP, arm=r.fresh_arm(-r.period, **{name: at + sign * k * step}))
         assert decision.held is Check.ARM_FROZEN
+
+
+def test_a_state_stamped_before_the_last_one_stops(rig: Callable, codes: Callable) -> None:
+    for off, expected in (((), {"clock_backwards"}), ((Check.CLOCK_BACKWARDS,), set())):
+        r = rig(*off)
+        r.step(arm=r.fresh_arm(-r.period))
+        decision = r.step(arm=r.fresh_arm(age=20 * MS - r.period))
+        assert set(codes(decision)) == expected
+        assert (decision.twist == ZERO) == bool(expected)
+        assert decision.held is None
+        assert set(codes(r.step(arm=r.fresh_arm(-r.period)))) <= {"acceleration"}

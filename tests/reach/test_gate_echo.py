@@ -134,3 +134,18 @@ def test_commands_of_others_are_told_and_stop_nothing(rig: Callable, codes: Call
     assert decision.interventions[0].effect == "ignored"
     assert decision.twist != ZERO
     assert codes(rig(Check.RIVAL_COMMANDS).step(rivalled=True)) == []
+
+
+def test_an_echo_of_what_was_never_sent_latches(rig: Callable) -> None:
+    r = rig()
+    for k in range(1, 20):
+        echo = Echo("r-1", k, r.now)
+        assert r.step(ZERO, arm=r.fresh_arm(-r.period, echo=echo)).held is None
+    for ahead, off, held in ((1, (), Check.ECHO_LOST), (1, (Check.ECHO_LOST,), None)):
+        r = rig(*off)
+        r.step(ZERO, arm=r.fresh_arm(-r.period, echo=Echo("r-1", 1, r.now)))
+        lie = Echo("r-1", 2, Instant(r.now + ahead))
+        decision = r.step(ZERO, arm=r.fresh_arm(-r.period, echo=lie))
+        assert decision.held is held
+        if held:
+            assert "never sent" in decision.interventions[0].text

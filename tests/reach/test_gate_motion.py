@@ -259,3 +259,96 @@ def test_the_constants_stand_apart() -> None:
     assert 0 < DEAD < 0.5
     for one in SETS.values():
         assert one.safety.arm_v_max * TOO_FAST > one.safety.speed
+
+
+@pytest.mark.parametrize("told", [ZERO, AHEAD, Twist(0.0, 0.03, 0.05), Twist(0.0, 0.0, -0.1)])
+@pytest.mark.parametrize(
+    ("drift", "held"),
+    [
+        (Twist(0.0, 0.0, 0.0), False),
+        (Twist(0.001, -0.001, 0.0), False),
+        (Twist(0.0021, 0.0023, 0.0), True),
+        (Twist(0.003, -0.0025, 0.0), True),
+        (Twist(0.0, 0.0, 0.03), True),
+        (Twist(0.0, 0.0, 0.01), False),
+    ],
+)
+def test_an_arm_that_drifts_while_nothing_touches_it_latches(
+    told: Twist, drift: Twist, held: bool, rig: Callable
+) -> None:
+    plant = Plant(
+        rig(*OFF),
+        lambda t: Twist(t.vx + drift.vx, t.vy + drift.vy, t.omega + drift.omega),
+    )
+    when, decision = plant.run(250, told)
+    if not held or drift.omega * told.omega < 0.0:  # what falls short may lag, and is not drift
+        assert when is None
+        return
+    assert when is not None
+    assert when <= 205, "whatever the delay that it might be"
+    assert decision.held is Check.ARM_TRACKING
+    assert "drifted" in decision.interventions[0].text
+    off = Plant(rig(*OFF, *MOTION), plant.does)
+    assert off.run(250, told)[0] is None
+
+
+@pytest.mark.parametrize("load", [{"fx": -1.01}, {"fy": 1.01}, {"mz": 0.159}, {"mz": -0.159}])
+def test_what_touches_the_arm_may_push_it(load: dict, rig: Callable) -> None:
+    def drifts(_: Twist) -> Twist:
+        return Twist(0.0, 0.004, 0.0)
+
+    plant = Plant(rig(*OFF), drifts, **load)
+    assert plant.run(250, ZERO)[0] is None
+    plant.state = {}
+    when, _ = plant.run(150, ZERO)
+    assert when is not None
+    assert 99 <= when <= 101, "counted anew from when it was let go"
+
+
+def test_an_arm_that_falls_short_does_not_drift(settings: Any, make_arm: Callable) -> None:
+    """Commands die on the way: it goes a part of the way, never beside it."""
+    watch = MotionWatch(settings)
+    t0 = Instant(5_000_000_000)
+    x = 0.0
+    for k in range(400):
+        watch.told(AHEAD, Instant(t0 + k * 10 * MS))
+        x += 0.0 if k % 4 == 0 else 0.0004
+        assert watch.judge(make_arm(Instant(t0 + (k + 1) * 10 * MS), x=x)) == ()
+    x -= 0.0004
+    assert [c for c, _ in watch.judge(make_arm(Instant(t0 + 401 * 10 * MS), x=x + 0.05))] != []
+
+
+@pytest.mark.parametrize("back", [1, 2, 5])
+def test_stamps_that_go_back_hide_no_motion(back: int, rig: Callable) -> None:
+    """Every second state is stamped before the one before it; the arm moves backwards."""
+    r = rig(*OFF)
+    x, last = -0.2, ZERO
+    for k in range(80):
+        x -= 0.01 * last.vx
+        age = back * 10 * MS if k % 2 else 0
+        decision = r.step(AHEAD, arm=r.fresh_arm(age - r.period, x=x, twist=Twist(-0.04, 0.0, 0.0)))
+        last = decision.twist
+        if decision.held is not None:
+            break
+    assert decision.held in {Check.ARM_TRACKING, Check.ARM_PATH}
+    assert -0.2 - x <= 0.010
+
+
+@pytest.mark.parametrize("field", ["vx", "vy", "omega"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_twist_that_is_not_finite_stops(field: str, value: float, rig: Callable) -> None:
+    r = rig(*OFF)
+    twist = replace(ZERO, **{field: value})
+    decision = r.step(AHEAD, arm=r.fresh_arm(-r.period, twist=twist))
+    assert decision.twist == ZERO
+    assert [i.code for i in decision.interventions] == [Check.ARM_NOT_FINITE]
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "heading"])
+def test_an_arm_that_is_mirrored_latches(axis: str, rig: Callable) -> None:
+    signs = {"x": (-1, 1, 1), "y": (1, -1, 1), "heading": (1, 1, -1)}[axis]
+    plant = Plant(rig(*OFF), lambda t: Twist(signs[0] * t.vx, signs[1] * t.vy, signs[2] * t.omega))
+    when, decision = plant.run(60, Twist(0.03, 0.02, 0.05))
+    assert when is not None
+    assert plant.travelled <= 0.015
+    assert decision.held in {Check.ARM_TRACKING, Check.ARM_PATH}

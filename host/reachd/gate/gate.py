@@ -119,6 +119,7 @@ class SafetyGate:
         self._touched: Touch | None = None  # the newest that was usable
         self._rising = 0.0  # N/s at which the force on the skin grew when it was captured
         self._loaded_at: Instant | None = None  # capture of the newest state
+        self._state_at: Instant | None = None  # capture of the state of the last cycle
 
     @property
     def armed(self) -> bool:
@@ -376,7 +377,14 @@ class SafetyGate:
                 faults.append(Intervention(Check.ARM_LOST, "latched", text))
             if self._on(Check.ARM_STALE):
                 stops.append(Intervention(Check.ARM_STALE, "stopped", text))
-        if not finite(arm.x, arm.y, arm.heading, arm.fx, arm.fy, arm.mz):
+        last, self._state_at = self._state_at, arm.captured
+        if last is not None and arm.captured < last and self._on(Check.CLOCK_BACKWARDS):
+            text = f"the arm's stamps went back by {seconds_between(arm.captured, last):.3f} s"
+            stops.append(Intervention(Check.CLOCK_BACKWARDS, "stopped", text))
+        twist = arm.twist
+        if not finite(
+            arm.x, arm.y, arm.heading, arm.fx, arm.fy, arm.mz, twist.vx, twist.vy, twist.omega
+        ):
             text = "the arm's state holds a number that is not finite"
             stops.append(Intervention(Check.ARM_NOT_FINITE, "stopped", text))
         else:
@@ -447,6 +455,9 @@ class SafetyGate:
             return
         if self._own_since is None:
             self._own_since = captured
+        if echo.sequence and self._motion.after_all(echo.decided) and self._on(Check.ECHO_LOST):
+            text = "the arm echoes a command that was never sent: see what drives it"
+            faults.append(Intervention(Check.ECHO_LOST, "latched", text))
         due = self._motion.first_after(echo.decided)
         if due is not None and echo.sequence == 0:
             due = max(due, self._own_since)  # none was obeyed yet

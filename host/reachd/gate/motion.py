@@ -71,6 +71,13 @@ LONGEST_GAP_NS = 150_000_000
 JUMP = 0.05
 """m between two states, which no arm goes: the pose was taken anew, and says nothing of motion."""
 
+DRIFT_NS = 1_000_000_000
+"""Window over which an arm that touches nothing must keep to what it was told."""
+
+DRIFTS = 0.002
+"""m beside or beyond the told path in such a window that are called drift. An arm that lags may
+fall short of it: commands die on the way."""
+
 KEPT = 512
 
 Finding = tuple[Check, str]
@@ -91,6 +98,7 @@ class MotionWatch:
         self._seen_at: list[Instant] = []
         self._seen: list[ArmState] = []
         self._found: tuple[Finding, ...] = ()
+        self._free_since: Instant | None = None  # since when nothing has loaded the arm
 
     def told(self, twist: Twist, at: Instant) -> None:
         """``twist`` was sent at ``at``."""
@@ -111,6 +119,11 @@ class MotionWatch:
         self._seen_at.clear()
         self._seen.clear()
         self._found = ()
+        self._free_since = None
+
+    def after_all(self, decided: Instant) -> bool:
+        """Whether ``decided`` is later than every command that was sent, of which there are any."""
+        return bool(self._told_at) and decided > self._told_at[-1]
 
     def first_after(self, decided: Instant) -> Instant | None:
         """When the first command after that of ``decided`` was sent; None when none was."""
@@ -122,16 +135,22 @@ class MotionWatch:
         at = arm.captured
         if self._seen_at:
             since = at - self._seen_at[-1]
-            if since == 0:
-                return self._found
-            if not 0 < since <= LONGEST_GAP_NS or self._jumped(arm):
+            if -LONGEST_GAP_NS <= since <= 0:
+                return self._found  # seen already, or stamped before one that was
+            if abs(since) > LONGEST_GAP_NS or self._jumped(arm):
                 self._seen_at.clear()
                 self._seen.clear()
+                self._free_since = None
         self._seen_at.append(at)
         self._seen.append(arm)
         if len(self._seen) > 2 * KEPT:
             del self._seen_at[:KEPT], self._seen[:KEPT]
-        found = [self._speed(arm), self._tracking(arm), self._disagreement(arm)]
+        s = self._s
+        if math.hypot(arm.fx, arm.fy) >= s.free_air_force or abs(arm.mz) >= s.free_air_torque:
+            self._free_since = None
+        elif self._free_since is None:
+            self._free_since = at
+        found = [self._speed(arm), self._tracking(arm) or self._drift(arm), self._disagreement(arm)]
         self._found = tuple(one for one in found if one is not None)
         return self._found
 
@@ -228,6 +247,29 @@ class MotionWatch:
             Check.ARM_TRACKING,
             f"the arm went {off * 1e3:.1f} mm and {math.degrees(off_turn):.1f}° away from what it "
             f"was told within {TRACK_NS / NS_PER_S:g} s",
+        )
+
+    def _drift(self, arm: ArmState) -> Finding | None:
+        """Beside or beyond what was told, over `DRIFT_NS` in which nothing touched the arm."""
+        end, free = arm.captured, self._free_since
+        if free is None or end - free < DRIFT_NS or not self._told_at:
+            return None
+        index = self._before(end, DRIFT_NS)
+        if index is None or self._told_at[0] > self._seen_at[index]:
+            return None
+        begin, lever = self._seen_at[index], self._s.tip_length
+        moved = self._moved(index, arm)
+        least, least_turn = math.inf, math.inf
+        for delay in (0, *DELAYS_NS):
+            x, y, h, _, _ = self._way(Instant(begin - delay), Instant(end - delay))
+            least = min(least, _astray(moved[0], moved[1], x, y))
+            least_turn = min(least_turn, _astray(moved[2] * lever, 0.0, h * lever, 0.0))
+            if least <= DRIFTS and least_turn <= DRIFTS:
+                return None
+        return (
+            Check.ARM_TRACKING,
+            f"the arm drifted {max(least, least_turn) * 1e3:.1f} mm away from what it was told "
+            f"within {DRIFT_NS / NS_PER_S:g} s, and nothing touches it",
         )
 
     def _gives_way(self, index: int) -> bool:
@@ -352,6 +394,15 @@ def _moving(states: list[ArmState]) -> bool:
     vy = math.fsum(a.twist.vy for a in states) / n
     omega = math.fsum(a.twist.omega for a in states) / n
     return max(math.hypot(vx, vy), abs(omega)) > CREEP
+
+
+def _astray(mx: float, my: float, x: float, y: float) -> float:
+    """m by which a way of (mx, my) goes beside or beyond one of (x, y); short of it is 0."""
+    length = math.hypot(x, y)
+    if length <= DRIFTS:
+        return math.hypot(mx - x, my - y)
+    along = (mx * x + my * y) / length
+    return math.hypot(max(-along, along - length, 0.0), (my * x - mx * y) / length)
 
 
 def _off(moved: tuple[float, float, float], way: Path) -> tuple[float, float]:
