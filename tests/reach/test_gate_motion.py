@@ -352,3 +352,13 @@ def test_an_arm_that_is_mirrored_latches(axis: str, rig: Callable) -> None:
     assert when is not None
     assert plant.travelled <= 0.015
     assert decision.held in {Check.ARM_TRACKING, Check.ARM_PATH}
+
+
+def test_what_was_not_told_for_a_second_is_no_drift(settings: Any, make_arm: Callable) -> None:
+    """The arm was moved by somebody else before the first command."""
+    watch = MotionWatch(settings)
+    t0 = Instant(5_000_000_000)
+    for k in range(150):
+        if k >= 140:
+            watch.told(ZERO, Instant(t0 + k * 10 * MS))
+        assert watch.judge(make_arm(Instant(t0 + k * 10 * MS), x=min(k, 125) * 1e-4)) == ()
