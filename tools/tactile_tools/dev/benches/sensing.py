@@ -24,12 +24,13 @@ from tactile_core.calibration import ArrayCalibration, BoardCalibration
 from tactile_core.geometry import Side, SkinGeometry, finger, grid_on_outline, grid_on_plane
 from tactile_core.types import NS_PER_S, Instant
 from tactiled.blocks import SampleBlock
+from tactiled.sensing import Method
 from tactiled.sensing.consensus import Consensus
 from tactiled.sensing.forces import ForceModel
 from tactiled.sensing.layout import Layout
 from tactiled.sensing.pipeline import BoardPipeline
 from tactiled.sensing.ransac_plane import fit_plane
-from tactiled.sensing.settings import Method, PipelineSettings
+from tactiled.sensing.settings import PipelineSettings
 
 SERIAL = "00000000000000b5"
 RATE_HZ = 100

@@ -13,8 +13,9 @@ from tactile_core.arrays import FloatArray
 from tactile_core.geometry import anyskin
 from tactile_core.types import NS_PER_S, Instant
 from tactiled.blocks import Cycle, SampleBlock
+from tactiled.sensing import Method
 from tactiled.sensing.pipeline import BoardPipeline
-from tactiled.sensing.settings import Method, PipelineSettings
+from tactiled.sensing.settings import PipelineSettings
 
 RATE_HZ = 100.0
 FORCES_N = (0.5, 1.0, 2.0, 5.0, 10.0)
