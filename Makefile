@@ -7,7 +7,7 @@ SOAK_MINUTES ?= 60
 KILLS ?= 1000
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-random lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage stress soak fuzz-pipeline kills docs docs-reference pictures clean
+.PHONY: help setup test test-random lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage hostile recordings stress soak fuzz-pipeline kills docs docs-reference pictures clean
 
 help:  ## list the targets (what `make` alone does)
 	@echo "make TARGET, where TARGET is one of:"
@@ -65,6 +65,14 @@ mutation: setup  ## mutate the safety gate
 # A million random inputs through the safety gate.
 gate-random: setup  ## a million random inputs through the safety gate
 	REACH_RANDOM_INPUTS=1000000 REACH_RANDOM_JSON=docs/results/gate.json $(BIN)/python -m pytest -q tests/reach/test_gate_random.py
+
+# A hundred thousand hostile items through the recorder and through tactiled's pipeline.
+hostile: setup  ## 100,000 hostile items through recorder and pipeline
+	HOSTILE_ITEMS=100000 $(BIN)/python -m pytest -q tests/bus/test_recorder_hostile.py tests/daemon/test_hostile.py -k hostile_items
+
+# Every frame of every recording, none of which may be masked.
+recordings: setup  ## every frame of every recording of a real board
+	RECORDED_FRAMES=1000000000 $(BIN)/python -m pytest -q tests/sensing/test_played_readings.py -k never_masked
 
 # Every branch of the safety gate is taken by its tests, or this fails.
 gate-coverage: setup  ## every branch of the safety gate is taken by its tests

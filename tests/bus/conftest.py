@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
-import socket
-import threading
-import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from support.fragile_disk import FragileDisk
 from tactile_core.bus import topics
 from tactile_core.bus.markers import CYLINDER, SPHERE_LIST, frame_transform, marker, wipe
 from tactile_core.bus.messages import MSG, codec, diagnostic_status, header, log_message
 from tactile_core.bus.session import BusConfig, close_session, open_session
 from tactile_core.log.info import LogInfo, info
-from tactile_core.log.mcap_file import DiskStorage
 from tactile_core.log.reader import read_messages
 from tactile_core.log.recorder import Recorder, RecorderSettings
 
@@ -116,18 +111,7 @@ def payloads(messages: dict[topics.Topic, Any]) -> dict[topics.Topic, bytes]:
 
 
 @pytest.fixture
-def free_port() -> Callable[[], int]:
-    def find() -> int:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            port: int = probe.getsockname()[1]
-            return port
-
-    return find
-
-
-@pytest.fixture
-def bus(free_port: Callable[[], int]) -> Iterator[Callable[..., Any]]:
+def bus() -> Iterator[Callable[..., Any]]:
     """``bus(listen=port)``, ``bus(connect=port)``: sessions that are closed after the test."""
     sessions = []
 
@@ -142,55 +126,6 @@ def bus(free_port: Callable[[], int]) -> Iterator[Callable[..., Any]]:
     yield join
     for session in sessions:
         close_session(session)
-
-
-@pytest.fixture
-def until() -> Callable[..., None]:
-    """``until(condition)``: wait for it, or fail."""
-
-    def wait(condition: Callable[[], object], timeout: float = 60.0) -> None:
-        deadline = time.monotonic() + timeout
-        while not condition():
-            assert time.monotonic() < deadline, "waited in vain"
-            time.sleep(0.01)
-
-    return wait
-
-
-class FragileDisk(DiskStorage):
-    """A disk that takes ``room`` more bytes (None: all), fails with ``error``, or hangs."""
-
-    def __init__(self) -> None:
-        self.room: int | None = None
-        self.error = errno.ENOSPC
-        self.free_bytes = 1 << 40
-        self.moving = threading.Event()
-        self.moving.set()
-        self.syncs = 0
-
-    def open(self, path: Path) -> int:
-        self.moving.wait()
-        if self.room == 0:
-            raise OSError(self.error, os.strerror(self.error))
-        return super().open(path)
-
-    def write(self, fd: int, data: bytes | memoryview) -> int:
-        self.moving.wait()
-        if self.room is None:
-            return super().write(fd, data)
-        taken = min(len(data), self.room)
-        if taken == 0:
-            raise OSError(self.error, os.strerror(self.error))
-        self.room -= taken
-        return super().write(fd, data[:taken])
-
-    def sync(self, fd: int) -> None:
-        self.moving.wait()
-        self.syncs += 1
-        super().sync(fd)
-
-    def free(self, directory: Path) -> int:
-        return self.free_bytes
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ MESSAGES = {"OneMessage": 1, "OneSchemalessMessage": 1, "TenMessages": 10}
 BASE_NS = 1_700_000_000_000_000_000
 
 
-def test_every_vector_of_the_formats_own_suite_is_right(tmp_path: Path) -> None:
+def test_every_conformance_vector_is_read_correctly(tmp_path: Path) -> None:
     if not (VECTORS / "vectors.tar.gz").exists():
         pytest.skip("the vectors are not here (../shared/data/mcap_conformance)")
     with tarfile.open(VECTORS / "vectors.tar.gz") as archive:
@@ -113,9 +113,7 @@ def write(tmp_path: Path, data: bytes) -> Path:
 
 
 @pytest.mark.parametrize("compression", ["", "zstd"])
-def test_fields_appended_and_records_of_later_versions_are_passed_over(
-    tmp_path: Path, compression: str
-) -> None:
+def test_appended_fields_and_newer_records_are_skipped(tmp_path: Path, compression: str) -> None:
     made = HandMade(b"\x01\x02\x03later")
     other = record(0x42, b"reserved") + record(0x99, b"somebody's own")
     inner = other + made.schema + made.channel + b"".join(message(k) + other for k in range(7))
@@ -136,7 +134,7 @@ def test_fields_appended_and_records_of_later_versions_are_passed_over(
         (tmp_path / "r.mcap").unlink()
 
 
-def test_what_the_format_forbids_is_told(tmp_path: Path) -> None:
+def test_violations_of_the_format_are_reported(tmp_path: Path) -> None:
     made = HandMade()
     start = made.data + made.schema + made.channel
 
@@ -163,7 +161,7 @@ def test_what_the_format_forbids_is_told(tmp_path: Path) -> None:
     assert info(tmp_path / "x.mcap").messages_lost == 3
 
 
-def test_a_footer_that_contradicts_the_file_is_noticed_and_costs_nothing(tmp_path: Path) -> None:
+def test_contradictory_footer_is_reported_and_loses_nothing(tmp_path: Path) -> None:
     made = HandMade()
     made.data += made.schema + made.channel + made.chunk(b"".join(map(message, range(10))))
     data_end = len(made.data) + 13
@@ -176,7 +174,7 @@ def test_a_footer_that_contradicts_the_file_is_noticed_and_costs_nothing(tmp_pat
     assert info(write(tmp_path, made.end(summary))).whole
 
 
-def test_the_checksum_over_all_data_is_looked_at_where_there_is_one(tmp_path: Path) -> None:
+def test_data_checksum_is_verified_when_present(tmp_path: Path) -> None:
     stream = io.BytesIO()
     writer = Writer(stream, use_chunking=False, enable_data_crcs=True)
     writer.start()
@@ -190,7 +188,7 @@ def test_the_checksum_over_all_data_is_looked_at_where_there_is_one(tmp_path: Pa
     assert spoilt.damages[0].reason == "the checksum over all the data is wrong"
 
 
-def test_a_summary_that_counts_more_than_there_is_tells_of_a_loss(tmp_path: Path) -> None:
+def test_summary_with_more_messages_than_data_reports_a_loss(tmp_path: Path) -> None:
     made = HandMade()
     made.data += made.schema + made.channel + made.chunk(b"".join(map(message, range(10))))
     statistics = struct.pack("<QHIIIIQQI", 12, 1, 1, 0, 0, 1, BASE_NS, BASE_NS, 0)
@@ -199,7 +197,7 @@ def test_a_summary_that_counts_more_than_there_is_tells_of_a_loss(tmp_path: Path
     assert "counts 12 messages, but 10 are in the file" in found.damages[0].reason
 
 
-def test_a_flipped_record_type_of_a_chunk_is_not_taken_for_a_later_version(tmp_path: Path) -> None:
+def test_flipped_chunk_record_type_is_not_mistaken_for_a_newer_version(tmp_path: Path) -> None:
     made = HandMade()
     made.data += made.schema + made.channel
     place = len(made.data)
@@ -227,7 +225,7 @@ def zeros(size: int) -> bytes:
     return zstandard.ZstdCompressor().compress(bytes(size))
 
 
-def test_small_files_that_unpack_to_much_take_little_memory(tmp_path: Path) -> None:
+def test_decompression_bombs_take_little_memory(tmp_path: Path) -> None:
     made = HandMade()
     bomb = made.chunk(b"", "zstd", 200 << 20, 0, zeros(200 << 20))
     lying = made.chunk(b"", "zstd", 1000, 0, zeros(100 << 20))
@@ -240,7 +238,7 @@ def test_small_files_that_unpack_to_much_take_little_memory(tmp_path: Path) -> N
         assert found[0].lost_unknown == damages
 
 
-def test_a_message_that_unpacks_to_much_is_counted_without_being_held(tmp_path: Path) -> None:
+def test_huge_compressed_message_is_counted_but_not_held(tmp_path: Path) -> None:
     made = HandMade()
     size = 150 << 20
     head = record(5, struct.pack("<HIQQ", 1, 0, BASE_NS, BASE_NS))[:1] + struct.pack(
@@ -262,7 +260,7 @@ def test_a_message_that_unpacks_to_much_is_counted_without_being_held(tmp_path: 
     assert found[0].whole
 
 
-def test_large_chunks_are_read_and_checked_piece_by_piece(tmp_path: Path) -> None:
+def test_large_chunks_are_read_and_checked_in_pieces(tmp_path: Path) -> None:
     made = HandMade()
     inner = made.schema + made.channel + b"".join(message(k, bytes(100_000)) for k in range(240))
     for compression in ("zstd", ""):
@@ -309,7 +307,7 @@ def test_attachments_and_messages_outside_chunks_may_be_large(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("compression", ["", "zstd"])
-def test_what_a_flipped_bit_left_readable_is_kept_when_asked_for(
+def test_data_readable_after_a_bit_flip_is_kept_on_request(
     tmp_path: Path, compression: str
 ) -> None:
     made = HandMade()
@@ -375,7 +373,7 @@ def files(draw: st.DrawFn) -> bytes:
 
 @settings(max_examples=80, deadline=None, derandomize=True)
 @given(files())
-def test_any_file_of_the_formats_writer_is_read_as_its_reader_does(
+def test_files_of_the_mcap_writer_read_as_with_the_mcap_reader(
     tmp_path_factory: pytest.TempPathFactory, data: bytes
 ) -> None:
     path = tmp_path_factory.mktemp("any") / "x.mcap"
@@ -418,7 +416,7 @@ def test_any_file_of_the_formats_writer_is_read_as_its_reader_does(
 
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(files(), st.data())
-def test_any_spoilt_file_gives_right_messages_or_a_damage(
+def test_any_corrupted_file_gives_correct_messages_or_reports_damage(
     tmp_path_factory: pytest.TempPathFactory, data: bytes, drawn: st.DataObject
 ) -> None:
     path = tmp_path_factory.mktemp("spoilt") / "x.mcap"

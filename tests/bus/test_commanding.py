@@ -62,7 +62,7 @@ def changed(data: bytes, **values: Any) -> bytes:
     return codec().encode(COMMAND, message)
 
 
-def test_the_owner_is_obeyed_and_echoed() -> None:
+def test_commander_is_obeyed_and_echoed() -> None:
     owner = Owner(CommandDesk())
     for k in range(1, 100):
         now = after(T0, 0.01 * k)
@@ -75,13 +75,13 @@ def test_the_owner_is_obeyed_and_echoed() -> None:
 
 
 @pytest.mark.parametrize(("way", "obeyed"), [(0.0, True), (0.059, True), (0.06, False), (2, False)])
-def test_a_command_that_comes_after_its_expiry_is_dropped(way: float, obeyed: bool) -> None:
+def test_command_arriving_after_its_expiry_is_dropped(way: float, obeyed: bool) -> None:
     owner = Owner(CommandDesk())
     assert (owner.send(T0, way) is not None) == obeyed
     assert owner.desk.refused["late"] == (0 if obeyed else 1)
 
 
-def test_one_that_waits_for_the_arm_too_long_is_dropped() -> None:
+def test_command_waiting_too_long_for_the_arm_is_dropped() -> None:
     owner = Owner(CommandDesk())
     owner.desk.hear(owner.data(T0), T0)
     assert owner.desk.newest(after(T0, 0.061)) is None
@@ -89,7 +89,7 @@ def test_one_that_waits_for_the_arm_too_long_is_dropped() -> None:
     assert owner.desk.newest(T0) is None, "handed out once"
 
 
-def test_of_several_the_newest_is_handed_out() -> None:
+def test_newest_of_several_commands_is_used() -> None:
     owner = Owner(CommandDesk())
     for k in range(3):
         owner.desk.hear(owner.data(after(T0, 0.01 * k), Twist(k, 0.0, 0.0)), after(T0, 0.03))
@@ -118,7 +118,7 @@ def forgeries(owner: Owner, now: Instant) -> list[tuple[str, bytes]]:
     ]
 
 
-def test_no_forgery_is_obeyed_or_takes_anything_from_the_owner() -> None:
+def test_forged_commands_are_not_obeyed_and_cost_the_commander_nothing() -> None:
     """Row 45: names, numbers and stamps can be read on the bus; the secret cannot."""
     owner = Owner(CommandDesk())
     desk, now = owner.desk, T0
@@ -136,7 +136,7 @@ def test_no_forgery_is_obeyed_or_takes_anything_from_the_owner() -> None:
             desk.hear(data, after(now, 0.002))
 
 
-def test_what_was_sent_once_is_obeyed_once() -> None:
+def test_replayed_command_is_not_obeyed_again() -> None:
     owner = Owner(CommandDesk())
     first = owner.data(T0)
     second = owner.data(after(T0, 0.01))
@@ -153,19 +153,19 @@ def test_what_was_sent_once_is_obeyed_once() -> None:
         ("bad_expiry", {"expiry": LONGEST_EXPIRY * 1.01}),
     ],
 )
-def test_an_owner_out_of_order_is_not_obeyed(reason: str, made: dict) -> None:
+def test_out_of_order_commands_are_not_obeyed(reason: str, made: dict) -> None:
     owner = Owner(CommandDesk())
     assert owner.desk.hear(owner.data(T0, **made), T0) == reason
     assert owner.send(after(T0, 0.01)) is not None
 
 
-def test_decisions_of_tomorrow_are_not_obeyed() -> None:
+def test_commands_decided_in_the_future_are_not_obeyed() -> None:
     owner = Owner(CommandDesk())
     assert owner.desk.hear(owner.data(after(T0, 0.02)), T0) == "future"
     assert owner.desk.hear(owner.data(after(T0, 0.009)), T0) is None
 
 
-def test_numbers_that_are_not_finite_reach_the_arm_which_stops() -> None:
+def test_non_finite_command_reaches_the_arm_and_stops_it() -> None:
     order = Owner(CommandDesk()).send(T0, twist=Twist(math.nan, 0.0, 0.0))
     assert order is not None
     assert math.isnan(order.twist.vx)
@@ -191,7 +191,7 @@ def test_one_commander_at_a_time() -> None:
             CommandDesk().claim(ClaimRequest(name, ""), T0)
 
 
-def test_strangers_do_not_keep_the_lease_of_a_commander_that_is_gone() -> None:
+def test_strangers_do_not_renew_the_lease_of_a_lost_commander() -> None:
     desk = CommandDesk()
     owner = Owner(desk)
     owner.send(T0)
@@ -206,7 +206,7 @@ def asked(owner: Owner, service: str, kind: type[Signed] = Signed, **fields: obj
     return msgspec.convert(owner.signer.sign(service, **fields), kind)
 
 
-def test_what_only_the_commander_may_ask_for() -> None:
+def test_requests_reserved_for_the_commander() -> None:
     desk = CommandDesk()
     owner = Owner(desk)
     given = limits_fields(LIMITS)
@@ -234,19 +234,19 @@ def test_what_only_the_commander_may_ask_for() -> None:
     assert Owner(desk).send(T0) is not None, "at once"
 
 
-def test_limits_of_a_silent_commander_may_be_set_by_whoever_is_there() -> None:
+def test_anyone_may_set_limits_once_the_commander_is_silent() -> None:
     desk = CommandDesk()
     Owner(desk)
     desk.authorise("limits", Signed(), after(T0, FIRST_COMMAND + 0.01))
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.inf])
-def test_limits_that_would_not_limit_are_refused(bad: float) -> None:
+def test_useless_limits_are_refused(bad: float) -> None:
     with pytest.raises((ValueError, msgspec.ValidationError)):
         LimitsRequest(v_max=bad, omega_max=1.0, f_max=1.0, m_max=1.0)
 
 
-def test_a_commander_on_another_machine_is_read_by_its_quickest_command() -> None:
+def test_remote_commander_clock_is_mapped_by_its_fastest_command() -> None:
     """A constant way is not seen by the arm, and one that grows is."""
     owner = Owner(CommandDesk(), clock="another machine")
     assert owner.grant.clock == "remote"
@@ -282,7 +282,7 @@ def test_any_byte_changed_is_refused(index: int, flip: int) -> None:
     assert owner.desk.hear(bytes(data), T0) is not None
 
 
-def test_the_frame_and_plane_are_those_of_the_cupboard() -> None:
+def test_command_frame_and_plane_are_those_of_the_cupboard() -> None:
     owner = Owner(CommandDesk())
     key = bytes.fromhex(owner.grant.key)
     for sequence, (reason, spoil) in enumerate(

@@ -67,7 +67,7 @@ def error_of(text: str) -> str:
     return str(caught.value)
 
 
-def test_a_good_file_is_read(tmp_path: Path) -> None:
+def test_valid_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / "t.toml"
     path.write_text(
         'name = "abc"\ntimeout = 2\naxis = [1, 0, 0]\n[[boards]]\nport = "x"\n'
@@ -124,7 +124,7 @@ def test_a_good_file_is_read(tmp_path: Path) -> None:
         ('bus.role = "x"', 't.toml:1: bus.role = "x"; allowed: arm, reachd, tactiled, tool'),
     ],
 )  # fmt: skip
-def test_a_wrong_value_is_located_and_the_allowed_ones_named(text: str, message: str) -> None:
+def test_wrong_value_is_located_with_allowed_values(text: str, message: str) -> None:
     got = error_of(text)
     head, _, allowed = message.partition("; allowed: ")
     assert got.startswith(head)
@@ -142,7 +142,7 @@ def test_a_wrong_value_is_located_and_the_allowed_ones_named(text: str, message:
         ("[loog]\nx = 1", 1, "loog", "did you mean log?"),
     ],
 )
-def test_an_unknown_key_lists_those_allowed(text: str, line: int, key: str, hint: str) -> None:
+def test_unknown_key_lists_allowed_keys(text: str, line: int, key: str, hint: str) -> None:
     got = error_of(text)
     assert got.startswith(f"t.toml:{line}: unknown key {key}")
     assert hint in got
@@ -152,11 +152,11 @@ def test_an_unknown_key_lists_those_allowed(text: str, line: int, key: str, hint
 @pytest.mark.parametrize(
     ("text", "line"), [("a = ", 1), ("a = 1\nb b = 2", 2), ("x = 1\nx = 2", 2), ('a = "', 1)]
 )
-def test_broken_toml_names_its_line(text: str, line: int) -> None:
+def test_invalid_toml_names_its_line(text: str, line: int) -> None:
     assert error_of(text).startswith(f"t.toml:{line}: ")
 
 
-def test_files_that_cannot_be_configurations(tmp_path: Path) -> None:
+def test_files_that_cannot_be_configurations_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="No such file"):
         load_toml(tmp_path / "none.toml", Settings)
     with pytest.raises(ConfigError, match="Is a directory"):
@@ -186,7 +186,7 @@ PAIRS = st.tuples(KEYS, SCALARS)
 
 @given(st.lists(st.tuples(st.booleans(), KEYS, st.lists(PAIRS, max_size=4)), max_size=5))
 @settings(max_examples=80, deadline=None)
-def test_every_key_of_any_valid_text_has_its_line(
+def test_every_key_of_valid_toml_has_its_line(
     tables: list[tuple[bool, str, list[tuple[str, str]]]],
 ) -> None:
     lines = ["# start"]
@@ -219,7 +219,7 @@ def test_every_key_of_any_valid_text_has_its_line(
     check(data, ())
 
 
-def test_counts_are_whole_numbers() -> None:
+def test_counts_must_be_whole_numbers() -> None:
     class One(msgspec.Struct):
         n: Count = 1
 

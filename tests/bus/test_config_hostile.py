@@ -31,9 +31,9 @@ BOMBS: dict[str, str | bytes] = {
     "header": "[" + ".".join(["a"] * 50_000) + "]\n",
     "key": ".".join(["a"] * 300_000) + " = 1\n",
     "spaced_key": " . ".join(["'a'"] * 50_000) + " = 1\n",
-    "dotted": "".join(f"{'.'.join('a' * 200)}.b{i} = 1\n" for i in range(2_000)),
+    "dotted": "".join(f"{'.'.join('a' * 200)}.b{i} = 1\n" for i in range(500)),
     "table": "".join(f"[{'.'.join('a' * n)}]\n" for n in range(1, 60)),
-    "many": "".join(f"k{i} = 1\n" for i in range(80_000)),
+    "many": "".join(f"k{i} = 1\n" for i in range(20_000)),
     "zeros": b"\0\0\0",
     "latin": b'name = "\xff\xfe"',
     "escape": 'name = "\\u001b[2J"',
@@ -79,7 +79,7 @@ def commands(path: Path) -> dict[str, tuple[Callable[[list[str]], int], list[str
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_every_command_refuses_it_in_one_sentence(
+def test_every_command_refuses_bad_toml_in_one_sentence(
     tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -111,7 +111,7 @@ def test_every_command_refuses_it_in_one_sentence(
         ("huge", ["over 1048576 bytes"]),
     ],
 )
-def test_the_sentence_says_where_and_why(tmp_path: Path, name: str, words: list[str]) -> None:
+def test_refusal_says_where_and_why(tmp_path: Path, name: str, words: list[str]) -> None:
     path = lay(tmp_path, name)
     with pytest.raises(ConfigError) as caught:
         Document.read(path, LIMIT)
@@ -119,7 +119,7 @@ def test_the_sentence_says_where_and_why(tmp_path: Path, name: str, words: list[
         assert word in str(caught.value)
 
 
-def test_what_is_within_bounds_is_read() -> None:
+def test_toml_within_bounds_is_read() -> None:
     deep = ".".join("a" * (MAX_DEPTH - 1))
     assert Document.parse(f"[{deep}]\nb = {(1 << 63) - 1}\nc = -{1 << 63}\n", "t").data
     assert Document.parse('t = "' + "a.b." * 100 + '"\n', "t").data["t"].count("a") == 100
@@ -134,7 +134,7 @@ def test_a_zero_byte_in_a_name_is_a_refusal() -> None:
 
 @given(st.text(alphabet="ab.=[]{}\"',#\n1-_ \\e", max_size=60))
 @settings(max_examples=300, deadline=None)
-def test_any_text_is_read_or_refused(text: str) -> None:
+def test_any_toml_text_is_read_or_refused(text: str) -> None:
     try:
         assert isinstance(Document.parse(text, "t").data, dict)
     except ConfigError:
@@ -142,7 +142,7 @@ def test_any_text_is_read_or_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize("key", ["serial_number", "model", "frame"])
-def test_a_calibration_names_its_board_in_printable_characters(
+def test_calibration_names_its_board_in_printable_characters(
     tmp_path: Path, key: str, capsys: Any
 ) -> None:
     path = tmp_path / "a.cal.toml"

@@ -15,7 +15,7 @@ KILLS = 12
 
 
 @pytest.mark.timeout(300)
-def test_kill_9_costs_no_more_than_was_not_flushed(tmp_path: Path) -> None:
+def test_kill_9_loses_only_unflushed_messages(tmp_path: Path) -> None:
     """How much that is in time is the machine's speed; `make crash` measures it."""
     result = tmp_path / "crash.json"
     command = [sys.executable, "-m", "tactile_tools.cli", "crash", "--kills", str(KILLS)]

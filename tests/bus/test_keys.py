@@ -20,7 +20,7 @@ def certificate(folder: Path) -> x509.Certificate:
     return x509.load_pem_x509_certificate((folder / "cert.pem").read_bytes())
 
 
-def test_one_command_makes_keys_for_a_lab(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_one_command_creates_keys_for_a_lab(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     lab = tmp_path / "lab"
     assert main(["bus", "keys", str(lab), "--host", "robot.lan", "--host", "10.0.0.7"]) == 0
     assert "off the robots" in capsys.readouterr().out
@@ -44,7 +44,7 @@ def test_one_command_makes_keys_for_a_lab(tmp_path: Path, capsys: pytest.Capture
     assert stat.S_IMODE((lab / "ca.key").stat().st_mode) == 0o600
 
 
-def test_parties_are_added_renewed_and_taken_away(
+def test_parties_are_added_renewed_and_removed(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     lab = tmp_path / "lab"
@@ -71,7 +71,7 @@ def test_parties_are_added_renewed_and_taken_away(
 
 
 @pytest.mark.parametrize("party", ["anna", "anna=king", "a/b=operator", "..=operator", "=viewer"])
-def test_parties_that_cannot_be_are_refused(
+def test_impossible_parties_are_refused(
     tmp_path: Path, party: str, capsys: pytest.CaptureFixture
 ) -> None:
     try:
@@ -83,7 +83,7 @@ def test_parties_that_cannot_be_are_refused(
     assert capsys.readouterr().err
 
 
-def test_an_authority_that_is_half_lost_is_not_replaced_silently(
+def test_incomplete_authority_is_not_replaced_silently(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     lab = tmp_path / "lab"
@@ -94,7 +94,7 @@ def test_an_authority_that_is_half_lost_is_not_replaced_silently(
     assert not (lab / "anna").exists()
 
 
-def test_the_secret_is_shown_only_when_asked_for(
+def test_secret_is_shown_only_on_request(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setenv(runtime.SYSTEMD_VARIABLE, str(tmp_path))

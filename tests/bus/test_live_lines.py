@@ -40,7 +40,7 @@ def recorder() -> Recorder:
     return cast(Recorder, SimpleNamespace(stats=stats))
 
 
-def test_a_terminal_shows_the_rows_and_below_them_the_log(recorder: Recorder) -> None:
+def test_terminal_shows_rows_above_the_log(recorder: Recorder) -> None:
     out = io.StringIO()
     with Lines(Console(file=out, force_terminal=True, width=100), recorder) as lines:
         lines.show()
@@ -52,7 +52,7 @@ def test_a_terminal_shows_the_rows_and_below_them_the_log(recorder: Recorder) ->
     assert "run.mcap  2.5 MB  NO_SPACE disk full  dropped queue=3" in text[shown:]
 
 
-def test_elsewhere_there_are_plain_lines_now_and_then(
+def test_without_terminal_plain_lines_are_printed_periodically(
     recorder: Recorder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     now: list[float] = [0.0]

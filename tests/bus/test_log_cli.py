@@ -59,7 +59,7 @@ def path(tmp_path: Path, record: Any, payloads: Any) -> Path:
     return path
 
 
-def test_info_tells_all_that_matters(tactile: Any, path: Path) -> None:
+def test_info_shows_contents_of_log(tactile: Any, path: Path) -> None:
     result = tactile("info", path)
     assert result.returncode == 0, result.stderr
     for text in (
@@ -123,9 +123,7 @@ def test_recover_reports_in_json(tactile: Any, path: Path, tmp_path: Path) -> No
         (os.urandom(200_000), "is no MCAP file"),
     ],
 )
-def test_what_is_no_log_is_refused_with_2(
-    tactile: Any, tmp_path: Path, content: bytes, text: str
-) -> None:
+def test_non_log_file_exits_with_2(tactile: Any, tmp_path: Path, content: bytes, text: str) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
     for command in ("info", "recover"):
@@ -138,7 +136,7 @@ def test_what_is_no_log_is_refused_with_2(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_missing_files_directories_and_devices(tactile: Any, tmp_path: Path) -> None:
+def test_missing_files_directories_and_devices_are_refused(tactile: Any, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for place, text in (
         (tmp_path / "none.mcap", "none.mcap does not exist; name a file, a folder of logs"),
@@ -151,19 +149,19 @@ def test_missing_files_directories_and_devices(tactile: Any, tmp_path: Path) -> 
         assert text in result.stderr
 
 
-def test_a_target_that_cannot_be_written_is_refused_with_3(tactile: Any, path: Path) -> None:
+def test_unwritable_target_exits_with_3(tactile: Any, path: Path) -> None:
     result = tactile("recover", path, "--out", "/proc/none/out.mcap")
     assert result.returncode == 3
     assert "name a place with room to write to" in result.stderr
 
 
-def test_names_with_markup_are_shown_as_they_are(tactile: Any, path: Path, tmp_path: Path) -> None:
+def test_names_with_markup_are_shown_verbatim(tactile: Any, path: Path, tmp_path: Path) -> None:
     odd = tmp_path / "[bold]x.mcap"
     odd.write_bytes(path.read_bytes())
     assert "[bold]x.mcap" in tactile("info", odd).stdout
 
 
-def test_the_command_ends_with_the_same_code_and_no_traceback(path: Path) -> None:
+def test_command_exits_with_the_same_code_without_traceback(path: Path) -> None:
     for place, code in ((path, 0), (path.with_name("none.mcap"), 2)):
         command = [sys.executable, "-m", "tactile_tools.cli", "log", "info", str(place)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)

@@ -36,7 +36,7 @@ def fields(message: Any) -> Any:
     return [fields(item) for item in message] if isinstance(message, list) else message
 
 
-def test_bytes_of_a_field_message_are_those_of_the_cdr_specification() -> None:
+def test_field_message_bytes_follow_the_cdr_specification() -> None:
     # OMG CDR, little-endian (encapsulation 00 01 00 00): each number aligned to its own size from
     # the first byte after the encapsulation, a string with its length and a closing zero.
     expected = (
@@ -78,24 +78,24 @@ def test_stamps_are_exact_nanoseconds() -> None:
         [0.0] * 9,
     ],
 )
-def test_an_array_of_the_wrong_kind_is_refused(messages: Any, array: Any) -> None:
+def test_array_of_wrong_dtype_is_refused(messages: Any, array: Any) -> None:
     good = messages[topics.FORCES]
     bad = type(good)(**{**good.__dict__, "force": array})
     with pytest.raises((ValueError, TypeError)):
         codec().encode(topics.FORCES, bad)
 
 
-def test_a_message_of_another_type_is_refused(messages: Any) -> None:
+def test_message_of_another_type_is_refused(messages: Any) -> None:
     with pytest.raises(TypeError, match="no tactile_msgs/msg/TaxelForces"):
         codec().encode(topics.FORCES, messages[topics.FEATURES])
 
 
-def test_a_number_that_does_not_fit_is_refused() -> None:
+def test_number_out_of_range_is_refused() -> None:
     with pytest.raises((TypeError, ValueError)):
         codec().encode("builtin_interfaces/msg/Time", MSG.Time(1 << 40, 0))
 
 
-def test_oversized_messages_are_refused_both_ways() -> None:
+def test_oversized_messages_are_refused_in_both_directions() -> None:
     chunk = MSG.RawChunk(
         header(0, "p"), 0, 0, np.zeros(0, np.uint32), np.zeros(0, np.uint8),
         np.zeros(MAX_PAYLOAD, np.uint8),
@@ -144,7 +144,7 @@ def test_schemas_are_complete_definitions_with_hashes() -> None:
         assert part in text
 
 
-def test_channels_lead_back_to_their_topics() -> None:
+def test_channel_names_map_back_to_topics() -> None:
     for topic in topics.TOPICS:
         name = "b-0" if "{name}" in topic.template else topic.template  # one that all share
         assert topics.find_topic(topic.channel("b-0")) == (topic, name)
@@ -154,7 +154,7 @@ def test_channels_lead_back_to_their_topics() -> None:
         topics.FEATURES.channel("a/b")
 
 
-def test_fields_that_came_later_are_those_at_the_end_of_their_types() -> None:
+def test_newer_fields_are_at_the_end_of_their_types() -> None:
     """Logs from before lack them and are read: so a field is only ever added at the end."""
     for name, later in LATER_FIELDS.items():
         fields = [field for field, _ in codec().fields(name)]

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from support.waiting import wait_until
 from tactile_core.bus import topics
 from tactile_core.log.info import info
 from tactile_core.log.reader import read_messages
@@ -29,28 +30,28 @@ def holes(numbers: list[int], handed_over: int) -> int:
     return handed_over - len(set(numbers))
 
 
-def test_a_message_is_readable_within_a_flush_though_none_follows(
-    tmp_path: Path, record: Any, payloads: Any, until: Any
+def test_last_message_is_readable_within_one_flush(
+    tmp_path: Path, record: Any, payloads: Any
 ) -> None:
     recorder = record(tmp_path / "a.mcap")
     recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
-    until(lambda: recorder.stats.written == 1)
+    wait_until(lambda: recorder.stats.written == 1)
     # The file is still open: what a kill at this moment would leave.
     found = info(tmp_path / "a.mcap")
     assert found.messages == 1
     assert not found.closed
 
 
-def test_every_flush_reaches_the_disk(
-    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any
+def test_every_flush_is_synced_to_disk(
+    tmp_path: Path, record: Any, payloads: Any, disk: Any
 ) -> None:
     recorder = record(tmp_path / "a.mcap")
     before = disk.syncs
     recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
-    until(lambda: disk.syncs > before)
+    wait_until(lambda: disk.syncs > before)
 
 
-def test_the_flush_period_cannot_be_set_above_half_a_second(tmp_path: Path) -> None:
+def test_flush_period_above_half_a_second_is_refused(tmp_path: Path) -> None:
     from tactile_core.config import ConfigError, parse_toml
 
     with pytest.raises(
@@ -59,7 +60,7 @@ def test_the_flush_period_cannot_be_set_above_half_a_second(tmp_path: Path) -> N
         parse_toml("flush_period = 5.0", RecorderSettings)
 
 
-def test_close_writes_what_is_queued_and_says_so(
+def test_close_writes_the_queue_and_reports_success(
     tmp_path: Path, record: Any, payloads: Any
 ) -> None:
     recorder = record(tmp_path / "a.mcap", flush_period=0.5)
@@ -73,15 +74,17 @@ def test_close_writes_what_is_queued_and_says_so(
     assert found.messages == 1000
 
 
-def test_what_comes_after_close_is_counted(tmp_path: Path, record: Any, payloads: Any) -> None:
+def test_messages_after_close_are_counted_as_lost(
+    tmp_path: Path, record: Any, payloads: Any
+) -> None:
     recorder = record(tmp_path / "a.mcap")
     recorder.close(10)
     recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
     assert recorder.stats.dropped == {"closed": 1}
 
 
-def test_a_full_queue_drops_the_oldest_and_the_log_shows_where(
-    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any, sequences: Any
+def test_full_queue_drops_oldest_and_the_log_locates_the_gap(
+    tmp_path: Path, record: Any, payloads: Any, disk: Any, sequences: Any
 ) -> None:
     recorder = record(tmp_path / "a.mcap", queue_messages=50)
     disk.moving.clear()  # a disk that hangs
@@ -91,7 +94,7 @@ def test_a_full_queue_drops_the_oldest_and_the_log_shows_where(
     dropped = recorder.stats.dropped["queue_full"]
     assert dropped > 0
     disk.moving.set()
-    until(lambda: recorder.stats.queued == 0)
+    wait_until(lambda: recorder.stats.queued == 0)
     for i in range(400, 410):
         recorder.write(topics.RAW, "b0", payloads[topics.RAW], BASE_NS + i, BASE_NS + i)
     assert recorder.close(10)
@@ -121,7 +124,7 @@ def test_a_full_queue_drops_the_oldest_and_the_log_shows_where(
     assert gaps[-1].last_ns >= missing[-1]
 
 
-def test_the_queue_is_bounded_in_bytes_too(tmp_path: Path, record: Any, disk: Any) -> None:
+def test_queue_is_bounded_in_bytes(tmp_path: Path, record: Any, disk: Any) -> None:
     recorder = record(tmp_path / "a.mcap", queue_bytes=10_000, chunk_bytes=1)
     disk.moving.clear()
     for i in range(100):
@@ -150,12 +153,11 @@ def test_writing_never_waits_for_a_hanging_disk(
     assert not recorder.close(0.2)  # it says that it could not
 
 
-def test_a_full_disk_is_loud_and_the_next_file_tells_of_it(
+def test_full_disk_is_reported_and_recorded_in_the_next_file(
     tmp_path: Path,
     record: Any,
     payloads: Any,
     disk: Any,
-    until: Any,
     caplog: Any,
     logs: Any,
     sequences: Any,
@@ -163,17 +165,17 @@ def test_a_full_disk_is_loud_and_the_next_file_tells_of_it(
     recorder = record(tmp_path)
     data = payloads[topics.FORCES]
     recorder.write(topics.FORCES, "b0", data, BASE_NS, BASE_NS)
-    until(lambda: recorder.stats.written == 1)
+    wait_until(lambda: recorder.stats.written == 1)
     with caplog.at_level(logging.ERROR):
         disk.room = 100  # the next chunk does not fit: part of it is written, then ENOSPC
         for i in range(1, 50):
             recorder.write(topics.FORCES, "b0", data, BASE_NS + i, BASE_NS + i)
-        until(lambda: recorder.stats.state == "disk_full")
+        wait_until(lambda: recorder.stats.state == "disk_full")
     assert "No space left on device" in caplog.text
     assert "make room" in caplog.text
     assert "No space left on device" in recorder.stats.last_error
     disk.room = None
-    until(lambda: recorder.stats.written == 50)
+    wait_until(lambda: recorder.stats.written == 50)
     assert recorder.stats.state == "recording"
     assert recorder.close(10)
     first, *later = logs(tmp_path)
@@ -188,43 +190,43 @@ def test_a_full_disk_is_loud_and_the_next_file_tells_of_it(
     assert all(found.whole for found in later)
 
 
-def test_what_a_full_disk_costs_is_counted(
-    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any, logs: Any, sequences: Any
+def test_messages_lost_to_a_full_disk_are_counted(
+    tmp_path: Path, record: Any, payloads: Any, disk: Any, logs: Any, sequences: Any
 ) -> None:
     recorder = record(tmp_path, queue_messages=20)
     data = payloads[topics.FORCES]
     recorder.write(topics.FORCES, "b0", data, BASE_NS, BASE_NS)
-    until(lambda: recorder.stats.written == 1)
+    wait_until(lambda: recorder.stats.written == 1)
     disk.room = 0
     recorder.write(topics.FORCES, "b0", data, BASE_NS + 1, BASE_NS + 1)
-    until(lambda: recorder.stats.state == "disk_full")
+    wait_until(lambda: recorder.stats.state == "disk_full")
     for i in range(2, 100):
         recorder.write(topics.FORCES, "b0", data, BASE_NS + i, BASE_NS + i)
     assert recorder.stats.dropped == {"disk_full": 78}
     disk.room = None
-    until(lambda: recorder.stats.queued == 0)
+    wait_until(lambda: recorder.stats.queued == 0)
     assert recorder.close(10)
     found = logs(tmp_path)
     assert sum(gap.messages for log in found for gap in log.gaps) == 78
     assert holes(sequences(tmp_path)["/tactile/b0/forces"], 100) == 78
 
 
-def test_an_io_error_ends_the_file_and_the_next_goes_on(
-    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any, logs: Any
+def test_io_error_ends_the_file_and_logging_continues_in_the_next(
+    tmp_path: Path, record: Any, payloads: Any, disk: Any, logs: Any
 ) -> None:
     recorder = record(tmp_path)
     disk.error = errno.EIO
     disk.room = 0
     recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
-    until(lambda: recorder.stats.state == "io_error")
+    wait_until(lambda: recorder.stats.state == "io_error")
     assert recorder.stats.errors >= 1
     disk.room = None
-    until(lambda: recorder.stats.written == 1)
+    wait_until(lambda: recorder.stats.written == 1)
     assert recorder.close(10)
     assert [g.reason for log in logs(tmp_path) for g in log.gaps] == ["io_error"]
 
 
-def test_a_disk_that_stays_full_to_the_end_is_admitted(
+def test_disk_full_until_the_end_is_reported(
     tmp_path: Path, record: Any, payloads: Any, disk: Any
 ) -> None:
     recorder = record(tmp_path)
@@ -237,35 +239,35 @@ def test_a_disk_that_stays_full_to_the_end_is_admitted(
     assert stats.dropped == {"disk_full": 5}
 
 
-def test_logging_stops_while_there_is_still_room_and_resumes(
-    tmp_path: Path, record: Any, payloads: Any, disk: Any, until: Any, caplog: Any, logs: Any
+def test_logging_stops_before_the_disk_is_full_and_resumes(
+    tmp_path: Path, record: Any, payloads: Any, disk: Any, caplog: Any, logs: Any
 ) -> None:
     recorder = record(tmp_path, min_free_bytes=1 << 30)
     recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
-    until(lambda: recorder.stats.written == 1)
+    wait_until(lambda: recorder.stats.written == 1)
     disk.free_bytes = (1 << 30) - 1
     with caplog.at_level(logging.ERROR):
-        until(lambda: recorder.stats.state == "low_space")
+        wait_until(lambda: recorder.stats.state == "low_space")
     assert "logs stop at 1.07" in caplog.text
-    until(lambda: logs(tmp_path)[0].whole)  # closed in order
+    wait_until(lambda: logs(tmp_path)[0].whole)  # closed in order
     size = sum(path.stat().st_size for path in tmp_path.iterdir())
     recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS + 1, BASE_NS)
     time.sleep(0.3)  # six flushes, at any of which it might write
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) == size
     disk.free_bytes = 1 << 40
-    until(lambda: recorder.stats.written == 2)
+    wait_until(lambda: recorder.stats.written == 2)
     assert recorder.close(10)
     assert [g.reason for g in logs(tmp_path)[-1].gaps] == ["low_space"]
 
 
-def test_stamps_follow_the_offset_taken_once(tmp_path: Path, record: Any) -> None:
+def test_stamps_use_the_clock_offset_taken_at_start(tmp_path: Path, record: Any) -> None:
     recorder = record(tmp_path / "a.mcap")
     recorder.close(10)
     offset = int(info(tmp_path / "a.mcap").metadata["software"]["clock_offset_ns"])
     assert abs(offset - WallClock.take().offset_ns) < 60e9
 
 
-def test_a_real_file_size_limit_is_met_like_a_full_disk(
+def test_file_size_limit_is_handled_like_a_full_disk(
     tmp_path: Path, logs: Any, sequences: Any
 ) -> None:
     """The kernel refuses bytes in the middle of a write: RLIMIT_FSIZE in a process of its own."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from support.waiting import wait_until
 from tactile_core.bus import topics
 from tactile_core.log.info import info
 from tactile_core.log.reader import read_messages
@@ -17,8 +18,8 @@ from tactile_core.log.recorder import Recorder, RecorderError, RecorderSettings
 BASE_NS = 1_700_000_000_000_000_000
 
 
-def test_files_split_by_size_and_each_stands_alone(
-    tmp_path: Path, record: Any, payloads: Any, until: Any, logs: Any, sequences: Any
+def test_files_split_by_size_are_self_contained(
+    tmp_path: Path, record: Any, payloads: Any, logs: Any, sequences: Any
 ) -> None:
     recorder = record(tmp_path, split_bytes=6000, chunk_bytes=1000, flush_period=0.03)
     recorder.attach("cal.toml", "application/toml", b"x = 1\n")
@@ -47,9 +48,7 @@ def test_files_split_by_size_and_each_stands_alone(
     assert sequences(tmp_path)["/tactile/b0/raw"] == list(range(count))
 
 
-def test_files_split_by_time(
-    tmp_path: Path, record: Any, payloads: Any, until: Any, logs: Any
-) -> None:
+def test_files_split_by_time(tmp_path: Path, record: Any, payloads: Any, logs: Any) -> None:
     recorder = record(tmp_path, split_seconds=0.15)
     deadline = time.monotonic() + 20
     while recorder.stats.files < 3:
@@ -60,25 +59,25 @@ def test_files_split_by_time(
     assert all(log.whole for log in logs(tmp_path))
 
 
-def test_a_changed_geometry_is_the_one_repeated(
-    tmp_path: Path, record: Any, payloads: Any, until: Any
+def test_changed_geometry_is_the_one_repeated_in_later_files(
+    tmp_path: Path, record: Any, payloads: Any
 ) -> None:
-    recorder = record(tmp_path, split_seconds=0.1)
+    recorder = record(tmp_path, split_bytes=6000, chunk_bytes=1000)
     old, new = payloads[topics.GEOMETRY], payloads[topics.GEOMETRY] + b"\0"
     recorder.write(topics.GEOMETRY, "b0", old, BASE_NS, BASE_NS)
     recorder.write(topics.GEOMETRY, "b0", new, BASE_NS + 1, BASE_NS)
-    until(lambda: recorder.stats.written == 2)
-    time.sleep(0.15)
-    recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS + 5, BASE_NS)
-    until(lambda: recorder.stats.files == 2)
+    wait_until(lambda: recorder.stats.written == 2)
+    count = 2
+    while recorder.stats.files < 2:
+        recorder.write(topics.RAW, "b0", os.urandom(300), BASE_NS + count, BASE_NS + count)
+        count += 1
+        time.sleep(0.002)
     assert recorder.close(10)
     rows = [(c.topic, m.data) for c, m in read_messages(sorted(tmp_path.glob("*.mcap"))[1])]
     assert rows[0] == ("/tactile/b0/geometry", new)
 
 
-def test_retention_keeps_the_newest_and_the_current(
-    tmp_path: Path, record: Any, until: Any
-) -> None:
+def test_retention_keeps_newest_and_current_files(tmp_path: Path, record: Any) -> None:
     stranger = tmp_path / "holiday.mcap"
     stranger.write_bytes(b"not ours")
     recorder = record(tmp_path, split_bytes=3000, chunk_bytes=1000, max_files=3)
@@ -98,7 +97,7 @@ def test_retention_keeps_the_newest_and_the_current(
     assert stranger.exists()
 
 
-def test_retention_starts_with_what_earlier_runs_left(
+def test_retention_includes_files_of_earlier_runs(
     tmp_path: Path, record: Any, payloads: Any, disk: Any
 ) -> None:
     old = []
@@ -118,7 +117,7 @@ def test_retention_starts_with_what_earlier_runs_left(
     assert Path(recorder.stats.path).exists()
 
 
-def test_nothing_is_deleted_when_the_newest_cannot_be_read(
+def test_nothing_is_deleted_when_newest_file_is_unreadable(
     tmp_path: Path, record: Any, caplog: Any
 ) -> None:
     old = [tmp_path / f"tactile_{year}0101T000000Z_0000.mcap" for year in (2001, 2002, 2003)]
@@ -129,7 +128,7 @@ def test_nothing_is_deleted_when_the_newest_cannot_be_read(
     assert "nothing is deleted" in caplog.text
 
 
-def test_a_file_that_another_process_writes_is_not_deleted(tmp_path: Path, record: Any) -> None:
+def test_file_being_written_by_another_process_is_kept(tmp_path: Path, record: Any) -> None:
     other = record(tmp_path)
     time.sleep(1.1)  # names have whole seconds
     record(tmp_path, max_files=1)
@@ -151,7 +150,7 @@ def test_two_daemons_may_log_to_one_directory(
     assert len({log.metadata["file"]["set"] for log in logs(tmp_path)}) == 2
 
 
-def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
+def test_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(b"precious")
     with pytest.raises(RecorderError, match="exists and is not overwritten"):
@@ -159,14 +158,14 @@ def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     assert path.read_bytes() == b"precious"
 
 
-def test_a_place_that_cannot_be_written_is_named_with_a_remedy(tmp_path: Path) -> None:
+def test_unwritable_place_is_named_with_a_remedy(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for place in (tmp_path / "file" / "logs", Path("/proc/logs")):
         with pytest.raises(RecorderError, match="name a directory that this user may write to"):
             Recorder(place, RecorderSettings(min_free_bytes=0))
 
 
-def test_a_disk_without_room_is_refused_at_the_start(tmp_path: Path, disk: Any) -> None:
+def test_full_disk_is_refused_at_start(tmp_path: Path, disk: Any) -> None:
     disk.free_bytes = 5 << 20
     with pytest.raises(RecorderError, match=r"0.01 GB free .* logs stop at 1.07"):
         Recorder(tmp_path, storage=disk)

@@ -76,7 +76,7 @@ def recovered(path: Path) -> Any:
     return report
 
 
-def test_a_whole_log_is_copied_whole(log: Any) -> None:
+def test_intact_log_is_copied_completely(log: Any) -> None:
     path, _ = log
     found = info(path)
     assert found.whole
@@ -90,7 +90,7 @@ def test_a_whole_log_is_copied_whole(log: Any) -> None:
     assert (report.damage_count, report.bytes_lost, report.messages_lost) == (0, 0, 0)
 
 
-def test_cut_off_anywhere_it_says_so_and_keeps_all_before(log: Any, tmp_path: Path) -> None:
+def test_log_cut_anywhere_is_reported_and_keeps_everything_before(log: Any, tmp_path: Path) -> None:
     path, offsets = log
     data = path.read_bytes()
     rng = random.Random(5)
@@ -117,7 +117,7 @@ def test_cut_off_anywhere_it_says_so_and_keeps_all_before(log: Any, tmp_path: Pa
     assert len(places) > 100
 
 
-def test_whole_blocks_of_a_chunk_that_is_cut_off_are_kept(tmp_path: Path) -> None:
+def test_complete_blocks_of_a_truncated_chunk_are_kept(tmp_path: Path) -> None:
     path = tmp_path / "big.mcap"
     rng = random.Random(1)
     sent = [rng.randbytes(20_000) for _ in range(PER_CHUNK)]  # 400 kB: several zstd blocks
@@ -136,7 +136,7 @@ def test_whole_blocks_of_a_chunk_that_is_cut_off_are_kept(tmp_path: Path) -> Non
     assert kept == sent[: len(kept)]
 
 
-def test_messages_whose_schema_is_lost_are_kept_without_a_type(tmp_path: Path) -> None:
+def test_messages_with_lost_schema_are_kept_untyped(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     write_log(path, b"data", finish=False)
     data = bytearray(path.read_bytes())
@@ -148,7 +148,7 @@ def test_messages_whose_schema_is_lost_are_kept_without_a_type(tmp_path: Path) -
     assert info(path.with_name("out.mcap")).channels[0].msgtype == ""
 
 
-def test_a_chunk_with_a_wrong_checksum_is_left_out_and_counted(log: Any) -> None:
+def test_chunk_with_bad_checksum_is_dropped_and_counted(log: Any) -> None:
     path, offsets = log
     data = bytearray(path.read_bytes())
     data[offsets[2] + 9 + 24] ^= 1  # the stored checksum
@@ -168,7 +168,7 @@ def test_a_chunk_with_a_wrong_checksum_is_left_out_and_counted(log: Any) -> None
     assert damage.last_ns == BASE_NS + (3 * PER_CHUNK - 1) * 10_000_000
 
 
-def test_any_damaged_byte_costs_at_most_its_chunk(log: Any) -> None:
+def test_damaged_byte_costs_at_most_its_chunk(log: Any) -> None:
     path, offsets = log
     data = path.read_bytes()
     good = {m.sequence: m.data for _, m in read_messages(path)}
@@ -188,7 +188,7 @@ def test_any_damaged_byte_costs_at_most_its_chunk(log: Any) -> None:
         assert recovered(path).messages == found.messages
 
 
-def test_a_stretch_of_zeros_is_stepped_over(log: Any) -> None:
+def test_run_of_zeros_is_skipped(log: Any) -> None:
     path, offsets = log
     data = bytearray(path.read_bytes())
     data[offsets[1] - 30 : offsets[3] - 5] = bytes(offsets[3] - 5 - offsets[1] + 30)
@@ -199,7 +199,7 @@ def test_a_stretch_of_zeros_is_stepped_over(log: Any) -> None:
     assert report.bytes_lost >= offsets[3] - offsets[1]
 
 
-def test_an_overwritten_start_does_not_cost_the_rest(log: Any) -> None:
+def test_overwritten_start_does_not_lose_the_rest(log: Any) -> None:
     path, _ = log
     data = bytearray(path.read_bytes())
     data[:100] = bytes(100)
@@ -208,7 +208,7 @@ def test_an_overwritten_start_does_not_cost_the_rest(log: Any) -> None:
     assert recovered(path).messages == CHUNKS * PER_CHUNK
 
 
-def test_channels_defined_nowhere_are_counted(tmp_path: Path, payload: bytes) -> None:
+def test_messages_on_undefined_channels_are_counted(tmp_path: Path, payload: bytes) -> None:
     path = tmp_path / "log.mcap"
     offsets = write_log(path, payload, finish=False)
     data = path.read_bytes()
@@ -219,7 +219,7 @@ def test_channels_defined_nowhere_are_counted(tmp_path: Path, payload: bytes) ->
     assert info(path).orphans == CHUNKS * PER_CHUNK
 
 
-def test_a_damaged_attachment_is_left_out_and_said(log: Any) -> None:
+def test_damaged_attachment_is_dropped_and_reported(log: Any) -> None:
     path, _ = log
     data = bytearray(path.read_bytes())
     data[data.index(b"x = 1\n") + 3] ^= 1
@@ -241,7 +241,7 @@ def test_a_damaged_attachment_is_left_out_and_said(log: Any) -> None:
         (b"time,x,y,z\n1,2,3,4\n", "is no MCAP file"),
     ],
 )
-def test_what_is_no_log_is_refused(tmp_path: Path, content: bytes, reason: str) -> None:
+def test_non_log_file_is_refused(tmp_path: Path, content: bytes, reason: str) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
     with pytest.raises(LogError, match=reason):
@@ -251,14 +251,14 @@ def test_what_is_no_log_is_refused(tmp_path: Path, content: bytes, reason: str) 
     assert not (tmp_path / "out.mcap").exists()
 
 
-def test_a_missing_file_and_a_directory_are_named(tmp_path: Path) -> None:
+def test_missing_file_and_directory_are_named(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="No such file"):
         info(tmp_path / "none.mcap")
     with pytest.raises(LogError, match="Is a directory"):
         info(tmp_path)
 
 
-def test_the_target_is_never_overwritten(log: Any, tmp_path: Path) -> None:
+def test_target_is_never_overwritten(log: Any, tmp_path: Path) -> None:
     path, _ = log
     for target in (path, tmp_path / "there.mcap"):
         before = path.read_bytes()
@@ -270,7 +270,7 @@ def test_the_target_is_never_overwritten(log: Any, tmp_path: Path) -> None:
     assert (tmp_path / "there.mcap").read_bytes() == b"precious"
 
 
-def test_a_target_that_cannot_be_written_leaves_nothing(log: Any, tmp_path: Path) -> None:
+def test_unwritable_target_leaves_no_file(log: Any, tmp_path: Path) -> None:
     path, _ = log
     with pytest.raises(RecoveryError, match="name a place with room to write to"):
         recover(path, tmp_path / "no" / "such" / "place.mcap")
@@ -278,7 +278,7 @@ def test_a_target_that_cannot_be_written_leaves_nothing(log: Any, tmp_path: Path
 
 @pytest.mark.parametrize("compression", list(CompressionType))
 @pytest.mark.parametrize("chunked", [True, False])
-def test_logs_of_other_writers_read_and_recover(
+def test_logs_of_other_writers_are_read_and_recovered(
     tmp_path: Path, compression: CompressionType, chunked: bool
 ) -> None:
     path = tmp_path / "other.mcap"
@@ -299,7 +299,7 @@ def test_logs_of_other_writers_read_and_recover(
     assert 10 < recovered(path).messages < 90
 
 
-def test_a_chunk_that_claims_to_be_huge_does_not_take_memory(tmp_path: Path) -> None:
+def test_chunk_claiming_a_huge_size_takes_no_memory(tmp_path: Path) -> None:
     bomb = zstandard.ZstdCompressor().compress(bytes(400 << 20))
     head = struct.pack("<QQQI", 1, 2, 400 << 20, 0) + struct.pack("<I", 4) + b"zstd"
     body = head + struct.pack("<Q", len(bomb)) + bomb
@@ -314,7 +314,7 @@ def test_a_chunk_that_claims_to_be_huge_does_not_take_memory(tmp_path: Path) -> 
     assert peak < 20 << 20
 
 
-def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
+def test_memory_use_is_independent_of_log_size(tmp_path: Path) -> None:
     payload = random.Random(1).randbytes(2000)
     peaks = []
     for chunks in (20, 200):
@@ -329,7 +329,7 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     assert peaks[1] < peaks[0] + 200_000  # the summary's index: 80 bytes a chunk
 
 
-def test_progress_goes_from_start_to_end(log: Any) -> None:
+def test_progress_runs_from_start_to_end(log: Any) -> None:
     path, _ = log
     steps: list[tuple[int, int]] = []
     info(path, lambda done, size: steps.append((done, size)))
@@ -338,7 +338,7 @@ def test_progress_goes_from_start_to_end(log: Any) -> None:
     assert [done for done, _ in steps] == sorted(done for done, _ in steps)
 
 
-def test_silences_are_found_where_they_are(tmp_path: Path, payload: bytes) -> None:
+def test_silent_intervals_are_located(tmp_path: Path, payload: bytes) -> None:
     path = tmp_path / "log.mcap"
     file = McapFile(path, DiskStorage(), "test")
     schema = codec().schema(topics.RAW)

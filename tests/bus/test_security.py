@@ -19,6 +19,8 @@ from typing import Any
 import pytest
 import zenoh
 
+from support.network import free_port
+from support.waiting import wait_until
 from tactile_core.bus import runtime, topics
 from tactile_core.bus.rights import CERTIFICATE_ROLES
 from tactile_core.bus.services import NoAnswerError, ServiceError, call, declare_service
@@ -124,14 +126,14 @@ def peer() -> Iterator[Callable[..., subprocess.Popen[str]]]:
             process.stdout.close()
 
 
-def hears(stream: Any, send: Callable[[], object], until: Any) -> None:
-    until(lambda: send() or stream.newest() is not None)
+def hears(stream: Any, send: Callable[[], object]) -> None:
+    wait_until(lambda: send() or stream.newest() is not None)
 
 
 # The folder and its sockets
 
 
-def test_by_default_nothing_listens_where_another_user_could_come_in(rig: Path, join: Any) -> None:
+def test_default_sockets_are_closed_to_other_users(rig: Path, join: Any) -> None:
     for role in PORTS:
         join(role=role)
     assert sorted(p.name for p in (rig / "bus").glob("*.sock")) == [
@@ -159,13 +161,13 @@ def _descriptors() -> list[str]:
     return found
 
 
-def test_daemons_and_tools_meet_through_the_folder_whoever_comes_first(
-    rig: Path, peer: Any, join: Any, until: Any
+def test_daemons_and_tools_connect_via_runtime_folder_in_any_order(
+    rig: Path, peer: Any, join: Any
 ) -> None:
     tool = join(role="tool")  # before any daemon
     streams = {role: latest(tool, f"tactile/{role}/features") for role in PORTS}
     processes = [peer(role) for role in reversed(list(PORTS))]
-    until(lambda: all(stream.received for stream in map(_drained, streams.values())))
+    wait_until(lambda: all(stream.received for stream in map(_drained, streams.values())))
     for process in processes:  # each hears the other two
         assert process.stdout.readline() == "heard\n"
 
@@ -175,23 +177,21 @@ def _drained(stream: Any) -> Any:
     return stream
 
 
-def test_killed_with_its_socket_left_behind_a_daemon_comes_back(
-    rig: Path, peer: Any, join: Any, until: Any
-) -> None:
+def test_killed_daemon_restarts_despite_its_stale_socket(rig: Path, peer: Any, join: Any) -> None:
     stream = latest(join(role="tool"), "tactile/tactiled/features")
     for _ in range(3):
         process = peer("tactiled")
-        until(lambda: stream.newest() is not None)
+        wait_until(lambda: stream.newest() is not None)
         process.kill()
         process.wait()
         assert (rig / "bus" / "tactiled.sock").exists()
         stream.newest()
     peer("tactiled")
-    until(lambda: stream.newest() is not None)
+    wait_until(lambda: stream.newest() is not None)
 
 
-def test_rigs_side_by_side_do_not_hear_one_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, join: Any, until: Any
+def test_separate_rigs_do_not_hear_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, join: Any
 ) -> None:
     streams, publishers = [], []
     for name in ("one", "two"):
@@ -199,7 +199,7 @@ def test_rigs_side_by_side_do_not_hear_one_another(
         publishers.append(declare_publisher(join(role="tactiled"), topics.FEATURES, name))
         streams.append(latest(join(role="tool"), "tactile/*/features"))
     for publisher, stream in zip(publishers, streams, strict=True):
-        hears(stream, lambda p=publisher: p.put(b"x", 1), until)
+        hears(stream, lambda p=publisher: p.put(b"x", 1))
     for publisher in publishers:
         publisher.put(b"last", 1)
     for name, stream in zip(("one", "two"), streams, strict=True):
@@ -207,20 +207,18 @@ def test_rigs_side_by_side_do_not_hear_one_another(
         assert sample.key == f"tactile/{name}/features"
 
 
-def test_a_second_one_of_a_role_is_told_who_is_there(rig: Path, peer: Any) -> None:
+def test_second_daemon_of_a_role_is_told_who_holds_it(rig: Path, peer: Any) -> None:
     process = peer("arm")
     with pytest.raises(BusError, match=rf"another arm runs.*process {process.pid}.*--listen"):
         open_session(BusConfig(role="arm"))
 
 
-def test_a_stopped_reader_at_a_socket_blocks_nobody(
-    rig: Path, peer: Any, join: Any, until: Any
-) -> None:
+def test_stopped_reader_on_a_socket_blocks_nobody(rig: Path, peer: Any, join: Any) -> None:
     session = join(role="tactiled")
     publisher = declare_publisher(session, topics.FEATURES, "b0")
     stopped = peer("reachd")
     stream = latest(join(role="tool"), publisher.key)
-    hears(stream, lambda: publisher.put(b"x", 1), until)
+    hears(stream, lambda: publisher.put(b"x", 1))
     os.kill(stopped.pid, signal.SIGSTOP)
     try:
         started = time.monotonic()
@@ -228,7 +226,7 @@ def test_a_stopped_reader_at_a_socket_blocks_nobody(
             publisher.put(bytes(20_000), 1)
             time.sleep(0.0003)
         assert time.monotonic() - started < 20  # blocking waits 5 s for each message
-        until(lambda: (stream.newest() or publisher.put(b"last", 1)) is not None)
+        wait_until(lambda: (stream.newest() or publisher.put(b"last", 1)) is not None)
     finally:
         os.kill(stopped.pid, signal.SIGCONT)
 
@@ -242,7 +240,7 @@ def test_a_stopped_reader_at_a_socket_blocks_nobody(
         (lambda bus: bus.parent.chmod(0o777), "may write to"),
     ],
 )
-def test_a_folder_that_is_not_safe_is_refused(rig: Path, spoil: Any, said: str) -> None:
+def test_unsafe_folder_is_refused(rig: Path, spoil: Any, said: str) -> None:
     if os.getuid() != 0 and "user" in said:
         pytest.skip("only root can give a folder away")
     (rig / "bus").mkdir(parents=True, mode=0o750)
@@ -251,7 +249,7 @@ def test_a_folder_that_is_not_safe_is_refused(rig: Path, spoil: Any, said: str) 
         open_session(BusConfig(role="tactiled"))
 
 
-def test_a_path_that_no_socket_can_have_is_refused(
+def test_path_too_long_for_a_socket_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for folder, said in (("d" * 120, "107"), ("a b", "no space"), ("a#b", "none of")):
@@ -265,9 +263,7 @@ def test_a_path_that_no_socket_can_have_is_refused(
 # The secret
 
 
-def test_over_plain_tcp_only_the_secret_lets_in(
-    join: Any, plain: Any, free_port: Any, until: Any
-) -> None:
+def test_plain_tcp_requires_the_secret(join: Any, plain: Any) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     arm = join(role="arm", listen=(endpoint,), connect=())
     obeyed: list[str] = []
@@ -280,7 +276,7 @@ def test_over_plain_tcp_only_the_secret_lets_in(
         plain(endpoint, mode="client", **{"connect/timeout_ms": 500})
     spying = [latest(session, states.key) for session in evil]
     friend = latest(join(listen=(), connect=(endpoint,)), states.key)
-    hears(friend, lambda: states.put(b"x", 1), until)
+    hears(friend, lambda: states.put(b"x", 1))
     for _ in range(100):
         states.put(b"x", 1)
         for session in evil:
@@ -324,10 +320,10 @@ def test_insecure_by_name_lets_everybody_in(
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     stream = latest(join(listen=(endpoint,), connect=(), insecure=True), "tactile/*/features")
     stranger = plain(endpoint)
-    until(lambda: stranger.put("tactile/b0/features", b"x") or stream.newest())
+    wait_until(lambda: stranger.put("tactile/b0/features", b"x") or stream.newest())
 
 
-def test_the_secret_is_made_once_and_kept_from_others(
+def test_secret_is_created_once_and_private(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place = runtime.Runtime(tmp_path / "home")
@@ -344,7 +340,7 @@ def test_the_secret_is_made_once_and_kept_from_others(
         runtime.token_file(place)
 
 
-def test_the_folder_of_the_secret_may_not_be_anothers(
+def test_secret_folder_of_another_user_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Somebody may have made it first where all users write; the remedy names what moves it."""
@@ -361,7 +357,7 @@ def test_the_folder_of_the_secret_may_not_be_anothers(
         open_session(BusConfig(role="tactiled"))
 
 
-def test_a_services_folder_is_its_groups_too(
+def test_service_folder_is_shared_with_its_group(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, join: Any
 ) -> None:
     monkeypatch.delenv(runtime.RUNTIME_VARIABLE, raising=False)
@@ -393,7 +389,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def secure_arm(lab: Path, join: Any, free_port: Any) -> Any:
+def secure_arm(lab: Path, join: Any) -> Any:
     """An arm over TLS: (endpoint, what it obeyed, its publisher of states)."""
     endpoint = f"tls/localhost:{free_port()}"
     arm = join(role="arm", listen=(endpoint,), connect=(), keys=str(lab / "lab" / "arm"))
@@ -406,15 +402,13 @@ def secure_arm(lab: Path, join: Any, free_port: Any) -> Any:
     return endpoint, obeyed, declare_publisher(arm, topics.ARM_STATE, "arm"), arm
 
 
-def test_each_role_may_do_what_is_its_own(
-    lab: Path, join: Any, secure_arm: Any, until: Any
-) -> None:
+def test_each_role_has_only_its_own_rights(lab: Path, join: Any, secure_arm: Any) -> None:
     endpoint, obeyed, states, arm = secure_arm
     _token = arm.liveliness().declare_token(topics.alive_key("arm", "arm"))
     for role in ("reachd", "operator", "viewer", "tactiled"):
         session = join(listen=(), connect=(endpoint,), keys=str(lab / "lab" / role))
         stream = latest(session, states.key)
-        hears(stream, lambda: states.put(b"x", 1), until)
+        hears(stream, lambda: states.put(b"x", 1))
         obeyed.clear()
         assert call(session, "arm/arm/srv/status", timeout=10)["did"] == "status"
         alive = session.liveliness().get("arm/*/alive", timeout=5)
@@ -429,16 +423,14 @@ def test_each_role_may_do_what_is_its_own(
             assert list(session.get("arm/arm/srv/limits", timeout=0.5)) == []
             assert list(session.get("arm/arm/srv/*", timeout=0.5)) == []
         if role == "reachd":
-            until(lambda: "command" in obeyed)
+            wait_until(lambda: "command" in obeyed)
         time.sleep(0.1)
         assert ("command" in obeyed) == (role == "reachd")
         assert ("limits" in obeyed) == (role in ("reachd", "operator"))
     assert certificate_names(arm) == ["operator", "reachd", "tactiled", "viewer"]
 
 
-def test_only_the_arms_certificate_speaks_for_the_arm(
-    lab: Path, join: Any, free_port: Any, until: Any
-) -> None:
+def test_only_the_arm_certificate_publishes_arm_state(lab: Path, join: Any) -> None:
     """Whoever else listens where the arm is sought, even with keys of the lab, is not believed."""
     endpoint = f"tls/localhost:{free_port()}"
     reach = join(listen=(), connect=(endpoint,), keys=str(lab / "lab" / "reachd"))
@@ -448,15 +440,13 @@ def test_only_the_arms_certificate_speaks_for_the_arm(
     declare_service(false, "arm/arm/srv/limits", lambda r: {})
     states = declare_publisher(false, topics.ARM_STATE, "arm")
     skin = declare_publisher(false, topics.FEATURES, "b0")
-    until(lambda: states.put(b"x", 1) or skin.put(b"x", 1) or events.newest())
+    wait_until(lambda: states.put(b"x", 1) or skin.put(b"x", 1) or events.newest())
     assert stream.received == 0
     with pytest.raises(NoAnswerError):
         call(reach, "arm/arm/srv/limits", timeout=0.5)
 
 
-def test_a_certificate_of_a_tool_cannot_pass_for_a_daemons(
-    lab: Path, join: Any, free_port: Any
-) -> None:
+def test_tool_certificate_cannot_impersonate_a_daemon(lab: Path, join: Any) -> None:
     endpoint = f"tls/localhost:{free_port()}"
     reach = join(listen=(), connect=(endpoint,), keys=str(lab / "lab" / "reachd"))
     false = join(listen=(endpoint,), connect=(), keys=str(lab / "lab" / "operator"))
@@ -468,8 +458,8 @@ def test_a_certificate_of_a_tool_cannot_pass_for_a_daemons(
 @pytest.mark.parametrize(
     "who", ["unlisted", "foreign", "expired", "no certificate", "plain TCP", "self-made name"]
 )
-def test_whoever_is_not_let_in_hears_and_moves_nothing(
-    lab: Path, join: Any, plain: Any, secure_arm: Any, until: Any, who: str, free_port: Any
+def test_rejected_peer_hears_and_moves_nothing(
+    lab: Path, join: Any, plain: Any, secure_arm: Any, who: str
 ) -> None:
     endpoint, obeyed, states, _arm = secure_arm
     ca = {"transport/link/tls/root_ca_certificate": str(lab / "lab" / "ca.pem")}
@@ -484,7 +474,7 @@ def test_whoever_is_not_let_in_hears_and_moves_nothing(
     }[who]()
     spy = latest(stranger, states.key)
     friend = latest(join(connect=(endpoint,), keys=str(lab / "lab" / "viewer")), states.key)
-    hears(friend, lambda: states.put(b"x", 1), until)
+    hears(friend, lambda: states.put(b"x", 1))
     for _ in range(60):
         states.put(b"x", 1)
         stranger.put("arm/arm/cmd_vel", b"go")
@@ -504,7 +494,7 @@ def _tls(folder: Path, ca: dict[str, str]) -> dict[str, Any]:
     }
 
 
-def test_a_rig_with_keys_has_nothing_without_them(lab: Path, tmp_path: Path) -> None:
+def test_rig_with_keys_is_closed_to_peers_without_keys(lab: Path, tmp_path: Path) -> None:
     keys = str(lab / "lab" / "arm")
     for endpoint in ("tcp/127.0.0.1:0", f"unixsock-stream/{tmp_path}/a.sock", "tcp/0.0.0.0:0"):
         with pytest.raises(BusError, match="this rig has keys"):
@@ -512,7 +502,7 @@ def test_a_rig_with_keys_has_nothing_without_them(lab: Path, tmp_path: Path) -> 
     assert BusConfig(role="arm", keys=keys).listen_endpoints() == ("tls/127.0.0.1:7453",)
 
 
-def test_keys_that_are_not_whole_are_refused(lab: Path, tmp_path: Path) -> None:
+def test_incomplete_keys_are_refused(lab: Path, tmp_path: Path) -> None:
     def refused(keys: Path, said: str) -> None:
         with pytest.raises(BusError, match=said):
             open_session(BusConfig(listen=(), connect=(), keys=str(keys)))
@@ -543,9 +533,7 @@ def test_every_role_has_a_certificate(lab: Path) -> None:
 # Seats
 
 
-def test_a_hundred_strangers_over_plain_tcp_take_no_seat(
-    join: Any, plain: Any, free_port: Any, until: Any
-) -> None:
+def test_hundred_strangers_over_plain_tcp_take_no_session(join: Any, plain: Any) -> None:
     """Half of them try zenoh's handshake again and again, half hold a connection and are silent."""
     port = free_port()
     session = join(listen=(f"tcp/127.0.0.1:{port}",), connect=())
@@ -558,39 +546,37 @@ def test_a_hundred_strangers_over_plain_tcp_take_no_seat(
         latest(join(listen=(), connect=(f"tcp/127.0.0.1:{port}",)), "tactile/*/features")
         for _ in range(4)
     ]
-    until(lambda: publisher.put(b"x", 1) or all(p.received for p in map(_drained, peers)))
+    wait_until(lambda: publisher.put(b"x", 1) or all(p.received for p in map(_drained, peers)))
     assert len(session.info.peers_zid()) == 4
     assert not any(list(s.info.peers_zid()) for s in strangers)
     for connection in silent:
         connection.close()
 
 
-def test_a_hundred_strangers_over_tls_leave_room_for_the_owners_peers(
-    lab: Path, join: Any, secure_arm: Any, until: Any
+def test_hundred_strangers_over_tls_leave_room_for_own_peers(
+    lab: Path, join: Any, secure_arm: Any
 ) -> None:
     """With a certificate that the lab signed, which is not on the list: they connect, no more."""
     endpoint, obeyed, states, arm = secure_arm
     guest = str(lab / "lab" / "guest")
     strangers = [join(connect=(endpoint,), listen=(), keys=guest) for _ in range(STRANGERS)]
-    until(lambda: len(arm.info.peers_zid()) >= STRANGERS, 60)
+    wait_until(lambda: len(arm.info.peers_zid()) >= STRANGERS, 60)
     peer = join(connect=(endpoint,), listen=(), keys=str(lab / "lab" / "reachd"))
     stream = latest(peer, states.key)
-    hears(stream, lambda: states.put(b"x", 1), until)
+    hears(stream, lambda: states.put(b"x", 1))
     strangers[-1].put("arm/arm/cmd_vel", b"go")
     peer.put("arm/arm/cmd_vel", b"go")
-    until(lambda: obeyed)
+    wait_until(lambda: obeyed)
     time.sleep(0.2)
     assert obeyed == ["command"]
     assert certificate_names(arm) == ["guest", "reachd"]
 
 
-def test_tokens_of_liveliness_are_the_roles_own(
-    lab: Path, join: Any, secure_arm: Any, until: Any
-) -> None:
+def test_liveliness_tokens_belong_to_their_role(lab: Path, join: Any, secure_arm: Any) -> None:
     endpoint, _, _, arm = secure_arm
     viewer = join(connect=(endpoint,), listen=(), keys=str(lab / "lab" / "viewer"))
     skin = join(connect=(endpoint,), listen=(), keys=str(lab / "lab" / "tactiled"))
     _false = viewer.liveliness().declare_token("reach/reach/alive")
     _true = declare_alive(skin, "b0")
-    until(lambda: list_alive(arm, 1) == ["b0"])
+    wait_until(lambda: list_alive(arm, 1) == ["b0"])
     assert list(arm.liveliness().get("reach/*/alive", timeout=0.5)) == []

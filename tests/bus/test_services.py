@@ -10,12 +10,11 @@ import msgspec
 import pytest
 import zenoh
 
+from support.network import free_port
+from support.waiting import PATIENCE_S
 from tactile_core.bus.messages import MAX_PAYLOAD
 from tactile_core.bus.services import NoAnswerError, ServiceError, call, declare_service
 from tactile_core.bus.topics import service_key
-
-SLOW = 60.0
-"""s that anything may take on a busy machine before a test gives it up."""
 
 KEY = service_key("b0", "set_rate")
 
@@ -35,11 +34,11 @@ def handle(request: SetRate) -> dict[str, Any]:
 
 
 @pytest.fixture
-def client(bus: Any, free_port: Any) -> Iterator[Any]:
+def client(bus: Any) -> Iterator[Any]:
     port = free_port()
     service = declare_service(bus(listen=port), KEY, handle, SetRate)
     client = bus(connect=port)
-    assert call(client, KEY, {"rate": 5}, timeout=SLOW) == {"rate": 5.0}
+    assert call(client, KEY, {"rate": 5}, timeout=PATIENCE_S) == {"rate": 5.0}
     yield client
     service.close()
 
@@ -58,33 +57,35 @@ def client(bus: Any, free_port: Any) -> Iterator[Any]:
 )
 def test_failures_come_back_as_errors(client: Any, request_: Any, reason: str) -> None:
     with pytest.raises(ServiceError, match=reason):
-        call(client, KEY, request_, timeout=SLOW)
-    assert call(client, KEY, {"rate": 7}, timeout=SLOW) == {"rate": 7.0}  # and the service lives on
+        call(client, KEY, request_, timeout=PATIENCE_S)
+    assert call(client, KEY, {"rate": 7}, timeout=PATIENCE_S) == {
+        "rate": 7.0
+    }  # and the service lives on
 
 
-def test_a_request_that_is_no_json_gets_an_error(client: Any) -> None:
-    replies = list(client.get(KEY, payload=b"\xff{", timeout=SLOW))
+def test_non_json_request_gets_an_error(client: Any) -> None:
+    replies = list(client.get(KEY, payload=b"\xff{", timeout=PATIENCE_S))
     assert len(replies) == 1
     assert b"bad request" in replies[0].err.payload.to_bytes()
 
 
-def test_an_oversized_request_is_refused(client: Any) -> None:
+def test_oversized_request_is_refused(client: Any) -> None:
     with pytest.raises(ValueError, match="65536 allowed"):
         call(client, KEY, {"rate": 1, "x": "y" * MAX_PAYLOAD})
     raw = msgspec.json.encode({"rate": 1}) + b" " * MAX_PAYLOAD
-    replies = list(client.get(KEY, payload=raw, timeout=SLOW))
+    replies = list(client.get(KEY, payload=raw, timeout=PATIENCE_S))
     assert b"65536 allowed" in replies[0].err.payload.to_bytes()
 
 
-def test_nobody_there_is_said_after_the_timeout(client: Any) -> None:
+def test_absent_service_is_reported_after_the_timeout(client: Any) -> None:
     with pytest.raises(NoAnswerError, match="nobody serves tactile/b1/srv/tare"):
         call(client, service_key("b1", "tare"), timeout=0.3)
 
 
-def test_a_service_that_hangs_is_told_from_one_that_is_not_there(bus: Any, free_port: Any) -> None:
+def test_hanging_service_is_distinguished_from_absent_one(bus: Any) -> None:
     port = free_port()
     leave = threading.Event()
-    service = declare_service(bus(listen=port), KEY, lambda request: leave.wait(2 * SLOW))
+    service = declare_service(bus(listen=port), KEY, lambda request: leave.wait(2 * PATIENCE_S))
     client = bus(connect=port)
     with pytest.raises(NoAnswerError, match="no answer from"):
         call(client, KEY, timeout=3.0)
@@ -92,20 +93,20 @@ def test_a_service_that_hangs_is_told_from_one_that_is_not_there(bus: Any, free_
     service.close()
 
 
-def test_a_service_that_starts_late_is_waited_for(bus: Any, free_port: Any) -> None:
+def test_late_service_is_waited_for(bus: Any) -> None:
     port = free_port()
     client = bus(connect=port)
     server = bus(listen=port)
     timer = threading.Timer(0.5, lambda: declare_service(server, KEY, lambda request: "hello"))
     timer.start()
-    assert call(client, KEY, timeout=SLOW) == "hello"
+    assert call(client, KEY, timeout=PATIENCE_S) == "hello"
     timer.join()
 
 
-def test_a_reply_that_is_no_json_is_an_error(bus: Any, free_port: Any) -> None:
+def test_non_json_reply_is_an_error(bus: Any) -> None:
     port = free_port()
     server = bus(listen=port)
     queryable = server.declare_queryable(KEY, lambda query: query.reply(KEY, b"\xff"))
     with pytest.raises(ServiceError, match="is no JSON"):
-        call(bus(connect=port), KEY, timeout=SLOW)
+        call(bus(connect=port), KEY, timeout=PATIENCE_S)
     assert isinstance(queryable, zenoh.Queryable)

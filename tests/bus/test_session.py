@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 
+from support.network import free_port
+from support.waiting import PATIENCE_S, wait_until
 from tactile_core.bus import topics
 from tactile_core.bus.keys import Roles, TlsConfig
 from tactile_core.bus.messages import MAX_PAYLOAD
@@ -26,9 +28,6 @@ from tactile_core.bus.session import (
     open_session,
 )
 from tactile_core.bus.streams import Tap, declare_alive, declare_publisher, latest, list_alive
-
-SLOW = 60.0
-"""s that anything may take on a busy machine before a test gives it up."""
 
 SUBSCRIBER = textwrap.dedent("""
     import sys, time
@@ -65,7 +64,7 @@ def subscriber() -> Iterator[Any]:
         process.stdout.close()
 
 
-def test_nothing_is_open_to_the_network_by_default() -> None:
+def test_default_endpoints_are_local_only() -> None:
     roles: Any = (*PORTS, "tool")
     for role in roles:
         config = BusConfig(role=role)
@@ -88,7 +87,7 @@ def test_off_host_endpoints_are_refused(endpoint: str) -> None:
             open_session(config)
 
 
-def test_off_host_endpoints_are_taken_when_asked_by_name(caplog: Any) -> None:
+def test_off_host_endpoints_are_accepted_when_explicit(caplog: Any) -> None:
     session = open_session(BusConfig(listen=("tcp/0.0.0.0:0",), connect=(), insecure=True))
     assert "without protection" in caplog.text
     close_session(session)
@@ -106,50 +105,48 @@ def test_tls_without_keys_or_names_is_refused(tmp_path: Path) -> None:
         open_session(BusConfig(listen=("tls/0.0.0.0:0",), connect=(), tls=tls))
 
 
-def test_what_is_no_endpoint_is_named() -> None:
+def test_invalid_endpoint_is_named() -> None:
     with pytest.raises(BusError, match="robot"):
         open_session(BusConfig(listen=(), connect=("robot",), insecure=True))
 
 
-def test_a_busy_port_is_named_with_a_remedy(bus: Any, free_port: Any) -> None:
+def test_busy_port_is_named_with_a_remedy(bus: Any) -> None:
     port = free_port()
     bus(listen=port)
     with pytest.raises(BusError, match=rf"127.0.0.1:{port} is in use.*--listen"):
         bus(listen=port)
 
 
-def test_samples_carry_sequence_stamp_and_source(bus: Any, free_port: Any, until: Any) -> None:
+def test_samples_carry_sequence_stamp_and_source(bus: Any) -> None:
     port = free_port()
     publisher = declare_publisher(bus(listen=port), topics.FEATURES, "b0")
     stream = latest(bus(connect=port), "tactile/*/features")
-    until(lambda: publisher.put(b"x", 1) or stream.newest())
+    wait_until(lambda: publisher.put(b"x", 1) or stream.newest())
     publisher.put(b"data", 123)
-    sample = stream.wait(SLOW)
+    sample = stream.wait(PATIENCE_S)
     while sample.data != b"data":
-        sample = stream.wait(SLOW)
+        sample = stream.wait(PATIENCE_S)
     assert sample.key == "tactile/b0/features"
     assert (sample.wall_ns, sample.source) == (123, publisher.source)
     assert sample.sequence == publisher.sequence
 
 
-def test_a_slow_reader_gets_the_newest_and_counts_the_rest(
-    bus: Any, free_port: Any, until: Any
-) -> None:
+def test_slow_reader_gets_newest_and_counts_skipped(bus: Any) -> None:
     port = free_port()
     publisher = declare_publisher(bus(listen=port), topics.FEATURES, "b0")
     session = bus(connect=port)
     stream = latest(session, publisher.key)
-    until(lambda: publisher.put(b"x", 1) or stream.newest())
+    wait_until(lambda: publisher.put(b"x", 1) or stream.newest())
     publisher.put(b"now", 1)
-    until(lambda: (sample := stream.newest()) is not None and sample.data == b"now")
+    wait_until(lambda: (sample := stream.newest()) is not None and sample.data == b"now")
     received, skipped, sent = stream.received, stream.skipped, publisher.sequence
     heard = threading.Event()
     tap = Tap(session, publisher.key, lambda s: s.sequence == sent + 500 and heard.set())
     for _ in range(500):
         publisher.put(b"x", 1)
         time.sleep(0.0005)
-    assert heard.wait(SLOW)
-    sample = stream.wait(SLOW)
+    assert heard.wait(PATIENCE_S)
+    sample = stream.wait(PATIENCE_S)
     assert sample.sequence == sent + 500
     assert stream.received == received + 1
     assert stream.skipped == skipped + 499
@@ -157,9 +154,7 @@ def test_a_slow_reader_gets_the_newest_and_counts_the_rest(
     assert stream.newest() is None
 
 
-def test_a_slow_process_acts_on_the_newest(
-    bus: Any, free_port: Any, subscriber: Any, until: Any
-) -> None:
+def test_slow_process_acts_on_newest_sample(bus: Any, subscriber: Any) -> None:
     """Row 21: a reader that takes 0.2 s over each sample does not fall behind."""
     port = free_port()
     publisher = declare_publisher(bus(listen=port), topics.FEATURES, "b0")
@@ -176,23 +171,21 @@ def test_a_slow_process_acts_on_the_newest(
         publisher.put(bytes(1000), 1)
         time.sleep(0.002)
     # Had they queued, it would get there after 200 s only.
-    until(lambda: seen[-1] == publisher.sequence)
+    wait_until(lambda: seen[-1] == publisher.sequence)
     process.kill()
     reader.join()
     assert seen == sorted(set(seen))
     assert len(seen) < publisher.sequence
 
 
-def test_a_stopped_subscriber_blocks_nobody(
-    bus: Any, free_port: Any, subscriber: Any, until: Any
-) -> None:
+def test_stopped_subscriber_blocks_nobody(bus: Any, subscriber: Any) -> None:
     """Row 20: with one reader under SIGSTOP, puts go on and the others get everything new."""
     port = free_port()
     session = bus(listen=port)
     publisher = declare_publisher(session, topics.FEATURES, "b0")
     stopped = subscriber(port, publisher.key, 0.01)
     stream = latest(bus(connect=port), publisher.key)
-    until(lambda: publisher.put(b"x", 1) or stream.newest())
+    wait_until(lambda: publisher.put(b"x", 1) or stream.newest())
     os.kill(stopped.pid, signal.SIGSTOP)
     try:
         # Far more than sockets and queues hold: a publisher that blocks waits 5 s for each of
@@ -200,44 +193,42 @@ def test_a_stopped_subscriber_blocks_nobody(
         for _ in range(3000):
             publisher.put(bytes(20_000), 1)
             time.sleep(0.0003)
-        until(lambda: (stream.newest() or publisher.put(b"last", 1)) is not None)
+        wait_until(lambda: (stream.newest() or publisher.put(b"last", 1)) is not None)
     finally:
         os.kill(stopped.pid, signal.SIGCONT)
     assert stream.received > 0
 
 
-def test_oversized_payloads_are_refused(bus: Any, free_port: Any, until: Any) -> None:
+def test_oversized_payloads_are_refused(bus: Any) -> None:
     port = free_port()
     session = bus(listen=port)
     publisher = declare_publisher(session, topics.FEATURES, "b0")
     with pytest.raises(ValueError, match="65536 allowed"):
         publisher.put(bytes(MAX_PAYLOAD + 1), 1)
     stream = latest(bus(connect=port), publisher.key)
-    until(lambda: publisher.put(bytes(MAX_PAYLOAD), 1) or stream.newest())
+    wait_until(lambda: publisher.put(bytes(MAX_PAYLOAD), 1) or stream.newest())
     publisher.put(b"now", 1)
-    until(lambda: (sample := stream.newest()) is not None and sample.data == b"now")
+    wait_until(lambda: (sample := stream.newest()) is not None and sample.data == b"now")
     # A sender that does not keep to the limit: a little above we count, far above zenoh drops.
     session.put(publisher.key, bytes(MAX_PAYLOAD + 100))
-    until(lambda: stream.newest() is None and stream.refused == 1)
+    wait_until(lambda: stream.newest() is None and stream.refused == 1)
     session.put(publisher.key, bytes(4 << 20))
-    until(lambda: publisher.put(b"still here", 1) or stream.newest() is not None)
+    wait_until(lambda: publisher.put(b"still here", 1) or stream.newest() is not None)
     assert stream.refused <= 2  # counted, or dropped on its way
 
 
-def test_a_plain_zenoh_sender_is_understood(bus: Any, free_port: Any, until: Any) -> None:
+def test_plain_zenoh_publisher_is_understood(bus: Any) -> None:
     port = free_port()
     session = bus(listen=port)
     stream = latest(bus(connect=port), "arm/a/state")
-    until(lambda: session.put("arm/a/state", b"x") or stream.newest())
+    wait_until(lambda: session.put("arm/a/state", b"x") or stream.newest())
     session.put("arm/a/state", b"y", attachment=b"odd")
-    sample = stream.wait(SLOW)
+    sample = stream.wait(PATIENCE_S)
     assert sample.data in (b"x", b"y")
     assert (sample.sequence, sample.wall_ns, sample.source) == (None, None, None)
 
 
-def test_daemons_find_one_another_whoever_starts_first(
-    bus: Any, free_port: Any, until: Any
-) -> None:
+def test_daemons_connect_in_any_start_order(bus: Any) -> None:
     port = free_port()
     early = bus(connect=port)
     assert list_alive(early, 0.2) == []
@@ -245,7 +236,7 @@ def test_daemons_find_one_another_whoever_starts_first(
     token = declare_alive(late, "b0")
     assert list_alive(early, 10) == ["b0"]
     token.undeclare()
-    until(lambda: list_alive(early, 0.1) == [])
+    wait_until(lambda: list_alive(early, 0.1) == [])
     close_session(late)
     again = bus(listen=port)  # restarted: found again without anyone's help
     _token = declare_alive(again, "b0")
@@ -255,7 +246,7 @@ def test_daemons_find_one_another_whoever_starts_first(
 @pytest.mark.parametrize(
     "way", ["", "close_session(session)", "session.close()", "raise SystemExit(7)"]
 )
-def test_a_process_that_used_the_bus_ends(free_port: Any, way: str) -> None:
+def test_process_that_used_the_bus_exits(way: str) -> None:
     """With a subscriber callback and a service, which zenoh serves from threads of its own."""
     code = textwrap.dedent(f"""
         from tactile_core.bus.session import BusConfig, open_session, close_session
@@ -272,14 +263,12 @@ def test_a_process_that_used_the_bus_ends(free_port: Any, way: str) -> None:
     assert b"Traceback" not in result.stderr
 
 
-def test_closing_does_not_wait_for_a_stopped_peer(
-    free_port: Any, subscriber: Any, until: Any
-) -> None:
+def test_closing_does_not_wait_for_a_stopped_peer(subscriber: Any) -> None:
     port = free_port()
     session = open_session(BusConfig(listen=(f"tcp/127.0.0.1:{port}",), connect=()))
     publisher = declare_publisher(session, topics.FEATURES, "b0")
     process = subscriber(port, publisher.key, 0.01)
-    until(lambda: session.info.peers_zid())
+    wait_until(lambda: session.info.peers_zid())
     os.kill(process.pid, signal.SIGSTOP)
     for _ in range(3000):
         publisher.put(bytes(20_000), 1)

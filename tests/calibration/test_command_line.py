@@ -81,7 +81,7 @@ def lose_column(sensor, states):
     ],
     ids=lambda v: getattr(v, "__name__", None),
 )
-def test_a_bad_recording_is_refused_with_its_place(capsys, write_pair, edit, words):
+def test_bad_recording_is_refused_with_its_location(capsys, write_pair, edit, words):
     folder = write_pair(edit=edit)
     code, _, err = run(capsys, "evaluate", folder)
     assert code == 2
@@ -89,7 +89,7 @@ def test_a_bad_recording_is_refused_with_its_place(capsys, write_pair, edit, wor
         assert word in err
 
 
-def test_recordings_of_other_boards_or_none_are_refused(capsys, write_pair, tmp_path):
+def test_recordings_of_other_or_no_boards_are_refused(capsys, write_pair, tmp_path):
     one, other = write_pair("a"), write_pair("b", taxels=4)
     out = tmp_path / "x.cal.toml"
     code, _, err = run(capsys, "fit", one, other, "--out", out, "--serial", "s")
@@ -111,7 +111,7 @@ def test_recordings_of_other_boards_or_none_are_refused(capsys, write_pair, tmp_
     assert str(garbage) in err
 
 
-def test_outputs_that_cannot_be_written_are_refused_before_the_work(capsys, write_pair, tmp_path):
+def test_unwritable_outputs_are_refused_before_work_starts(capsys, write_pair, tmp_path):
     folder = write_pair()
     for out, code in (("x.toml", 2), ("none/x.cal.toml", 3)):
         got, _, err = run(capsys, "fit", folder, "--serial", "s", "--out", tmp_path / out)
@@ -134,7 +134,7 @@ def test_outputs_that_cannot_be_written_are_refused_before_the_work(capsys, writ
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_folder_that_may_not_be_written_is_refused(capsys, quick, write_pair, tmp_path):
+def test_unwritable_folder_is_refused(capsys, quick, write_pair, tmp_path):
     locked = tmp_path / "locked"
     locked.mkdir(mode=0o500)
     code, _, err = run(capsys, "fit", write_pair(), "--serial", "s", "--out", locked / "x.cal.toml")
@@ -142,7 +142,7 @@ def test_a_folder_that_may_not_be_written_is_refused(capsys, quick, write_pair, 
     assert "cannot be written" in err
 
 
-def test_a_fit_leaves_a_file_that_says_where_it_is_from(capsys, quick, write_pair, tmp_path):
+def test_fitted_file_names_its_recordings(capsys, quick, write_pair, tmp_path):
     folders = [write_pair("normal_1", rows=600), write_pair("normal_2", rows=600)]
     out, report = tmp_path / "x.cal.toml", tmp_path / "report"
     code, said, err = run(
@@ -184,7 +184,7 @@ def test_a_fit_leaves_a_file_that_says_where_it_is_from(capsys, quick, write_pai
             assert word in err
 
 
-def test_an_evaluation_is_json(capsys, quick, write_pair):
+def test_evaluation_is_json(capsys, quick, write_pair):
     code, said, _ = run(capsys, "evaluate", write_pair(rows=400), "--json")
     assert code == 0
     found = json.loads(said)

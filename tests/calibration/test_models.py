@@ -50,7 +50,7 @@ def dragging(time, depth):
 
 
 @pytest.mark.parametrize(("force", "recipe"), [(creeping, CREEP), (dragging, PLAY)])
-def test_a_model_with_history_is_right_where_one_without_cannot_be(make_recording, force, recipe):
+def test_model_with_history_fits_hysteresis(make_recording, force, recipe):
     recording = make_recording(force, seconds=120)
     recipe = replace(recipe, penalties=(1.0,))
     simple = tail20([recording], [CUBIC])[0].rmse[0]
@@ -59,18 +59,18 @@ def test_a_model_with_history_is_right_where_one_without_cannot_be(make_recordin
     assert with_history < simple / 3
 
 
-def test_the_kind_that_the_skin_needs_is_chosen(make_recording):
+def test_model_kind_is_chosen_by_the_skin(make_recording):
     choice = choose([make_recording(creeping, seconds=80)], [LINEAR, CUBIC, CREEP])
     assert choice.recipe is CREEP
     assert {s.recipe.name for s in choice.scores} == {"linear", "cubic", "creep"}
 
 
-def test_a_recording_too_short_to_choose_by_is_refused_with_what_to_do(make_recording):
+def test_too_short_recording_is_refused_with_a_remedy(make_recording):
     with pytest.raises(RecordingError, match=r"labels over 5 s.*record more presses"):
         choose([make_recording(elastic, seconds=6, period=3)], [LINEAR])
 
 
-def test_the_delay_of_the_labels_is_found(make_recording):
+def test_label_delay_is_estimated(make_recording):
     """A slow memory alone: one of 0.3 s would take part of the delay on itself."""
     recording = make_recording(lambda time, depth: 10 * depth, delay=0.25, seconds=120, period=10)
     slow = replace(CREEP, components=2, degree=1, taus_s=(10.0,), lagged=1, lag_degree=0)
@@ -78,7 +78,7 @@ def test_the_delay_of_the_labels_is_found(make_recording):
     assert choice.delay_s == pytest.approx(0.25, abs=0.051)
 
 
-def test_the_beat_of_a_load_cell_read_too_slowly_is_found(make_recording):
+def test_load_cell_beat_is_estimated(make_recording):
     """Readings 0.2 s apart, fetched every 0.205 s: one in forty is skipped."""
     time = np.arange(0.0, 400.0, 0.205)
     true = np.floor(time / 0.2) * 0.2
@@ -94,7 +94,7 @@ def test_the_beat_of_a_load_cell_read_too_slowly_is_found(make_recording):
     assert np.median(clock.lag_s) > 0.05
 
 
-def test_no_beat_is_seen_where_there_is_none(make_recording):
+def test_no_false_beat_is_found(make_recording):
     recording = make_recording(creeping)
     assert find_clock(recording.label_time_s, recording.labels[:, 0]) is None
 
@@ -105,7 +105,7 @@ def test_no_beat_is_seen_where_there_is_none(make_recording):
     fold=st.integers(0, 4),
     gap=st.floats(0.0, 5.0),
 )
-def test_folds_leave_a_gap_on_both_sides_and_test_everything_once(gaps, fold, gap):
+def test_folds_leave_gaps_and_test_every_row_once(gaps, fold, gap):
     time = np.cumsum(gaps)
     edges = block_edges(time)
     for begin_end in edges:
@@ -117,7 +117,7 @@ def test_folds_leave_a_gap_on_both_sides_and_test_everything_once(gaps, fold, ga
     assert (tested == 1).all()
 
 
-def test_no_row_of_a_fold_is_near_one_it_was_fitted_on_not_even_in_a_copy(make_recording):
+def test_test_rows_are_never_near_training_rows(make_recording):
     recordings = [make_recording(elastic, seconds=90, seed=s, name=str(s)) for s in (0, 1)]
     made = copies(feature_map(CREEP, recordings), recordings, restarts=True)
     rows = align(made, recordings, 0.1)
@@ -136,7 +136,7 @@ def test_no_row_of_a_fold_is_near_one_it_was_fitted_on_not_even_in_a_copy(make_r
     assert seen == 12  # five blocks of each, and each whole
 
 
-def test_features_do_not_look_ahead(make_recording):
+def test_model_features_are_causal(make_recording):
     recording = make_recording(creeping, seconds=60)
     features = feature_map(PLAY, [recording])
     whole = batch_features(features, recording.time_s, recording.change_ut())
@@ -160,7 +160,7 @@ def test_features_do_not_look_ahead(make_recording):
     ],
     ids=lambda r: f"{r.name}-{r.readout}",
 )
-def test_the_file_gives_the_numbers_of_scikit_learn(make_recording, recipe: Recipe):
+def test_saved_model_matches_scikit_learn(make_recording, recipe: Recipe):
     recording = make_recording(creeping, seconds=60)
     features = feature_map(recipe, [recording])
     rows = align(copies(features, [recording], recipe.restarts), [recording], 0.0)
@@ -176,7 +176,7 @@ def test_the_file_gives_the_numbers_of_scikit_learn(make_recording, recipe: Reci
     assert readout(unbounded, rows.features) == pytest.approx(expected, abs=1e-6)
 
 
-def test_frame_by_frame_equals_the_whole_recording(make_recording):
+def test_frame_by_frame_equals_batch(make_recording):
     recording = make_recording(dragging, seconds=60)
     model = fit([recording], Choice(PLAY, 1.0, 0.0, (), ()))
     change = recording.change_ut()
@@ -187,7 +187,7 @@ def test_frame_by_frame_equals_the_whole_recording(make_recording):
     assert np.array(one_by_one) == pytest.approx(whole, abs=1e-9)
 
 
-def test_the_daemons_pipeline_says_what_the_batch_says(make_recording):
+def test_daemon_pipeline_matches_batch(make_recording):
     """Chips turned, rest from the file's own, tared at the start: features sum to the model."""
     recording = make_recording(creeping, seconds=60)
     model = fit([recording], Choice(CREEP, 1.0, 0.0, (), ()))
@@ -220,7 +220,7 @@ def test_the_daemons_pipeline_says_what_the_batch_says(make_recording):
     assert predict(model, recording).shape == recording.labels.shape
 
 
-def test_forces_pause_and_say_so_while_a_taxel_is_blind(make_recording):
+def test_forces_are_invalid_while_a_taxel_is_masked(make_recording):
     recording = make_recording(elastic, seconds=60)
     model = fit([recording], Choice(CREEP, 1.0, 0.0, (), ()))
     calibration = board(nominal("anyskin", "s", 5), [recording], [model], "s")

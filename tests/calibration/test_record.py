@@ -12,6 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.network import free_port
+from support.processes import command
+from support.waiting import PATIENCE_S
 from tactile_core.bus.messages import MSG, codec, header
 from tactile_core.bus.services import call
 from tactile_core.bus.session import BusConfig, close_session, open_session
@@ -21,7 +24,7 @@ from tactile_core.calibration import nominal, saves
 from tactile_core.calibration.file import SUFFIX
 from tactile_core.log.recorder import Recorder, RecorderSettings
 from tactile_tools.calibrate.log_recording import read_log
-from tactile_tools.processes import command, free_port, running, wait_for
+from tactile_tools.processes import running, wait_for
 
 FORCE_N = 4.0
 FIRST_S, EVERY_S = 3.0, 7.0
@@ -37,7 +40,6 @@ repeat = 1000
 every_s = {EVERY_S}
 """
 
-SLOW_S = 60.0
 CALIBRATE = (sys.executable, "-m", "tactile_tools.cli", "calibrate")
 
 
@@ -59,13 +61,13 @@ class Person:
             time.sleep(0.05)
 
     def force(self) -> float:
-        sample = self._features.wait(SLOW_S)
+        sample = self._features.wait(PATIENCE_S)
         assert sample is not None, "no features came"
         return float(codec().decode(FEATURES, sample.data).normal_force)
 
     def wait_for(self, *, pressed: bool) -> None:
         """Until the skin, after it was otherwise, is pressed or free, and steadily so."""
-        deadline = time.monotonic() + SLOW_S
+        deadline = time.monotonic() + PATIENCE_S
         for wanted in (not pressed, pressed):
             while (self.force() > 0.5) is not wanted:
                 assert time.monotonic() < deadline, f"pressed={wanted} did not come"
@@ -78,7 +80,8 @@ def served(folder: Path, *words: str) -> Iterator[tuple[str, Person]]:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     port, press = folder / "skin", folder / "press.toml"
     press.write_text(PRESSES)
-    simulator = [command("simdevice"), "boards", "--board", "anyskin", "--pty", str(port)]
+    simulator = [command("simdevice"), "boards", "--board", "anyskin", "--rate", "40"]
+    simulator += ["--pty", str(port)]
     daemon = [command("tactiled"), "--port", str(port), "--board", "anyskin", "--no-log"]
     with running([*simulator, "--press", str(press)], folder / "simdevice") as board:
         wait_for(port, board, folder / "simdevice")
@@ -89,7 +92,7 @@ def served(folder: Path, *words: str) -> Iterator[tuple[str, Person]]:
                 person = Person(latest(session, FEATURES.key("board0")), began)
                 person.force()
                 person.wait_untouched()
-                call(session, service_key("board0", "tare"), timeout=SLOW_S)
+                call(session, service_key("board0", "tare"), timeout=PATIENCE_S)
                 yield endpoint, person
             finally:
                 close_session(session)
@@ -107,7 +110,7 @@ def prompt(process: subprocess.Popen[str]) -> str:
     return " ".join(text.split())
 
 
-def test_frames_whose_stamps_stand_still_do_not_spoil_a_recording(tmp_path: Path) -> None:
+def test_repeated_stamps_do_not_spoil_a_recording(tmp_path: Path) -> None:
     """As while the estimate of a board's clock is set back, which a busy machine brings about."""
     path, begin = tmp_path / "rec.mcap", 1_700_000_000 * 10**9
     recorder = Recorder(path, RecorderSettings(min_free_bytes=0))
@@ -131,7 +134,7 @@ def test_frames_whose_stamps_stand_still_do_not_spoil_a_recording(tmp_path: Path
 
 
 @pytest.mark.timeout(300)
-def test_an_owner_records_fits_and_then_reads_the_force_that_is_there(tmp_path: Path) -> None:
+def test_user_records_fits_and_reads_the_true_force(tmp_path: Path) -> None:
     with served(tmp_path) as (endpoint, person):
         words = ["record", "--out", str(tmp_path / "rec.mcap"), "--connect", endpoint]
         process = subprocess.Popen(
@@ -155,12 +158,12 @@ def test_an_owner_records_fits_and_then_reads_the_force_that_is_there(tmp_path: 
                 person.wait_untouched()
             process.stdin.write(answer + "\n")
             process.stdin.flush()
-        assert process.wait(SLOW_S) == 0
+        assert process.wait(PATIENCE_S) == 0
     fitted = subprocess.run(
         [*CALIBRATE, "fit", str(tmp_path / "rec.mcap"), "--out", str(tmp_path / "skin.cal.toml")],
         capture_output=True,
         text=True,
-        timeout=2 * SLOW_S,
+        timeout=2 * PATIENCE_S,
         check=False,
     )
     assert fitted.returncode == 0, fitted.stderr

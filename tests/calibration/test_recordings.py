@@ -24,7 +24,7 @@ def last_fifth(recording, recipe, penalty, label_clock=True):
     return (predict(model, recording, label_clock) - recording.labels)[tested]
 
 
-def test_readings_minus_one_are_no_labels_and_weights_become_newtons(real):
+def test_readings_of_minus_one_are_not_labels_and_weights_become_newtons(real):
     recording = real("normal_force_20250401_014340")
     assert len(recording.labels) == 1860  # of 3600 rows; the others hold -1
     assert recording.labels.min() == 0
@@ -51,25 +51,25 @@ def test_the_load_cell_was_read_every_0_2048_s_and_measured_every_0_1998(real, n
         ("shear_force_20250416_200533", CREEP, 3.0, 0.13),
     ],
 )
-def test_force_on_the_last_fifth(real, name, recipe, penalty, bound):
+def test_force_error_on_the_last_fifth(real, name, recipe, penalty, bound):
     error = last_fifth(real(name), recipe, penalty)
     assert np.sqrt((error**2).mean()) < bound
 
 
-def test_the_clock_of_the_labels_accounts_for_a_good_part_of_the_error(real):
+def test_label_clock_explains_much_of_the_error(real):
     recording = real("normal_force_20250401_015037")
     with_clock = last_fifth(recording, CREEP, 10.0)
     without = last_fifth(recording, CREEP, 10.0, label_clock=False)
     assert (with_clock**2).mean() < 0.7 * (without**2).mean()
 
 
-def test_place_on_the_last_fifth(real):
+def test_position_error_on_the_last_fifth(real):
     error = last_fifth(real("spatial_resolution_20250316_155729"), PLACE_RECIPES[-1], 1e-3)
     assert np.sqrt((error**2).mean(axis=0)).max() < 0.49
     assert np.linalg.norm(error, axis=1).mean() < 0.53
 
 
-def test_a_recording_that_was_not_seen(real):
+def test_force_error_on_an_unseen_recording(real):
     one, other = (real(f"normal_force_20250401_{n}") for n in ("014340", "015037"))
     errors = []
     for seen, unseen in ((one, other), (other, one)):

@@ -135,7 +135,7 @@ def some_presses(seed, count):
     ]
 
 
-def test_what_the_wizard_records_calibrates_the_simulated_board(tmp_path):
+def test_wizard_recording_calibrates_the_simulated_board(tmp_path):
     recording = record(tmp_path, "rec.mcap", some_presses(0, 16))
     assert recording.targets == ("normal",)
     assert recording.serial_number == "bench"
@@ -151,7 +151,7 @@ def test_what_the_wizard_records_calibrates_the_simulated_board(tmp_path):
     assert np.sqrt((error**2).mean()) < 0.4 * np.std(predict(uncalibrated, other) - other.labels)
 
 
-def test_a_recording_with_equal_stamps_is_read_all_the_same(tmp_path):
+def test_recording_with_equal_stamps_is_read(tmp_path):
     recorder = Recorder(tmp_path / "rec.mcap")
     bench = Bench(recorder, some_presses(0, 15))
     sample = bench._sample
@@ -217,7 +217,7 @@ class Dialogue:
         return presses
 
 
-def test_questions_go_on_until_they_are_answered_well():
+def test_questions_repeat_until_answered_correctly():
     talk = Dialogue("", "heavy", "-3", "1e9", "nan", "200g", "", "", "", "", "n")
     assert talk.run(Steady()) == 1
     assert talk.labels == [0.0, pytest.approx(1.96133), 0.0]
@@ -227,7 +227,7 @@ def test_questions_go_on_until_they_are_answered_well():
         Wizard(Silent(), lambda s, f: None, lambda q: "", said.append, Timing()).run()
 
 
-def test_fifteen_presses_are_asked_for_and_counted():
+def test_fifteen_presses_are_requested_and_counted():
     press = ["2", "", ""]
     talk = Dialogue("", *(press * PRESSES), "", "n")
     assert talk.run(Steady()) == PRESSES == 15
@@ -237,13 +237,13 @@ def test_fifteen_presses_are_asked_for_and_counted():
     assert "(16)" in asked[-1]
 
 
-def test_ending_early_takes_a_second_answer():
+def test_ending_early_needs_confirmation():
     talk = Dialogue("", "2", "", "", "", "3", "", "", "", "", "n")
     assert talk.run(Steady()) == 2
     assert sum("Enter again to end" in line for line in talk.shown) == 2
 
 
-def test_the_last_press_can_be_undone_and_leaves_no_label():
+def test_last_press_can_be_undone():
     talk = Dialogue("", "u", "2", "", "", "5", "", "", "u", "undo", "3", "", "", "", "", "n")
     assert talk.run(Steady()) == 2
     assert talk.labels == [0.0, 2.0, 0.0, 3.0, 0.0]
@@ -251,14 +251,14 @@ def test_the_last_press_can_be_undone_and_leaves_no_label():
     assert sum("nothing to undo" in line for line in talk.shown) == 2
 
 
-def test_a_tare_that_is_refused_is_tried_again_or_forced():
+def test_refused_tare_is_retried_or_forced():
     source = Steady(refusals=2)
     assert Dialogue("", "", "f", "2", "", "", "", "", "n").run(source) == 1
     assert source.forced == [False, False, True]
 
 
 @pytest.mark.parametrize("width", [40, 80])
-def test_no_line_is_wider_than_the_terminal_and_no_word_is_cut(width):
+def test_lines_fit_the_terminal_without_cutting_words(width):
     talk = Dialogue("", "f", "x" * 15, "2", "", "", "", "", "y", "")
     talk.run(Steady(refusals=1), width)
     whole = Dialogue("", "f", "x" * 15, "2", "", "", "", "", "y", "")
@@ -272,11 +272,11 @@ def test_no_line_is_wider_than_the_terminal_and_no_word_is_cut(width):
     ("text", "newton"),
     [("3.2", 3.2), ("3,2 N", 3.2), ("1kg", 9.80665), ("500 g", 4.903325), ("0", None), ("x", None)],
 )
-def test_forces_are_read_as_people_write_them(text, newton):
+def test_forces_are_parsed_as_people_write_them(text, newton):
     assert parse_force(text) == (None if newton is None else pytest.approx(newton))
 
 
-def test_recording_is_refused_where_nothing_can_come_of_it(capsys, tmp_path):
+def test_pointless_recording_is_refused(capsys, tmp_path):
     there = tmp_path / "there.mcap"
     there.write_bytes(b"")
     for out, words in ((there, "is there already"), (tmp_path / "x.log", "ends in .mcap")):

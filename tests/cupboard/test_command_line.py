@@ -42,7 +42,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("arguments", "said"), BAD, ids=lambda v: " ".join(v)[:40])
-def test_bad_input_is_refused_with_what_is_allowed(
+def test_bad_input_is_refused_with_allowed_values(
     arguments: list[str],
     said: str,
     scene_file: Path,
@@ -65,7 +65,7 @@ def test_bad_input_is_refused_with_what_is_allowed(
     assert not Path("board0").is_symlink()
 
 
-def test_what_the_system_refuses_is_told_apart(
+def test_system_errors_are_distinguished_from_bad_input(
     scene_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with socket.socket() as taken:
@@ -84,9 +84,7 @@ def test_what_the_system_refuses_is_told_apart(
 
 
 @pytest.mark.parametrize("name", ["authors_sim", "hardware"])
-def test_the_goal_of_a_scene_is_one_that_reachd_takes(
-    name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_scene_goal_is_accepted_by_reachd(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["cupboard", "--scene", name, "--seed", "7", "--print-goal"]) == 0
     text = capsys.readouterr().out.strip()
     goal = make_goal(*parse_target(text), SETS[name])
@@ -114,7 +112,7 @@ def test_recorded_scenes_are_found_by_their_number(
 
 
 @pytest.mark.parametrize("place", ["folder", "home"])
-def test_recorded_scenes_that_are_not_there_are_asked_for(
+def test_missing_recorded_scenes_are_asked_for(
     place: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from sim_device.board.catalogue import factory_calibration
+from support.waiting import wait_until
 from tactile_core.bus.messages import MSG, codec
 from tactile_core.bus.services import ServiceError
 from tactile_core.bus.streams import Tap, latest
@@ -61,7 +62,7 @@ def rest_after(cupboard: Any) -> float:
     return float(max(moving) - last) / NS_PER_S
 
 
-def test_it_says_how_to_connect_and_announces_itself(cupboard: Any, wait_until: Wait) -> None:
+def test_cupboard_says_how_to_connect_and_announces_itself(cupboard: Any) -> None:
     arm, board = cupboard.said
     assert "reachd --strategy hybrid_event --set authors_sim --target 0.3580,0.1000" in arm
     assert board.startswith("board0: finger ")
@@ -81,9 +82,7 @@ def test_it_says_how_to_connect_and_announces_itself(cupboard: Any, wait_until: 
     assert ("finger", 0) in by_name
 
 
-def test_states_are_stamped_at_100_hz_whatever_else_goes_on(
-    cupboard: Any, wait_until: Wait
-) -> None:
+def test_states_are_stamped_at_100_hz_under_any_load(cupboard: Any) -> None:
     first = len(cupboard.states)
     wait_until(lambda: len(cupboard.states) >= first + 150)
     states = cupboard.states[first:]
@@ -97,7 +96,7 @@ def test_states_are_stamped_at_100_hz_whatever_else_goes_on(
     assert states[-1].f_max == 10.0
 
 
-def test_a_command_moves_the_arm_and_its_end_stops_it(cupboard: Any, wait_until: Wait) -> None:
+def test_command_moves_the_arm_and_its_end_stops_it(cupboard: Any) -> None:
     begin = cupboard.states[-1].x
     commander = cupboard.commander(AHEAD)
     wait_until(lambda: cupboard.states[-1].x > begin + 0.01)
@@ -122,9 +121,7 @@ def other(cupboard: Any) -> Iterator[subprocess.Popen[str]]:
     process.communicate()
 
 
-def test_kill_9_of_the_commander_stops_the_arm(
-    cupboard: Any, other: subprocess.Popen[str], wait_until: Wait
-) -> None:
+def test_kill_9_of_the_commander_stops_the_arm(cupboard: Any, other: subprocess.Popen[str]) -> None:
     begin = cupboard.states[-1].x
     wait_until(lambda: cupboard.states[-1].x > begin + 0.005)
     os.kill(other.pid, signal.SIGSTOP)  # neither closes its socket nor speaks
@@ -136,9 +133,7 @@ def test_kill_9_of_the_commander_stops_the_arm(
     assert rest_after(cupboard) <= 0.1
 
 
-def test_a_second_commander_is_refused_until_the_first_is_gone(
-    cupboard: Any, wait_until: Wait
-) -> None:
+def test_second_commander_is_refused_until_the_first_is_gone(cupboard: Any) -> None:
     begin = cupboard.states[-1].x
     first = cupboard.commander(AHEAD)
     wait_until(lambda: cupboard.states[-1].mode == "moving")
@@ -161,7 +156,7 @@ def test_a_second_commander_is_refused_until_the_first_is_gone(
     second.stop()
 
 
-def test_strangers_move_nothing_and_lock_nobody_out(cupboard: Any, wait_until: Wait) -> None:
+def test_strangers_move_nothing_and_block_nobody(cupboard: Any) -> None:
     """Row 45: whoever reads all that the commander sends, and sends a hundred times as much."""
     heard: list[bytes] = []
     tap = Tap(cupboard.session, COMMAND.key("arm"), lambda s: heard.append(s.data))
@@ -204,9 +199,7 @@ def test_strangers_move_nothing_and_lock_nobody_out(cupboard: Any, wait_until: W
 FACTORY = {"v_max": 0.5, "omega_max": 1.0, "f_max": 100.0, "m_max": 20.0}
 
 
-def test_damaged_oversized_and_nameless_commands_move_nothing(
-    cupboard: Any, wait_until: Wait
-) -> None:
+def test_damaged_oversized_and_anonymous_commands_move_nothing(cupboard: Any) -> None:
     before = cupboard.call("status")["counters"]
     signer, publisher = cupboard.claim(), cupboard.publisher()
     nameless = cupboard.session.declare_publisher("arm/arm/cmd_vel")
@@ -233,9 +226,7 @@ def test_damaged_oversized_and_nameless_commands_move_nothing(
 
 
 @pytest.mark.parametrize("delay", [0.25])
-def test_commands_expire_by_their_decision_however_they_are_delayed(
-    delay: float, cupboard: Any, wait_until: Wait
-) -> None:
+def test_commands_expire_by_decision_time_despite_delays(delay: float, cupboard: Any) -> None:
     """Row 37: a queue on the way holds what was decided before the stop."""
     begin = cupboard.states[-1].x
     commander = cupboard.commander(AHEAD)
@@ -250,7 +241,7 @@ def test_commands_expire_by_their_decision_however_they_are_delayed(
     assert cupboard.call("status")["counters"]["late"] > 10
 
 
-def test_limits_are_confirmed_and_kept(cupboard: Any, wait_until: Wait) -> None:
+def test_limits_are_confirmed_and_kept(cupboard: Any) -> None:
     asked = {"v_max": 0.02, "omega_max": 0.1, "f_max": 5.0, "m_max": 0.5}
     assert cupboard.call("limits", asked) == asked
     assert cupboard.call("clear") == {"mode": "ready"}
@@ -265,9 +256,7 @@ def test_limits_are_confirmed_and_kept(cupboard: Any, wait_until: Wait) -> None:
             cupboard.call("limits", bad)
 
 
-def test_what_the_finger_runs_into_shows_in_the_bytes_of_its_board(
-    cupboard: Any, wait_until: Wait
-) -> None:
+def test_contact_of_the_finger_shows_in_the_bytes_of_its_board(cupboard: Any) -> None:
     port = SerialTransport(str(cupboard.folder / "board0"), 115_200)
     port.open()
     line = SerialLine("board0", lambda *_: None, "tactile", 100.0)
@@ -305,7 +294,7 @@ def test_what_the_finger_runs_into_shows_in_the_bytes_of_its_board(
     assert free < 1.0
 
 
-def test_a_reset_brings_arm_and_objects_back(cupboard: Any, wait_until: Wait) -> None:
+def test_reset_restores_arm_and_objects(cupboard: Any) -> None:
     commander = cupboard.commander(AHEAD)
     wait_until(lambda: cupboard.states[-1].x > -0.17)
 
@@ -327,8 +316,8 @@ def test_a_reset_brings_arm_and_objects_back(cupboard: Any, wait_until: Wait) ->
         cupboard.call("reset", {"seed": 8}, kind="world")
 
 
-def test_an_emergency_stop_cannot_be_cleared_while_pressed_and_ctrl_c_ends_in_order(
-    start: Any, wait_until: Wait
+def test_emergency_stop_cannot_be_cleared_while_pressed_and_ctrl_c_exits_cleanly(
+    start: Any,
 ) -> None:
     cupboard = start("--arm-fault", "estop@0s+600s,refuses_limits", "--arm-rate", "200")
     factory = cupboard.call("limits", {"v_max": 0.05, "omega_max": 0.3, "f_max": 5.0, "m_max": 1.0})

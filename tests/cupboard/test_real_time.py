@@ -45,14 +45,14 @@ def moving(state: ArmState) -> bool:
     return abs(state.twist.vx) > 1e-4
 
 
-def test_states_come_on_a_grid_of_their_own_rate(scene: Scene) -> None:
+def test_states_come_on_a_grid_of_their_rate(scene: Scene) -> None:
     states = run(made(scene), 0, 0.5)
     gaps = {b.captured - a.captured for a, b in itertools.pairwise(states)}
     assert gaps == {10_000_000}
     assert len(states) == 49
 
 
-def test_the_arm_rests_within_100_ms_of_the_last_command_however_late_it_is_served(
+def test_arm_rests_within_100_ms_of_the_last_command_even_if_served_late(
     scene: Scene,
 ) -> None:
     for stall in (0.001, 0.02, 0.06, 0.2, 3.0):
@@ -70,7 +70,7 @@ def test_the_arm_rests_within_100_ms_of_the_last_command_however_late_it_is_serv
         assert cupboard.world.finger().x == pytest.approx(stood, abs=1e-6)
 
 
-def test_missed_steps_are_made_up_for_in_order_and_counted(scene: Scene) -> None:
+def test_missed_steps_are_caught_up_in_order_and_counted(scene: Scene) -> None:
     steady, late = made(scene), made(scene)
     whole = run(steady, 0, 0.4)
     first = run(late, 0, 0.1)
@@ -81,7 +81,7 @@ def test_missed_steps_are_made_up_for_in_order_and_counted(scene: Scene) -> None
     assert late.counters["suspended_ms"] == 0
 
 
-def test_a_long_stop_suspends_the_world_and_stamps_stay_those_of_the_clock(scene: Scene) -> None:
+def test_long_stop_suspends_the_world_and_stamps_follow_the_clock(scene: Scene) -> None:
     cupboard = made(scene)
     before = run(cupboard, 0, 0.2, AHEAD)
     states = cupboard.advance(after(T0, 60.0))
@@ -97,7 +97,7 @@ def test_a_long_stop_suspends_the_world_and_stamps_stay_those_of_the_clock(scene
     assert len(after_it) == pytest.approx(30, abs=1)
 
 
-def test_a_command_that_waited_longer_than_it_holds_is_not_obeyed(scene: Scene) -> None:
+def test_command_expired_while_waiting_is_not_obeyed(scene: Scene) -> None:
     cupboard = made(scene)
     run(cupboard, 0, 0.1)
     now = after(T0, 0.1)
@@ -108,7 +108,7 @@ def test_a_command_that_waited_longer_than_it_holds_is_not_obeyed(scene: Scene) 
     assert cupboard.command(AHEAD, after(T0, 0.3), waited=0.0)
 
 
-def test_faults_come_and_go_by_the_clock(scene: Scene) -> None:
+def test_faults_start_and_end_by_the_clock(scene: Scene) -> None:
     cupboard = made(scene, "silent@0.2s+0.2s,estop@0.6s,biased@1s")
     first = run(cupboard, 0, 0.5, AHEAD)
     stamps = [seconds_between(T0, s.captured) for s in first]
@@ -126,7 +126,7 @@ def test_faults_come_and_go_by_the_clock(scene: Scene) -> None:
     assert any(moving(s) for s in run(cupboard, 1.1, 1.3, AHEAD))
 
 
-def test_a_reset_puts_everything_back_but_limits_and_stops(scene: Scene) -> None:
+def test_reset_restores_everything_but_limits_and_stops(scene: Scene) -> None:
     cupboard = made(scene, "fault@1.5s")
     run(cupboard, 0, 1.2, AHEAD)
     assert cupboard.contacts()
@@ -146,7 +146,7 @@ def test_a_reset_puts_everything_back_but_limits_and_stops(scene: Scene) -> None
     assert cupboard.clear() == "ready"
 
 
-def test_an_arm_that_refuses_limits_confirms_its_own_after_a_reset_too(scene: Scene) -> None:
+def test_arm_refusing_limits_confirms_its_own_after_reset(scene: Scene) -> None:
     cupboard = made(scene, "refuses_limits")
     assert cupboard.request_limits(ARM_LIMITS["hardware"]) == FACTORY_LIMITS
     cupboard.reset(MujocoWorld(scene))

@@ -34,7 +34,9 @@ def run(departures: list[float], delays: list[float]) -> tuple[ArrivalClock, lis
     seed=st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=20, deadline=None)
-def test_measured_instant_is_within_uncertainty(period: float, jitter: float, seed: int) -> None:
+def test_captured_instant_is_within_its_uncertainty(
+    period: float, jitter: float, seed: int
+) -> None:
     rng = np.random.default_rng(seed)
     sent = [k * period for k in range(600)]
     _, out = run(sent, list(rng.exponential(jitter * period, 600)))
@@ -59,7 +61,7 @@ def test_jitter_is_rejected() -> None:
     assert [a.sequence for a in out] == list(range(2000))
 
 
-def test_a_host_stall_that_ends_in_a_burst_loses_nothing() -> None:
+def test_host_stall_ending_in_a_burst_loses_nothing() -> None:
     sent = [k * 0.01 for k in range(400)]
     delays = [0.0] * 400
     for k in range(300, 306):
@@ -71,7 +73,7 @@ def test_a_host_stall_that_ends_in_a_burst_loses_nothing() -> None:
     assert abs(stalled.captured - at(sent[301] - 0.005)) / NS_PER_S <= stalled.uncertainty
 
 
-def test_lost_frames_leave_a_gap_in_the_numbers() -> None:
+def test_lost_frames_leave_a_gap_in_the_sequence() -> None:
     sent = [k * 0.01 for k in range(400) if not 300 <= k < 305]
     clock, out = run(sent, [0.0] * len(sent))
     assert clock.counters["lost"] == 5
@@ -81,7 +83,7 @@ def test_lost_frames_leave_a_gap_in_the_numbers() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_a_changed_rate_is_followed(factor: float) -> None:
+def test_changed_rate_is_followed(factor: float) -> None:
     sent = [k * 0.01 for k in range(400)]
     sent += [sent[-1] + (k + 1) * 0.01 * factor for k in range(600)]
     clock, out = run(sent, [0.0] * len(sent))
@@ -143,7 +145,7 @@ def test_frames_read_late_and_together_keep_their_instants(
 
 
 @pytest.mark.parametrize("rate", [0.5, 1.0, 5.0])
-def test_a_slow_board_is_known_within_a_few_frames(rate: float) -> None:
+def test_slow_board_is_recognised_within_a_few_frames(rate: float) -> None:
     clock = ArrivalClock()
     out = [clock.arrived(at(k / rate)) for k in range(12)]
     assert clock.period == pytest.approx(1 / rate, rel=1e-3)

@@ -8,6 +8,8 @@ from typing import Any
 
 import pytest
 
+from support.tactiled_lab import Ear
+from support.waiting import wait_until
 from tactile_tools.cli import main
 
 pytestmark = pytest.mark.timeout(300)
@@ -22,7 +24,39 @@ hold_s = 100000.0
 """
 
 
-def test_one_of_several_boards_is_named(running: Any, capsys: Any) -> None:
+@pytest.mark.parametrize("words", [["tare"], ["status", "--json"]])
+def test_missing_daemon_is_reported_in_one_sentence(
+    words: list[str], lab: Any, capsys: Any
+) -> None:
+    assert main([*words, "--connect", lab.endpoint]) == 3
+    said = capsys.readouterr()
+    assert not said.out
+    assert len(said.err.splitlines()) == 1
+    assert lab.endpoint in said.err
+    assert "--connect" in said.err
+
+
+def test_tare_under_a_press_is_refused_and_can_be_forced(
+    lab: Any, tmp_path: Path, capsys: Any
+) -> None:
+    (tmp_path / "press.toml").write_text(PRESS)
+    lab.boards("--board", "anyskin", "--pty", "skin0", "--press", "press.toml", link="skin0")
+    daemon = lab.tactiled("--port", "skin0", "--no-log")
+    ear = Ear(lab.listen())
+    wait_until(lambda: any(m.normal_force > 2.0 for _, m in list(ear.heard)))
+    words = ["--connect", lab.endpoint]
+    assert main(["tare", *words]) == 3
+    error = capsys.readouterr().err
+    assert error.startswith("tactile tare: board0: tare refused: ")
+    assert "--force" in error
+    assert len(error.splitlines()) == 1
+    assert main(["tare", "board0", "--force", *words]) == 0
+    assert "tared over" in capsys.readouterr().out
+    wait_until(lambda: abs(ear.heard[-1][1].normal_force) < 0.5)
+    assert "tare refused" in daemon.said
+
+
+def test_command_needs_a_board_name_when_there_are_several(running: Any, capsys: Any) -> None:
     lab, _, _ = running
     words = ["--connect", lab.endpoint]
     assert main(["tare", *words]) == 2
@@ -56,33 +90,3 @@ def test_status_for_programs_is_json_by_board(running: Any, capsys: Any) -> None
     assert sorted(told) == ["board0", "skin0"]
     assert told["board0"]["state"] == "streaming"
     assert told["board0"]["clock_trouble"] == ""
-
-
-@pytest.mark.parametrize("words", [["tare"], ["status", "--json"]])
-def test_without_a_daemon_one_sentence_says_so(words: list[str], lab: Any, capsys: Any) -> None:
-    assert main([*words, "--connect", lab.endpoint]) == 3
-    said = capsys.readouterr()
-    assert not said.out
-    assert len(said.err.splitlines()) == 1
-    assert lab.endpoint in said.err
-    assert "--connect" in said.err
-
-
-def test_a_tare_under_a_press_is_refused_with_its_remedy_and_can_be_forced(
-    lab: Any, tmp_path: Path, hear: Any, until: Any, capsys: Any
-) -> None:
-    (tmp_path / "press.toml").write_text(PRESS)
-    lab.boards("--board", "anyskin", "--pty", "skin0", "--press", "press.toml", link="skin0")
-    daemon = lab.tactiled("--port", "skin0", "--no-log")
-    ear = hear(lab.listen())
-    until(lambda: any(m.normal_force > 2.0 for _, m in list(ear.heard)))
-    words = ["--connect", lab.endpoint]
-    assert main(["tare", *words]) == 3
-    error = capsys.readouterr().err
-    assert error.startswith("tactile tare: board0: tare refused: ")
-    assert "--force" in error
-    assert len(error.splitlines()) == 1
-    assert main(["tare", "board0", "--force", *words]) == 0
-    assert "tared over" in capsys.readouterr().out
-    until(lambda: abs(ear.heard[-1][1].normal_force) < 0.5)
-    assert "tare refused" in daemon.said

@@ -32,7 +32,7 @@ def watch(
     return chips, lines
 
 
-def test_a_dead_chip_is_told_once_and_shown_as_long_as_it_lasts() -> None:
+def test_dead_chip_is_reported_once_and_shown_while_it_lasts() -> None:
     chips, lines = watch(lambda k: {2: Fault.ZEROS} if k >= 100 else {}, 60)
     (line,) = lines
     assert line[:2] == (3, logging.WARNING)
@@ -45,20 +45,20 @@ def test_a_dead_chip_is_told_once_and_shown_as_long_as_it_lasts() -> None:
     assert [(one.array, one.chip) for one in chips.masked] == [("skin", 2)]
 
 
-def test_single_failed_reads_are_told_every_ten_seconds_with_how_many() -> None:
+def test_sporadic_read_failures_are_summed_up_every_ten_seconds() -> None:
     chips, lines = watch(lambda k: {4: Fault.ZEROS} if k % 20 == 0 else {}, 35)
     assert [second for second, _, _ in lines] == [1, 11, 21, 31]
     assert all("in 2 of 40 cycles" in text for _, _, text in lines)
     assert chips.masked[0].share == 0.05
 
 
-def test_chips_of_one_array_with_one_fault_are_told_together() -> None:
+def test_chips_of_an_array_with_the_same_fault_are_reported_together() -> None:
     _, lines = watch(lambda k: dict.fromkeys(range(5), Fault.ZEROS), 3)
     assert len(lines) == 1
     assert "chips 0, 1, 2, 3, 4 of skin" in lines[0][2]
 
 
-def test_a_chip_that_is_well_again_is_told_with_how_long_it_was_not() -> None:
+def test_recovered_chip_is_reported_with_its_downtime() -> None:
     chips, lines = watch(lambda k: {1: Fault.FROZEN} if k < 200 else {}, 12)
     assert [(second, level) for second, level, _ in lines] == [
         (1, logging.WARNING),
@@ -68,7 +68,7 @@ def test_a_chip_that_is_well_again_is_told_with_how_long_it_was_not() -> None:
     assert chips.masked == []
 
 
-def test_a_missing_array_is_left_to_others() -> None:
+def test_missing_array_is_not_reported_as_chips() -> None:
     _, lines = watch(lambda k: dict.fromkeys(range(5), Fault.MISSING), 3)
     assert lines == []
 

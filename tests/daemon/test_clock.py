@@ -68,13 +68,15 @@ def worst(clock: ClockMap, board: Oscillator, rng: np.random.Generator, seconds:
     seed=st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=20, deadline=None)
-def test_error_stays_within_uncertainty(error: float, drift: float, phase: int, seed: int) -> None:
+def test_clock_error_stays_within_uncertainty(
+    error: float, drift: float, phase: int, seed: int
+) -> None:
     clock = ClockMap(TICK_HZ)
     board = Oscillator(error, drift, phase)
     assert worst(clock, board, np.random.default_rng(seed), 20.0) <= 1.0
 
 
-def test_bound_holds_for_a_link_that_is_slow_one_way_only() -> None:
+def test_uncertainty_holds_for_an_asymmetric_link() -> None:
     clock, board = ClockMap(TICK_HZ), Oscillator(0.03)
     for token in range(40):
         poll(clock, board, token, token * 0.25, 0.1e-3, 4e-3)
@@ -83,14 +85,14 @@ def test_bound_holds_for_a_link_that_is_slow_one_way_only() -> None:
     assert 1.9e-3 < error <= stamp.uncertainty < 10e-3
 
 
-def test_rate_error_is_found() -> None:
+def test_clock_rate_error_is_estimated() -> None:
     clock, board = ClockMap(TICK_HZ), Oscillator(0.05)
     for token in range(40):
         poll(clock, board, token, token * 0.25, 0.2e-3, 0.2e-3)
     assert clock.rate_error == pytest.approx(0.05, abs=1e-4)
 
 
-def test_slow_polls_do_not_spoil_the_map() -> None:
+def test_slow_polls_do_not_degrade_the_clock_map() -> None:
     clock, board, rng = ClockMap(TICK_HZ), Oscillator(-0.02), np.random.default_rng(4)
     for token in range(80):
         delay = 0.1e-3 if token % 4 == 0 else rng.uniform(0.01, 0.1)
@@ -109,7 +111,7 @@ def test_uncertainty_grows_while_polls_go_unanswered() -> None:
     assert late > 10 * early
 
 
-def test_recovers_from_a_clock_that_jumps() -> None:
+def test_clock_map_recovers_from_a_jump() -> None:
     clock, board = ClockMap(TICK_HZ), Oscillator()
     for token in range(20):
         poll(clock, board, token, token * 0.25, 0.2e-3, 0.2e-3)
@@ -147,7 +149,7 @@ def test_useless_replies_are_counted(reply: ClockReply, delay: float, reason: st
     assert clock.counters == {reason: 1}
 
 
-def test_arrivals_stand_in_until_a_poll_is_answered() -> None:
+def test_arrival_times_are_used_until_a_poll_is_answered() -> None:
     clock, board, rng = ClockMap(TICK_HZ), Oscillator(0.04), np.random.default_rng(1)
     errors = []
     for step in range(500):
@@ -161,7 +163,7 @@ def test_arrivals_stand_in_until_a_poll_is_answered() -> None:
     assert clock.rate_error == pytest.approx(0.04, abs=2e-3)
 
 
-def test_unbounded_polls_are_forgotten_oldest_first() -> None:
+def test_unanswered_polls_are_dropped_oldest_first() -> None:
     clock, board = ClockMap(TICK_HZ), Oscillator()
     for token in range(1000):
         clock.polled(token, at(token * 0.001))

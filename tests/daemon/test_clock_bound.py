@@ -166,7 +166,7 @@ delays = st.builds(
     seed=st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=25, deadline=None)
-def test_a_clock_may_be_as_wrong_as_it_likes(
+def test_any_clock_rate_error_is_tolerated(
     error: float, drift: float, line: Line, tick_hz: int, period: float, seed: int
 ) -> None:
     board = Simulation(np.random.default_rng(seed), line, tick_hz, error, drift, period=period)
@@ -188,7 +188,7 @@ def test_a_clock_may_be_as_wrong_as_it_likes(
     seed=st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=25, deadline=None)
-def test_a_clock_may_jump(
+def test_clock_jump_is_tolerated(
     error: float, line: Line, when: float, size: float, again: float, seed: int
 ) -> None:
     jumps = ((when, size), (when + 1.1, again))
@@ -206,7 +206,7 @@ def test_a_clock_may_jump(
     seed=st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=25, deadline=None)
-def test_a_board_may_begin_anew_with_another_clock(
+def test_restarted_board_may_have_another_clock(
     error: float, line: Line, reset_at: float, tick_hz: int, told: bool, seed: int
 ) -> None:
     board = Simulation(
@@ -224,7 +224,7 @@ def test_a_board_may_begin_anew_with_another_clock(
 
 
 @pytest.mark.parametrize("error", [-0.2, 0.5])
-def test_a_clock_beyond_its_limit_is_named_and_its_samples_are_marked(error: float) -> None:
+def test_clock_beyond_its_limit_is_reported_and_its_samples_marked(error: float) -> None:
     board = Simulation(np.random.default_rng(1), Line(), error=error)
     board.run(3.0)
     told = [e.trouble for e in board.events if isinstance(e, ClockJudged)]
@@ -233,7 +233,7 @@ def test_a_clock_beyond_its_limit_is_named_and_its_samples_are_marked(error: flo
     assert not any(block.clock_usable for truth, block in board.blocks if truth > 1.0)
 
 
-def test_a_usable_clock_marks_nothing_once_it_is_settled() -> None:
+def test_usable_clock_marks_no_samples_once_settled() -> None:
     board = Simulation(np.random.default_rng(1), Line(jitter=1e-3), error=0.09)
     board.run(5.0)
     assert not [e for e in board.events if isinstance(e, ClockJudged)]
@@ -242,7 +242,7 @@ def test_a_usable_clock_marks_nothing_once_it_is_settled() -> None:
     assert usual < 3e-3
 
 
-def test_a_clock_that_keeps_jumping_is_unusable_and_one_that_ceased_is_usable_again() -> None:
+def test_repeatedly_jumping_clock_is_unusable_until_it_stops() -> None:
     jumps = tuple((2.0 + k, 5.0) for k in range(5))
     board = Simulation(np.random.default_rng(1), Line(), jumps=jumps, period=0.05)
     board.run(45.0)
@@ -252,7 +252,7 @@ def test_a_clock_that_keeps_jumping_is_unusable_and_one_that_ceased_is_usable_ag
     assert board.worst() <= SLACK_S
 
 
-def test_ticks_too_coarse_to_be_of_use_are_marked() -> None:
+def test_too_coarse_ticks_are_marked() -> None:
     board = Simulation(np.random.default_rng(1), Line(), tick_hz=1)
     board.run(4.0)
     assert board.worst() <= SLACK_S
@@ -260,7 +260,7 @@ def test_ticks_too_coarse_to_be_of_use_are_marked() -> None:
     assert [e for e in board.events if isinstance(e, ClockJudged)]
 
 
-def test_frames_read_at_once_after_a_stall_keep_the_instants_they_were_sampled_at() -> None:
+def test_frames_read_after_a_stall_keep_their_sampling_instants() -> None:
     line = Line(stalls=((3.0, 3.4),))
     board = Simulation(np.random.default_rng(1), line)
     board.run(5.0)
@@ -272,7 +272,7 @@ def test_frames_read_at_once_after_a_stall_keep_the_instants_they_were_sampled_a
     assert all(a < b for a, b in itertools.pairwise(stamps))
 
 
-def test_steps_that_vary_are_usual_and_larger_ones_are_not() -> None:
+def test_varying_tick_steps_are_accepted_and_large_ones_are_not() -> None:
     rng, watch, now = np.random.default_rng(2), StepWatch(), 0
     for sequence in range(200):
         now += 10_000 + int(rng.integers(-100, 100))
@@ -282,7 +282,7 @@ def test_steps_that_vary_are_usual_and_larger_ones_are_not() -> None:
     assert watch.take(205, (now + 60_000 - 3_000) % WRAP) == 0  # four were lost
 
 
-def test_a_line_of_text_of_the_firmware_moves_no_sample() -> None:
+def test_firmware_text_does_not_shift_samples() -> None:
     clean = Simulation(np.random.default_rng(3), Line())
     link = clean.run(3.0)
     assert link.clock is not None

@@ -79,7 +79,7 @@ def pressed() -> tuple[Any, SerialLine, list[tuple[Instant, Cycle]]]:
     return run_serial(at, contacts=press, clock=ClockParameters(error=0.03))
 
 
-def test_a_press_is_felt_where_it_is(pressed: tuple[Any, SerialLine, Any]) -> None:
+def test_press_is_located_correctly(pressed: tuple[Any, SerialLine, Any]) -> None:
     _, _, cycles = pressed
     features = cycles[-1][1].features
     assert features.valid
@@ -89,7 +89,7 @@ def test_a_press_is_felt_where_it_is(pressed: tuple[Any, SerialLine, Any]) -> No
     assert max(f.normal_force for f in before[20:]) < 0.5
 
 
-def test_every_cycle_comes_once_and_is_stamped_within_its_uncertainty(
+def test_every_cycle_arrives_once_and_stamped_within_uncertainty(
     pressed: tuple[Any, SerialLine, Any],
 ) -> None:
     board, line, cycles = pressed
@@ -118,7 +118,7 @@ def test_the_same_bytes_give_the_same_features_to_the_bit(instant: At) -> None:
         assert a.features.peak_force == b.features.peak_force
 
 
-def test_a_spoiled_wire_loses_cycles_but_never_makes_one_up(instant: At) -> None:
+def test_corrupted_wire_loses_cycles_but_never_invents_one(instant: At) -> None:
     plan = FaultPlan(seed=3, flip=2e-5, loss=0.02, duplicate=0.02, reorder=0.02)
     board, line, cycles = run_serial(instant, 2.5, plan=plan)
     numbers = [cycle.sequence for _, cycle in cycles]
@@ -136,7 +136,7 @@ def test_a_spoiled_wire_loses_cycles_but_never_makes_one_up(instant: At) -> None
     assert max(c.features.normal_force for c in settled) < 1.0
 
 
-def test_a_reset_in_mid_stream_is_survived(instant: At) -> None:
+def test_stream_survives_a_board_reset(instant: At) -> None:
     _, _, cycles = run_serial(instant, 3.0, plan=FaultPlan(reset=(1.2,)))
     captured = [c.captured for _, c in cycles]
     assert captured == sorted(captured)
@@ -145,7 +145,7 @@ def test_a_reset_in_mid_stream_is_survived(instant: At) -> None:
     assert 0.15 < gap < 1.5
 
 
-def test_the_same_board_over_can(instant: At) -> None:
+def test_press_is_located_over_can(instant: At) -> None:
     board = CanBoard(build_skin("finger", SEED), identity("finger", SEED), node=9, contacts=press)
     line = CanLine("can", welcome)
     cycles = drive(board, line, BoardPipeline(factory_calibration("finger", SEED)), instant, 3.0)

@@ -5,6 +5,7 @@ Every frame has a right CRC, so all of it reaches link, pipeline and log. Time i
 
 from __future__ import annotations
 
+import os
 import random
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -56,7 +57,7 @@ from tactiled.transports import Medium
 from tactiled.transports.base import READ_LIMIT
 
 TICK_HZ = 1_000_000
-ITEMS = 100_000
+ITEMS = int(os.environ.get("HOSTILE_ITEMS", "20000"))
 
 
 def array(number: int, rows: int = 2, columns: int = 2) -> ArrayDescriptor:
@@ -228,7 +229,7 @@ def hostile(rng: random.Random, rig: Rig) -> Any:
 
 
 @pytest.mark.timeout(400)
-def test_after_a_hundred_thousand_hostile_items_pipeline_and_log_go_on(
+def test_pipeline_and_log_survive_many_hostile_items(
     tmp_path: Path, recorder: Recorder, caplog: pytest.LogCaptureFixture
 ) -> None:
     rng = random.Random(42)
@@ -269,7 +270,7 @@ def largest() -> Descriptor:
 
 
 @pytest.mark.parametrize("count", [12, 16])
-def test_the_largest_boards_work_with_every_other_taxel_pressed(
+def test_largest_boards_work_with_every_other_taxel_pressed(
     count: int, recorder: Recorder, tmp_path: Path
 ) -> None:
     rig = Rig(replace(BOARD, arrays=largest().arrays[:count]), recorder)
@@ -294,7 +295,7 @@ def test_the_largest_boards_work_with_every_other_taxel_pressed(
     assert info(tmp_path / "a.mcap").whole
 
 
-def test_more_patches_than_a_message_holds_are_cut_to_the_strongest_and_counted() -> None:
+def test_excess_patches_are_cut_to_the_strongest_and_counted() -> None:
     rig = Rig()
     maker = rig.station._maker
     cycle = rig.station.last
@@ -310,7 +311,7 @@ def test_more_patches_than_a_message_holds_are_cut_to_the_strongest_and_counted(
     assert rig.station.drops()["patches_cut"] == 1024 - MAX_PATCHES
 
 
-def test_a_picture_that_cannot_be_drawn_or_sent_stops_no_features(
+def test_failed_markers_do_not_stop_features(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     rig = Rig()
@@ -331,9 +332,7 @@ def test_a_picture_that_cannot_be_drawn_or_sent_stops_no_features(
 
 
 @pytest.mark.parametrize("kind", ["features", "forces", "field"])
-def test_a_message_that_cannot_be_made_costs_itself(
-    kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unencodable_message_costs_only_itself(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     rig = Rig()
     before = rig.ends.sent.copy()
     real: Callable[..., Any] = getattr(MessageMaker, kind)
@@ -353,7 +352,7 @@ def test_a_message_that_cannot_be_made_costs_itself(
     assert rig.station.drops()[f"unsent_{kind}"] == 5
 
 
-def test_an_event_that_nobody_foresaw_costs_itself_and_is_told(
+def test_unexpected_event_costs_only_itself_and_is_reported(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     rig = Rig()
@@ -375,7 +374,7 @@ def test_an_event_that_nobody_foresaw_costs_itself_and_is_told(
     assert "a mistake in the pipeline" in caplog.text
 
 
-def test_a_text_from_another_time_is_stamped_when_it_came_and_says_so(
+def test_text_with_impossible_stamp_is_stamped_on_arrival(
     recorder: Recorder, tmp_path: Path
 ) -> None:
     rig = Rig(recorder=recorder)
@@ -399,7 +398,7 @@ def test_a_text_from_another_time_is_stamped_when_it_came_and_says_so(
     assert recorder.stats.marked == 0
 
 
-def test_a_flood_of_serial_numbers_is_held_back_counted_and_shown() -> None:
+def test_flood_of_serial_numbers_is_throttled_and_counted() -> None:
     rig = Rig()
     said = len(rig.ends.texts)
     for k in range(3000):
@@ -414,7 +413,7 @@ def test_a_flood_of_serial_numbers_is_held_back_counted_and_shown() -> None:
     assert any("times more in" in text and "refused" in text for text in rig.ends.texts)
 
 
-def test_a_flood_of_firmware_texts_is_held_back_counted_and_shown() -> None:
+def test_flood_of_firmware_texts_is_throttled_and_counted() -> None:
     rig = Rig()
     before = rig.ends.sent["log"]
     rig.send(*(Log(40, rig.ticks(), f"flood {k}") for k in range(5000)))
@@ -424,7 +423,7 @@ def test_a_flood_of_firmware_texts_is_held_back_counted_and_shown() -> None:
     assert f"{5000 - FIRMWARE_BURST} texts held back, too many: firmware" in rig.ends.texts
 
 
-def test_a_board_that_changes_its_shape_again_and_again_is_refused_for_it() -> None:
+def test_board_that_keeps_changing_shape_is_refused() -> None:
     rig = Rig()
     before = rig.ends.sent["geometry"]
     for k in range(200):
@@ -433,7 +432,7 @@ def test_a_board_that_changes_its_shape_again_and_again_is_refused_for_it() -> N
     assert any("describes itself anew again and again" in text for text in rig.ends.texts)
 
 
-def test_a_throttle_lets_a_burst_pass_then_its_rate() -> None:
+def test_throttle_passes_a_burst_then_its_rate() -> None:
     throttle = Throttle(rate=2.0, burst=3)
     passed = [throttle.allow(Instant(k * NS_PER_S // 10)) for k in range(100)]
     assert passed[:3] == [True] * 3

@@ -9,7 +9,7 @@ from tactiled.blocks import Chunk
 from tactiled.reader import Inbox, PortLost, PortOpened, Wake
 
 
-def test_the_oldest_chunks_go_and_are_counted(instant: Callable[[float], Instant]) -> None:
+def test_oldest_chunks_are_dropped_and_counted(instant: Callable[[float], Instant]) -> None:
     inbox = Inbox(Wake(), limit=10)
     chunks = [Chunk(instant(k), bytes([k])) for k in range(25)]
     inbox.put(PortOpened())
@@ -24,7 +24,7 @@ def test_the_oldest_chunks_go_and_are_counted(instant: Callable[[float], Instant
     assert taken == [PortOpened(), *chunks[15:], PortLost("gone")]
 
 
-def test_chunks_that_waited_too_long_go_too(instant: Callable[[float], Instant]) -> None:
+def test_stale_chunks_are_dropped(instant: Callable[[float], Instant]) -> None:
     inbox = Inbox(Wake(), max_age=0.5)
     for k in range(100):
         inbox.put(Chunk(instant(k / 100), bytes([k])))
@@ -34,7 +34,7 @@ def test_chunks_that_waited_too_long_go_too(instant: Callable[[float], Instant])
     assert first.payload == bytes([49])
 
 
-def test_the_pipeline_is_roused_by_what_comes(instant: Callable[[float], Instant]) -> None:
+def test_incoming_items_wake_the_pipeline(instant: Callable[[float], Instant]) -> None:
     wake = Wake()
     inbox = Inbox(wake)
     inbox.put(Chunk(instant(0), b"x"))

@@ -65,7 +65,7 @@ def feed(line: SerialLine, at: At, seconds: float, data: Callable[[int], bytes])
     return events
 
 
-def test_our_board_is_found_by_its_answer(board: Any, instant: At) -> None:
+def test_own_protocol_board_is_found_by_its_answer(board: Any, instant: At) -> None:
     line = SerialLine("p", welcome)
     line.connect(instant(0.0))
     events = serve(line, board, instant, 1.0)
@@ -74,7 +74,7 @@ def test_our_board_is_found_by_its_answer(board: Any, instant: At) -> None:
     assert len(of(events, Sampled)) > 100
 
 
-def test_a_board_that_sends_floats_is_found_by_its_frames(instant: At) -> None:
+def test_float_board_is_found_by_its_frames(instant: At) -> None:
     line = SerialLine("p", welcome)
     line.connect(instant(0.0), usb_serial="USB7")
     events = feed(line, instant, 2.0, lambda k: floats(100.0 + k))
@@ -87,7 +87,7 @@ def test_a_board_that_sends_floats_is_found_by_its_frames(instant: At) -> None:
     assert len(blocks) > 180
 
 
-def test_what_piled_up_before_the_port_was_opened_is_not_taken_for_new(instant: At) -> None:
+def test_bytes_buffered_before_opening_are_not_taken_as_new(instant: At) -> None:
     line = SerialLine("p", welcome)
     line.connect(instant(0.0))
     old = b"".join(floats(-1.0) for _ in range(100))
@@ -97,7 +97,7 @@ def test_what_piled_up_before_the_port_was_opened_is_not_taken_for_new(instant: 
     assert len(blocks) > 150
 
 
-def test_a_kind_that_was_given_is_not_second_guessed(instant: At) -> None:
+def test_configured_kind_is_not_second_guessed(instant: At) -> None:
     line = SerialLine("p", welcome, kind="tactile")
     line.connect(instant(0.0))
     events = feed(line, instant, 4.0, lambda k: floats(100.0 + k))
@@ -116,7 +116,7 @@ def test_a_kind_that_was_given_is_not_second_guessed(instant: At) -> None:
         (lambda k: b"", "silent"),
     ],
 )
-def test_a_port_without_a_board_is_diagnosed_once(
+def test_port_without_a_board_is_diagnosed_once(
     instant: At, data: Callable[[int], bytes], said: str
 ) -> None:
     line = SerialLine("/dev/ttyX", welcome)
@@ -128,7 +128,7 @@ def test_a_port_without_a_board_is_diagnosed_once(
     assert not of(events, Sampled)
 
 
-def test_a_board_that_does_not_hear_us_is_diagnosed(board: Any, instant: At) -> None:
+def test_board_that_does_not_receive_is_diagnosed(board: Any, instant: At) -> None:
     board.deaf, board.streaming = True, True
     line = SerialLine("p", welcome)
     line.connect(instant(0.0))
@@ -137,7 +137,7 @@ def test_a_board_that_does_not_hear_us_is_diagnosed(board: Any, instant: At) -> 
     assert "did not answer Identify" in diagnosed.problem
 
 
-def test_wire_time_of_what_came_after_is_taken_off(board: Any, instant: At) -> None:
+def test_wire_time_of_trailing_bytes_is_subtracted(board: Any, instant: At) -> None:
     line = SerialLine("p", welcome)
     line.connect(instant(0.0), byte_time=1e-4)
     serve(line, board, instant, 1.0)
@@ -149,7 +149,7 @@ def test_wire_time_of_what_came_after_is_taken_off(board: Any, instant: At) -> N
     assert received == [instant(1.1 - len(tail) * 1e-4), instant(1.1)]
 
 
-def test_a_replug_is_taken_up_where_it_stood(board: Any, instant: At) -> None:
+def test_replugged_board_continues_where_it_stopped(board: Any, instant: At) -> None:
     line = SerialLine("p", welcome)
     line.connect(instant(0.0))
     serve(line, board, instant, 1.0)
@@ -195,7 +195,7 @@ class Bus:
         return [frame for m in messages for frame in self.encoders[node].encode(m)]
 
 
-def test_boards_on_a_bus_are_gathered_then_served_each_by_its_link(
+def test_boards_on_a_bus_are_discovered_then_served_separately(
     make_board: Callable[..., Any], instant: At
 ) -> None:
     boards = {3: make_board("00000000000000a3"), 5: make_board("00000000000000a5")}
@@ -213,9 +213,7 @@ def test_boards_on_a_bus_are_gathered_then_served_each_by_its_link(
     assert 2 <= bus.questions <= 5
 
 
-def test_a_board_that_joins_later_is_found_by_its_status(
-    make_board: Callable[..., Any], instant: At
-) -> None:
+def test_late_board_is_found_by_its_status(make_board: Callable[..., Any], instant: At) -> None:
     line = CanLine("can", welcome)
     bus = Bus(line, {3: make_board("00000000000000a3")}, instant)
     line.connect(instant(0.0))
@@ -228,7 +226,7 @@ def test_a_board_that_joins_later_is_found_by_its_status(
     assert not of(events, Refused)
 
 
-def test_boards_not_asked_for_are_counted_not_used(
+def test_unrequested_boards_are_counted_not_used(
     make_board: Callable[..., Any], instant: At
 ) -> None:
     line = CanLine("can", welcome, nodes=frozenset({3}))
@@ -240,7 +238,7 @@ def test_boards_not_asked_for_are_counted_not_used(
     assert line.rejects["strangers"] > 0
 
 
-def test_a_bus_without_boards_is_diagnosed(instant: At) -> None:
+def test_bus_without_boards_is_diagnosed(instant: At) -> None:
     line = CanLine("can", welcome)
     bus = Bus(line, {}, instant)
     line.connect(instant(0.0))
@@ -256,7 +254,7 @@ def test_a_bus_without_boards_is_diagnosed(instant: At) -> None:
     assert "no taxel board" in diagnosed.problem
 
 
-def test_a_recording_needs_no_answers(
+def test_recording_needs_no_answers(
     board: Any, instant: At, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     live = SerialLine("p", welcome)
@@ -284,7 +282,7 @@ def test_a_recording_needs_no_answers(
     assert of(events, Identified)
 
 
-def test_other_versions_are_refused_on_a_line(board: Any, instant: At) -> None:
+def test_other_protocol_versions_are_refused_on_a_line(board: Any, instant: At) -> None:
     board.descriptor = replace(board.descriptor, major=3)
     line = SerialLine("p", welcome)
     line.connect(instant(0.0))
@@ -293,7 +291,7 @@ def test_other_versions_are_refused_on_a_line(board: Any, instant: At) -> None:
     assert not of(events, Diagnosed)
 
 
-def test_a_board_that_goes_quiet_for_a_while_is_not_called_deaf(board: Any, instant: At) -> None:
+def test_temporarily_quiet_board_is_not_called_deaf(board: Any, instant: At) -> None:
     line = SerialLine("p", welcome)
     line.connect(instant(0.0))
     serve(line, board, instant, 5.0)

@@ -78,7 +78,7 @@ def rig(board: Any, instant: Callable[[float], Instant]) -> Rig:
     return Rig(link, board, instant)
 
 
-def test_identifies_starts_and_streams(rig: Rig) -> None:
+def test_board_is_identified_started_and_streams(rig: Rig) -> None:
     rig.run(1.0)
     assert rig.link.state is State.STREAMING
     identity = rig.of(Identified)[0].identity
@@ -91,7 +91,7 @@ def test_identifies_starts_and_streams(rig: Rig) -> None:
     assert blocks[0].temperature_c == pytest.approx([25.12])
 
 
-def test_stamps_are_on_host_time_and_within_their_uncertainty(
+def test_stamps_are_host_time_within_uncertainty(
     make_board: Callable[..., Any], instant: Callable[[float], Instant]
 ) -> None:
     link = BoardLink(lambda identity: None)
@@ -112,7 +112,7 @@ def test_lost_commands_are_repeated_until_answered(rig: Rig) -> None:
     assert rig.link.state is State.STREAMING
 
 
-def test_a_deaf_board_is_asked_ever_more_slowly(rig: Rig) -> None:
+def test_deaf_board_is_polled_ever_more_slowly(rig: Rig) -> None:
     rig.board.mute = True
     rig.run(10.0)
     asked = [m for m in rig.board.heard if isinstance(m, Identify)]
@@ -120,7 +120,7 @@ def test_a_deaf_board_is_asked_ever_more_slowly(rig: Rig) -> None:
     assert not rig.of(Sampled)
 
 
-def test_rate_is_set_before_the_start(
+def test_rate_is_set_before_streaming_starts(
     make_board: Callable[..., Any], instant: Callable[[float], Instant]
 ) -> None:
     link = BoardLink(lambda identity: None, rate=25.0)
@@ -133,7 +133,7 @@ def test_rate_is_set_before_the_start(
     assert rig.of(Streaming) == [Streaming(25.0)]
 
 
-def test_a_rate_above_the_boards_is_refused(
+def test_rate_above_the_board_maximum_is_refused(
     board: Any, instant: Callable[[float], Instant]
 ) -> None:
     link = BoardLink(lambda identity: None, rate=600.0)
@@ -146,7 +146,7 @@ def test_a_rate_above_the_boards_is_refused(
     assert not board.streaming
 
 
-def test_another_major_version_is_refused_by_name(rig: Rig, descriptor: Descriptor) -> None:
+def test_other_major_version_is_refused_by_name(rig: Rig, descriptor: Descriptor) -> None:
     rig.board.descriptor = replace(descriptor, major=2)
     rig.run(3.0)
     (refused,) = rig.of(Refused)
@@ -155,7 +155,7 @@ def test_another_major_version_is_refused_by_name(rig: Rig, descriptor: Descript
     assert rig.link.state is State.REFUSED
 
 
-def test_an_unwelcome_board_is_refused_until_it_is_welcome(
+def test_rejected_board_is_refused_until_admitted(
     board: Any, instant: Callable[[float], Instant]
 ) -> None:
     seen: list[Identity] = []
@@ -177,7 +177,7 @@ def test_an_unwelcome_board_is_refused_until_it_is_welcome(
     assert rig.link.state is State.STREAMING
 
 
-def test_another_board_on_the_same_port_is_refused_and_both_are_named(
+def test_other_board_on_the_same_port_is_refused_naming_both(
     rig: Rig, make_board: Callable[..., Any]
 ) -> None:
     first = rig.board
@@ -196,7 +196,7 @@ def test_another_board_on_the_same_port_is_refused_and_both_are_named(
     assert [e for e in events if isinstance(e, Sampled)]
 
 
-def test_silence_is_told_and_so_is_its_end(rig: Rig) -> None:
+def test_silence_and_its_end_are_reported(rig: Rig) -> None:
     rig.run(2.0)
     rig.board.mute = True
     events = rig.run(0.5)
@@ -209,7 +209,7 @@ def test_silence_is_told_and_so_is_its_end(rig: Rig) -> None:
     assert not [e for e in events if isinstance(e, Identified)]
 
 
-def test_nothing_is_used_after_a_long_silence_before_the_board_has_said_who_it_is(
+def test_after_long_silence_nothing_is_used_until_board_identifies(
     rig: Rig, make_board: Callable[..., Any]
 ) -> None:
     rig.run(2.0)
@@ -223,7 +223,7 @@ def test_nothing_is_used_after_a_long_silence_before_the_board_has_said_who_it_i
     assert [e for e in events if isinstance(e, Refused)]
 
 
-def test_a_rebooted_board_streams_again_within_a_second(rig: Rig) -> None:
+def test_rebooted_board_streams_again_within_a_second(rig: Rig) -> None:
     rig.run(3.0)
     rig.board.reboot(rig.now)
     events = rig.run(1.0)
@@ -237,7 +237,7 @@ def test_a_rebooted_board_streams_again_within_a_second(rig: Rig) -> None:
     assert sum(a.tracker.missing for a in rig.link.arrays.values()) == 0
 
 
-def test_stamps_never_run_backwards_through_a_reboot(rig: Rig) -> None:
+def test_stamps_stay_monotonic_through_a_reboot(rig: Rig) -> None:
     rig.run(2.0)
     rig.board.reboot(rig.now)
     rig.run(2.0)
@@ -246,7 +246,7 @@ def test_stamps_never_run_backwards_through_a_reboot(rig: Rig) -> None:
         assert captured == sorted(captured)
 
 
-def test_a_reboot_that_goes_on_streaming_is_seen_by_its_uptime_or_sequence(rig: Rig) -> None:
+def test_reboot_while_streaming_is_detected_by_uptime_or_sequence(rig: Rig) -> None:
     rig.run(3.0)
     rig.board.reboot(rig.now)
     rig.board.streaming = True
@@ -255,7 +255,7 @@ def test_a_reboot_that_goes_on_streaming_is_seen_by_its_uptime_or_sequence(rig: 
     assert rig.link.state is State.STREAMING
 
 
-def test_commands_from_outside_are_answered(rig: Rig) -> None:
+def test_external_commands_are_answered(rig: Rig) -> None:
     rig.run(1.0)
     number = rig.link.request(lambda n: SetRate(n, 50_000), rig.at(rig.now))
     rig.run(0.5)
@@ -263,7 +263,7 @@ def test_commands_from_outside_are_answered(rig: Rig) -> None:
     assert rig.link.rate == 50.0
 
 
-def test_commands_that_are_not_answered_are_given_up(rig: Rig) -> None:
+def test_unanswered_commands_time_out(rig: Rig) -> None:
     rig.run(1.0)
     rig.board.deaf = True
     number = rig.link.request(lambda n: SetRate(n, 50_000), rig.at(rig.now))
@@ -274,12 +274,12 @@ def test_commands_that_are_not_answered_are_given_up(rig: Rig) -> None:
     assert [type(e) for e in events] == [Answered]
 
 
-def test_commands_to_a_board_not_in_service_are_refused(rig: Rig) -> None:
+def test_commands_to_an_unavailable_board_are_refused(rig: Rig) -> None:
     with pytest.raises(ValueError, match="not in service"):
         rig.link.request(Start, rig.at(0.0))
 
 
-def test_a_board_that_will_not_take_the_rate_is_refused(
+def test_board_refusing_the_rate_is_refused(
     make_board: Callable[..., Any], instant: Callable[[float], Instant]
 ) -> None:
     board = make_board(results={SetRate: AckResult.BAD_ARGUMENT})
@@ -291,7 +291,7 @@ def test_a_board_that_will_not_take_the_rate_is_refused(
     assert "SetRate" in refused.refusal.problem
 
 
-def test_farewell_stops_the_board(rig: Rig) -> None:
+def test_closing_the_link_stops_the_board(rig: Rig) -> None:
     rig.run(1.0)
     rig.link.farewell()
     rig.run(0.01)
@@ -306,7 +306,7 @@ def test_firmware_text_is_passed_on(rig: Rig) -> None:
     assert (event.level, event.text) == (30, "hot")
 
 
-def test_samples_of_another_shape_are_counted_not_used(rig: Rig) -> None:
+def test_samples_of_wrong_shape_are_counted_not_used(rig: Rig) -> None:
     rig.run(1.0)
     odd = replace(rig.board.sample(0, rig.now), array=7)
     assert rig.link.receive(odd, rig.at(rig.now)) == []

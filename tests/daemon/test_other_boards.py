@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 
+from support.tactiled_lab import Ear
+from support.waiting import wait_until
 from tactile_core.bus.messages import codec
 from tactile_core.bus.topics import GEOMETRY
 from tactile_core.log.info import info
@@ -14,9 +16,7 @@ from tactile_core.log.info import info
 pytestmark = pytest.mark.timeout(300)
 
 
-def test_a_text_sketch_a_declared_board_and_a_mute_adapter_stream_and_replay(
-    lab: Any, hear: Any, until: Any
-) -> None:
+def test_text_board_declared_board_and_silent_adapter_stream_and_replay(lab: Any) -> None:
     lab.boards(
         "--pty", "text", "--board", "anyskin", "--arrays", "5+5", "--format", "anyskin-text",
         "--banner", "--rate", "50", link="text",
@@ -37,10 +37,10 @@ def test_a_text_sketch_a_declared_board_and_a_mute_adapter_stream_and_replay(
         GEOMETRY.key("jaws"),
         lambda sample: shapes.append(codec().decode(GEOMETRY, sample.payload.to_bytes())),
     )
-    ears = {name: hear(session, name) for name in ("jaws", "pad", "hand")}
+    ears = {name: Ear(session, name) for name in ("jaws", "pad", "hand")}
     for ear in ears.values():
         ear.wait(20)
-    until(lambda: "read as text:10txyz" in daemon.said)
+    wait_until(lambda: "read as text:10txyz" in daemon.said)
     assert "answers no command" in daemon.said
     daemon.process.send_signal(signal.SIGINT)
     assert daemon.wait() == 0, daemon.said
@@ -64,7 +64,7 @@ def test_a_text_sketch_a_declared_board_and_a_mute_adapter_stream_and_replay(
         (("--arrays", "5+5"), ("--arrays", "5+4"), "5+4 names 9 magnetometers"),
     ],
 )
-def test_what_cannot_be_read_ends_with_the_remedy(
+def test_unreadable_stream_ends_with_a_remedy(
     lab: Any, sent: tuple[str, ...], words: tuple[str, ...], said: str
 ) -> None:
     lab.boards("--pty", "skin", "--board", "anyskin", *sent, link="skin")
@@ -74,7 +74,7 @@ def test_what_cannot_be_read_ends_with_the_remedy(
     assert "baud" not in daemon.said
 
 
-def test_a_bit_rate_that_no_adapter_has_is_a_bad_argument(lab: Any) -> None:
+def test_unsupported_bit_rate_is_a_bad_argument(lab: Any) -> None:
     daemon = lab.tactiled("--can", "slcan:can0@123456", "--no-log")
     assert daemon.wait() == 2
     assert "83333" in daemon.said

@@ -80,7 +80,7 @@ def through(topic: Any, message: Any) -> Any:
     return codec().decode(topic, codec().encode(topic, message))
 
 
-def test_features(calibration: BoardCalibration, cycle: Cycle) -> None:
+def test_features_message_matches_the_pipeline(calibration: BoardCalibration, cycle: Cycle) -> None:
     seen = through(FEATURES, MessageMaker(calibration, WALL).features(cycle))
     assert stamp_ns(seen.header.stamp) == cycle.captured + WALL.offset_ns
     assert seen.header.frame_id == "ee"
@@ -104,7 +104,9 @@ def test_features(calibration: BoardCalibration, cycle: Cycle) -> None:
     assert seen.patches[0].force.y == -4.0
 
 
-def test_forces_and_field(calibration: BoardCalibration, cycle: Cycle) -> None:
+def test_forces_and_field_messages_match_the_pipeline(
+    calibration: BoardCalibration, cycle: Cycle
+) -> None:
     maker = MessageMaker(calibration, WALL)
     forces = through(FORCES, maker.forces(cycle))
     assert forces.array_taxels.tolist() == [32, 32, 16]
@@ -117,15 +119,13 @@ def test_forces_and_field(calibration: BoardCalibration, cycle: Cycle) -> None:
     assert through(FORCES, maker.forces(good)).compensated
 
 
-def test_ambient_planes_are_in_the_order_of_the_message(
-    calibration: BoardCalibration, cycle: Cycle
-) -> None:
+def test_ambient_planes_are_in_message_order(calibration: BoardCalibration, cycle: Cycle) -> None:
     seen = through(AMBIENT, MessageMaker(calibration, WALL).ambient(cycle))
     np.testing.assert_array_equal(seen.plane, np.arange(27.0))
     assert seen.valid.tolist() == [True, True, False]
 
 
-def test_geometry(calibration: BoardCalibration) -> None:
+def test_geometry_message_matches_the_calibration(calibration: BoardCalibration) -> None:
     seen = through(GEOMETRY, MessageMaker(calibration, WALL).geometry(5))
     assert seen.array_name == ["left", "right", "tip"]
     assert seen.array_side.tolist() == [1, 2, 3]
@@ -135,7 +135,7 @@ def test_geometry(calibration: BoardCalibration) -> None:
     np.testing.assert_allclose(np.linalg.norm(seen.normal.reshape(-1, 3), axis=1), 1, rtol=1e-6)
 
 
-def test_long_chunks_are_cut_into_messages_that_may_be_sent(
+def test_long_chunks_are_split_into_sendable_messages(
     instant: Callable[[float], Instant],
 ) -> None:
     data = bytes(range(256)) * 300
@@ -148,7 +148,7 @@ def test_long_chunks_are_cut_into_messages_that_may_be_sent(
     assert b"".join(p for p in parts if isinstance(p, bytes)) == data
 
 
-def test_a_step_of_the_system_clock_moves_no_stamp(
+def test_system_clock_step_does_not_shift_stamps(
     calibration: BoardCalibration, cycle: Cycle, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     maker = MessageMaker(calibration, WallClock.take())

@@ -15,22 +15,21 @@ from typing import Any
 
 import pytest
 
+from support.tactiled_lab import Ear
+from support.waiting import PATIENCE_S
 from tactile_core.bus.services import ServiceError
 from tactile_core.log.info import info
 from tactiled.cli import main
 from tactiled.port import Port
 
-SLOW = 60.0
-"""s that anything may take on a busy machine before a test gives it up."""
-
 pytestmark = pytest.mark.timeout(300)
 
 
-def test_ctrl_c_leaves_a_whole_log_that_replays_on_keys_of_its_own(lab: Any, hear: Any) -> None:
+def test_ctrl_c_leaves_a_complete_log_that_replays_on_its_own_keys(lab: Any) -> None:
     lab.boards("--pty", "board0", "--seed", "1", link="board0")
     daemon = lab.tactiled("--port", "board0", "--log", "run.mcap")
     session = lab.listen()
-    ear = hear(session)
+    ear = Ear(session)
     ear.wait(50)
     daemon.process.send_signal(signal.SIGINT)
     assert daemon.wait() == 0, daemon.said
@@ -44,25 +43,23 @@ def test_ctrl_c_leaves_a_whole_log_that_replays_on_keys_of_its_own(lab: Any, hea
     # All of it again, and at most the cycles that were in hand when Ctrl-C came.
     ahead = again["/tactile/board0/features"] - logged["/tactile/board0/features"]
     assert 0 <= ahead <= 3
-    live, replayed = hear(session), hear(session, prefix="replay")
+    live, replayed = Ear(session), Ear(session, prefix="replay")
     lab.tactiled("--mcap", "run.mcap", "--speed", "0.5")
     replayed.wait(5)
     assert not live.heard
 
 
-def test_whoever_waits_for_an_answer_is_told_that_the_daemon_stops(
-    lab: Any, hear: Any, ask: Any
-) -> None:
+def test_pending_requests_are_told_that_the_daemon_stops(lab: Any, ask: Any) -> None:
     board = lab.boards("--pty", "board0", "--seed", "1", link="board0")
     daemon = lab.tactiled("--port", "board0", "--no-log")
     session = lab.listen()
-    hear(session).wait(10)
+    Ear(session).wait(10)
     board.process.send_signal(signal.SIGSTOP)
     answers: list[str] = []
 
     def tare() -> None:
         try:
-            ask(session, "tare", timeout=SLOW)
+            ask(session, "tare", timeout=PATIENCE_S)
         except ServiceError as error:
             answers.append(str(error))
 
@@ -70,19 +67,19 @@ def test_whoever_waits_for_an_answer_is_told_that_the_daemon_stops(
     thread.start()
     time.sleep(0.5)
     daemon.process.terminate()
-    thread.join(SLOW)
+    thread.join(PATIENCE_S)
     assert daemon.wait() == 0, daemon.said
     assert answers
     assert "did not end in time" not in daemon.said
 
 
-def test_silence_ends_the_features_and_never_repeats_one(lab: Any, hear: Any) -> None:
+def test_silence_ends_features_without_repeating_one(lab: Any) -> None:
     board = lab.boards("--pty", "board0", "--seed", "1", link="board0")
     daemon = lab.tactiled("--port", "board0", "--no-log")
-    ear = hear(lab.listen())
+    ear = Ear(lab.listen())
     ear.wait(10)
     board.process.send_signal(signal.SIGSTOP)
-    daemon.wait_for("no samples for")
+    daemon.wait_for_text("no samples for")
     time.sleep(1.2)
     board.process.send_signal(signal.SIGCONT)
     ear.wait(20, after=time.monotonic())
@@ -92,30 +89,28 @@ def test_silence_ends_the_features_and_never_repeats_one(lab: Any, hear: Any) ->
     assert max(pauses) > 1.0
 
 
-def test_an_unplugged_board_is_taken_up_again_and_another_in_its_place_refused(
-    lab: Any, hear: Any
-) -> None:
+def test_replugged_board_is_resumed_and_another_in_its_place_refused(lab: Any) -> None:
     board = lab.boards("--pty", "board0", "--seed", "1", link="board0")
     daemon = lab.tactiled("--port", "board0", "--log", "run.mcap")
-    ear = hear(lab.listen())
+    ear = Ear(lab.listen())
     ear.wait(10)
     board.end()
-    daemon.wait_for("waiting for it to come back")
+    daemon.wait_for_text("waiting for it to come back")
     (lab.folder / "board0").unlink(missing_ok=True)
     board = lab.boards("--pty", "board0", "--seed", "1", link="board0")
     ear.wait(10, after=time.monotonic())
     board.end()
     (lab.folder / "board0").unlink(missing_ok=True)
     lab.boards("--pty", "board0", "--seed", "2", link="board0")
-    daemon.wait_for("answers where")
+    daemon.wait_for_text("answers where")
     assert daemon.process.poll() is None
 
 
-def test_a_killed_daemon_starts_again_and_its_log_is_read(lab: Any, hear: Any) -> None:
+def test_killed_daemon_restarts_and_its_log_is_readable(lab: Any) -> None:
     lab.boards("--pty", "board0", "--seed", "1", link="board0")
     daemon = lab.tactiled("--port", "board0", "--log", "run.mcap")
     session = lab.listen()
-    ear = hear(session)
+    ear = Ear(session)
     ear.wait(60)
     daemon.process.kill()
     daemon.wait()
@@ -126,7 +121,7 @@ def test_a_killed_daemon_starts_again_and_its_log_is_read(lab: Any, hear: Any) -
     assert {c.topic: c.messages for c in told.channels}["/tactile/board0/features"] > 20
 
 
-def test_a_thread_that_dies_takes_the_daemon_down_and_the_log_is_whole(
+def test_dead_thread_ends_the_daemon_and_the_log_is_complete(
     lab: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lab.boards("--pty", "board0", "--seed", "1", link="board0")
@@ -150,19 +145,19 @@ def test_a_thread_that_dies_takes_the_daemon_down_and_the_log_is_whole(
     assert {c.topic: c.messages for c in told.channels}["/tactile/board0/forces"] >= 100
 
 
-def test_boards_on_a_can_bus_are_named_by_node(lab: Any, hear: Any) -> None:
+def test_boards_on_a_can_bus_are_named_by_node(lab: Any) -> None:
     lab.boards(
         "--slcan", "can0", "--node", "3", "--node", "5", "--rate", "25", "--seed", "1", link="can0"
     )
     daemon = lab.tactiled("--can", "slcan:can0@1000000", "--name", "hand", "--no-log")
     session = lab.listen()
     for name in ("hand-3", "hand-5"):
-        hear(session, name).wait(5)
+        Ear(session, name).wait(5)
     daemon.process.terminate()
     assert daemon.wait() == 0, daemon.said
 
 
-def test_a_calibration_of_another_board_ends_with_both_named(lab: Any) -> None:
+def test_calibration_of_another_board_is_refused_naming_both(lab: Any) -> None:
     lab.boards("--pty", "board0", "--serial", "a1", link="board0")
     lab.calibration("--serial", "b2", "--out", "other.cal.toml")
     daemon = lab.tactiled("--port", "board0", "--calibration", "other.cal.toml", "--no-log")
@@ -172,7 +167,7 @@ def test_a_calibration_of_another_board_ends_with_both_named(lab: Any) -> None:
     assert "Traceback" not in daemon.said
 
 
-def test_a_device_that_is_no_board_is_named_with_a_remedy(lab: Any) -> None:
+def test_non_board_device_is_named_with_a_remedy(lab: Any) -> None:
     with chattering(b"T=21.5 C\r\n") as path:
         daemon = lab.tactiled("--port", path, "--log", "run.mcap")
         assert daemon.wait() == 3
@@ -182,7 +177,7 @@ def test_a_device_that_is_no_board_is_named_with_a_remedy(lab: Any) -> None:
     assert {c.topic for c in info(lab.folder / "run.mcap").channels} >= {"/tactile/board0/raw"}
 
 
-def test_an_unwritable_log_is_refused_before_anything_runs(lab: Any) -> None:
+def test_unwritable_log_is_refused_before_anything_runs(lab: Any) -> None:
     lab.boards("--pty", "board0", link="board0")
     (lab.folder / "file").write_text("")
     daemon = lab.tactiled("--port", "board0", "--log", "file/logs")

@@ -12,6 +12,7 @@ import pytest
 from sensor_proto.anyskin import encode_anyskin
 from sensor_proto.framing import SerialDecoder, encode_serial
 from sensor_proto.packets import Descriptor, FloatSamples
+from support.waiting import wait_until
 from tactile_core.calibration import nominal
 from tactile_core.types import Instant
 from tactiled.blocks import Chunk, Cycle, SampleBlock
@@ -44,12 +45,12 @@ def floats(rng: np.random.Generator, cut: int = 0) -> bytes:
     return encode_anyskin(samples)[cut:]
 
 
-def play_floats(line: SerialLine, at: At, rate: float, frames: int, until: float) -> list[Any]:
+def play_floats(line: SerialLine, at: At, rate: float, frames: int) -> list[Any]:
     """A float board that is heard from in the middle of a frame on; looked at every 10 ms."""
     rng, events, sent = np.random.default_rng(0), [], 0
     line.connect(at(0.0))
     step = min(0.01, 1 / rate)
-    for k in range(round(until / step)):
+    for k in range(round(wait_until / step)):
         now = k * step
         events += line.tick(at(now))
         line.outgoing()
@@ -60,7 +61,7 @@ def play_floats(line: SerialLine, at: At, rate: float, frames: int, until: float
 
 
 @pytest.mark.parametrize("rate", RATES)
-def test_a_float_board_is_found_and_never_called_silent(rate: float, instant: At) -> None:
+def test_float_board_is_found_and_never_called_silent(rate: float, instant: At) -> None:
     line, frames = SerialLine("p", welcome), max(20, round(4 * rate))
     events = play_floats(line, instant, rate, frames, frames / rate)
     blocks = [e.block for e in events if isinstance(e, Sampled)]
@@ -74,7 +75,9 @@ def test_a_float_board_is_found_and_never_called_silent(rate: float, instant: At
 
 
 @pytest.mark.parametrize("rate", RATES)
-def test_a_float_board_that_ceases_is_called_silent_at_its_pace(rate: float, instant: At) -> None:
+def test_stopped_float_board_is_called_silent_after_its_own_period(
+    rate: float, instant: At
+) -> None:
     line, frames = SerialLine("p", welcome), max(16, round(2 * rate))
     last = (frames - 0.7) / rate
     limit = max(0.2, 3 / rate)
@@ -83,7 +86,7 @@ def test_a_float_board_that_ceases_is_called_silent_at_its_pace(rate: float, ins
     assert limit <= silence.seconds <= limit * 1.1 + 0.05
 
 
-def test_bytes_that_are_no_board_are_called_so_however_seldom_they_come(instant: At) -> None:
+def test_rare_garbage_is_reported_as_such(instant: At) -> None:
     rng = np.random.default_rng(1)
     line, told = SerialLine("p", welcome), []
     line.connect(instant(0.0))
@@ -98,7 +101,7 @@ def test_bytes_that_are_no_board_are_called_so_however_seldom_they_come(instant:
     assert "no valid frame" in diagnosed[0][1].problem
 
 
-def test_bytes_that_pour_in_are_called_garbage_in_three_seconds(instant: At) -> None:
+def test_flood_of_garbage_is_reported_within_three_seconds(instant: At) -> None:
     rng = np.random.default_rng(1)
     line, told = SerialLine("p", welcome), []
     line.connect(instant(0.0))
@@ -129,7 +132,7 @@ def play_board(line: SerialLine, board: Any, at: At, seconds: float, step: float
 
 @pytest.mark.parametrize("rate", RATES)
 @pytest.mark.parametrize("says", ["its rate", "nothing", "another rate"])
-def test_a_board_that_speaks_our_protocol_is_served_at_any_rate(
+def test_own_protocol_board_is_served_at_any_rate(
     rate: float, says: str, make_board: Callable[..., Any], instant: At
 ) -> None:
     board = make_board(period=1 / rate)
@@ -142,7 +145,7 @@ def test_a_board_that_speaks_our_protocol_is_served_at_any_rate(
         assert not [e for e in events if isinstance(e, FellSilent | Resumed)]
 
 
-def test_a_rate_that_is_told_of_is_not_what_counts() -> None:
+def test_measured_rate_counts_not_the_reported_one() -> None:
     pace = Pace()
     assert pace.silence_limit(said_hz=0.001) == 3 * SLOWEST_S
     for k in range(5):
@@ -175,7 +178,7 @@ def cycles_of(
 
 
 @pytest.mark.parametrize("rate", RATES)
-def test_a_first_tare_takes_the_cycles_it_needs_at_any_rate(rate: float, instant: At) -> None:
+def test_first_tare_takes_enough_cycles_at_any_rate(rate: float, instant: At) -> None:
     pipeline = BoardPipeline(nominal("anyskin", "s"), PipelineSettings())
     count = max(12, round(rate))
     cycles = cycles_of(pipeline, instant, rate, count)
@@ -187,7 +190,7 @@ def test_a_first_tare_takes_the_cycles_it_needs_at_any_rate(rate: float, instant
     assert not np.count_nonzero(cycles[-1].health)
 
 
-def test_features_of_a_board_with_an_unusable_clock_say_so(instant: At) -> None:
+def test_features_are_marked_while_the_board_clock_is_unusable(instant: At) -> None:
     pipeline = BoardPipeline(nominal("anyskin", "s"), PipelineSettings())
     good = cycles_of(pipeline, instant, 100.0, 100)[-1].features
     assert good.valid
@@ -198,7 +201,7 @@ def test_features_of_a_board_with_an_unusable_clock_say_so(instant: At) -> None:
     assert "clock" in bad.reasons[0].text
 
 
-def test_another_tick_rate_is_told_when_the_board_comes_back(
+def test_changed_tick_rate_is_reported_after_reconnect(
     make_board: Callable[..., Any], descriptor: Descriptor, instant: At
 ) -> None:
     line, board = SerialLine("p", welcome), make_board()

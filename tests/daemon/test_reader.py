@@ -109,7 +109,7 @@ def test_chunks_are_handed_over_and_logged(rig: Rig, instant: Callable[[float], 
     assert rig.log.chunks == chunks
 
 
-def test_a_port_that_vanishes_is_told_and_opened_again(rig: Rig) -> None:
+def test_vanished_port_is_reported_and_reopened(rig: Rig) -> None:
     rig.reader.open(wait=False)
     rig.reader.start()
     assert rig.next() == PortOpened()
@@ -121,7 +121,7 @@ def test_a_port_that_vanishes_is_told_and_opened_again(rig: Rig) -> None:
     assert not rig.failures
 
 
-def test_a_port_missing_at_the_start_is_an_error_or_waited_for(rig: Rig) -> None:
+def test_port_missing_at_start_is_an_error_or_waited_for(rig: Rig) -> None:
     rig.transport.openings = [PortMissing("no port"), PortMissing("no port")]
     with pytest.raises(PortMissing):
         rig.reader.open(wait=False)
@@ -130,7 +130,7 @@ def test_a_port_missing_at_the_start_is_an_error_or_waited_for(rig: Rig) -> None
     assert rig.next() == PortOpened()
 
 
-def test_what_a_reader_dies_of_is_told(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reader_failure_is_reported(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     rig.reader.open(wait=False)
 
     def put(item: Any) -> None:
@@ -146,7 +146,7 @@ def test_what_a_reader_dies_of_is_told(rig: Rig, monkeypatch: pytest.MonkeyPatch
     assert str(rig.failures[0]) == "no inbox"
 
 
-def test_a_driver_that_fails_is_a_lost_port_and_is_opened_anew(
+def test_failing_driver_counts_as_lost_port_and_is_reopened(
     rig: Rig, instant: Callable[[float], Instant]
 ) -> None:
     rig.reader.open(wait=False)
@@ -163,7 +163,7 @@ def test_a_driver_that_fails_is_a_lost_port_and_is_opened_anew(
     assert rig.failures == []
 
 
-def test_a_recording_waits_for_the_pipeline_and_ends(instant: Callable[[float], Instant]) -> None:
+def test_recording_waits_for_the_pipeline_and_ends(instant: Callable[[float], Instant]) -> None:
     rig = Rig(paced=True, limit=4)
     chunks = [Chunk(instant(k), bytes([k])) for k in range(50)]
     for chunk in chunks:
@@ -177,7 +177,7 @@ def test_a_recording_waits_for_the_pipeline_and_ends(instant: Callable[[float], 
     rig.reader.stop()
 
 
-def test_only_a_uart_takes_time_on_the_wire() -> None:
+def test_only_a_uart_has_wire_time() -> None:
     assert byte_time("/dev/ttyUSB0", 115_200) == pytest.approx(86.8e-6, rel=1e-3)
     assert byte_time("/dev/ttyACM0", 115_200) == 0
     assert byte_time("/dev/pts/3", 115_200) == 0

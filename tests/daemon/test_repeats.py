@@ -11,7 +11,7 @@ from tactiled.watch import FEW, KINDS, WINDOW_S, Repeats, Silences
 At = Callable[[float], Instant]
 
 
-def test_short_silences_in_a_row_are_one_line(instant: At) -> None:
+def test_repeated_short_silences_give_one_line(instant: At) -> None:
     silences, said = Silences(), []
     for k in range(100):
         now = k * 0.1
@@ -29,7 +29,7 @@ def test_short_silences_in_a_row_are_one_line(instant: At) -> None:
     assert silences.fell(0.2, instant(25.0)) == "no samples for 0.20 s"
 
 
-def test_a_silence_that_lasts_is_told_though_others_were_before_it(instant: At) -> None:
+def test_lasting_silence_is_reported_after_short_ones(instant: At) -> None:
     silences = Silences()
     assert silences.fell(0.2, instant(0.0))
     assert silences.ended(0.4)
@@ -40,7 +40,7 @@ def test_a_silence_that_lasts_is_told_though_others_were_before_it(instant: At) 
     assert silences.ended(5.0) == "samples again after 5.00 s"
 
 
-def test_a_board_that_is_unplugged_is_not_called_silent_as_well(instant: At) -> None:
+def test_unplugged_board_is_not_also_called_silent(instant: At) -> None:
     silences = Silences()
     assert silences.fell(0.2, instant(0.0))
     silences.ended(0.3)
@@ -49,7 +49,7 @@ def test_a_board_that_is_unplugged_is_not_called_silent_as_well(instant: At) -> 
     assert silences.due(instant(5.0)) is None
 
 
-def test_the_first_few_of_a_kind_are_told_and_the_rest_counted(instant: At) -> None:
+def test_first_few_of_a_kind_are_reported_and_the_rest_counted(instant: At) -> None:
     repeats, told = Repeats(), 0
     for k in range(50):
         told += repeats.tell("restart", f"restart {k}", logging.WARNING, instant(k * 0.1))
@@ -63,7 +63,7 @@ def test_the_first_few_of_a_kind_are_told_and_the_rest_counted(instant: At) -> N
     assert repeats.tell("restart", "restart 51", logging.WARNING, instant(41.0))
 
 
-def test_kinds_without_end_take_no_memory_without_end(instant: At) -> None:
+def test_memory_for_kinds_of_messages_is_bounded(instant: At) -> None:
     repeats = Repeats()
     for k in range(10 * KINDS):
         assert repeats.tell(f"kind {k}", "text", logging.INFO, instant(0.0))

@@ -54,7 +54,7 @@ MESSAGES = st.one_of(
 
 @given(st.lists(st.tuples(MESSAGES, st.floats(0, 1.5)), max_size=120))
 @settings(max_examples=60, deadline=None)
-def test_a_link_takes_any_message_at_any_time(script: list[tuple[Any, float]]) -> None:
+def test_link_accepts_any_message_at_any_time(script: list[tuple[Any, float]]) -> None:
     from_board = _descriptor()
     now, last = 1000.0, {0: 0, 1: 0}
     link = BoardLink(lambda identity: None)
@@ -96,7 +96,7 @@ def test_a_link_takes_any_message_at_any_time(script: list[tuple[Any, float]]) -
     st.lists(st.one_of(st.binary(max_size=300), st.just("frame"), st.just("zeros")), max_size=40)
 )
 @settings(max_examples=40, deadline=None)
-def test_a_line_takes_any_bytes(script: list[Any]) -> None:
+def test_line_accepts_any_bytes(script: list[Any]) -> None:
     line = SerialLine("p", lambda node, identity: None)
     line.connect(Instant(0))
     for step, item in enumerate(script):
@@ -108,7 +108,7 @@ def test_a_line_takes_any_bytes(script: list[Any]) -> None:
         line.outgoing()
 
 
-def test_chunks_dropped_on_overflow_are_the_gaps_that_are_counted(
+def test_chunks_dropped_on_overflow_are_counted_as_gaps(
     board: Any, instant: Callable[[float], Instant]
 ) -> None:
     line = SerialLine("p", lambda node, identity: None)

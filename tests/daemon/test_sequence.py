@@ -13,35 +13,35 @@ def take_all(numbers: list[int]) -> tuple[SequenceTracker, list[Verdict]]:
     return tracker, [tracker.take(n % 2**32) for n in numbers]
 
 
-def test_a_gap_is_counted() -> None:
+def test_gap_is_counted() -> None:
     tracker, _ = take_all([1, 2, 6, 7])
     assert (tracker.accepted, tracker.missing) == (4, 3)
 
 
-def test_a_duplicate_is_used_once() -> None:
+def test_duplicate_is_used_once() -> None:
     tracker, verdicts = take_all([1, 2, 2, 3])
     assert verdicts[2] is Verdict.DUPLICATE
     assert (tracker.accepted, tracker.duplicate, tracker.missing) == (3, 1, 0)
 
 
-def test_a_late_frame_fills_its_gap_but_is_not_used() -> None:
+def test_late_frame_fills_its_gap_but_is_not_used() -> None:
     tracker, verdicts = take_all([1, 3, 2, 4])
     assert verdicts == [Verdict.FRESH, Verdict.FRESH, Verdict.LATE, Verdict.FRESH]
     assert (tracker.accepted, tracker.late, tracker.missing) == (3, 1, 0)
 
 
-def test_numbers_wrap() -> None:
+def test_sequence_numbers_wrap() -> None:
     tracker, verdicts = take_all([2**32 - 2, 2**32 - 1, 0, 1])
     assert set(verdicts) == {Verdict.FRESH}
     assert tracker.missing == 0
 
 
-def test_falling_far_back_is_foreign() -> None:
+def test_number_far_behind_is_from_another_stream() -> None:
     _, verdicts = take_all([1000, 1000 - HISTORY, 1001])
     assert verdicts[1] is Verdict.FOREIGN
 
 
-def test_after_a_silence_lower_numbers_start_anew_and_higher_ones_leave_a_gap() -> None:
+def test_after_silence_lower_numbers_restart_and_higher_leave_a_gap() -> None:
     tracker, _ = take_all([100])
     tracker.resume()
     assert tracker.take(5) is Verdict.FRESH

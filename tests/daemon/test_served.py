@@ -6,34 +6,32 @@ from typing import Any
 
 import pytest
 
+from support.network import free_endpoint
+from support.tactiled_lab import Ear
+from support.waiting import PATIENCE_S, wait_until
 from tactile_core.bus.messages import codec
 from tactile_core.bus.services import ServiceError
 from tactile_core.bus.streams import latest
 from tactile_core.bus.topics import FORCES
 
-SLOW = 60.0
-"""s that anything may take on a busy machine before a test gives it up."""
-
 pytestmark = pytest.mark.timeout(300)
 
 
-def test_two_boards_of_two_kinds_under_one_daemon(running: tuple[Any, Any, Any], hear: Any) -> None:
+def test_one_daemon_serves_two_kinds_of_board(running: tuple[Any, Any, Any]) -> None:
     _, daemon, session = running
-    features = hear(session, "board0").wait(5)
+    features = Ear(session, "board0").wait(5)
     assert features.calibrated
-    features = hear(session, "skin0").wait(5)
+    features = Ear(session, "skin0").wait(5)
     assert not features.calibrated
     assert "anyskin board without a serial number found" in daemon.said
-    forces = latest(session, FORCES.key("skin0")).wait(SLOW)
+    forces = latest(session, FORCES.key("skin0")).wait(PATIENCE_S)
     assert forces is not None
     assert len(codec().decode(FORCES, forces.data).status) == 5
 
 
-def test_status_tells_everything_of_a_board(
-    running: tuple[Any, Any, Any], ask: Any, until: Any
-) -> None:
+def test_status_describes_the_board_completely(running: tuple[Any, Any, Any], ask: Any) -> None:
     _, _, session = running
-    until(lambda: ask(session, "status")["rate_hz"] > 0)
+    wait_until(lambda: ask(session, "status")["rate_hz"] > 0)
     status = ask(session, "status")
     assert status["state"] == "streaming"
     assert status["model"] == "finger"
@@ -45,20 +43,18 @@ def test_status_tells_everything_of_a_board(
     assert status["log"]["state"] == "recording"
 
 
-def test_tare_waits_for_its_end_and_reports(running: tuple[Any, Any, Any], ask: Any) -> None:
+def test_tare_replies_when_done_with_a_report(running: tuple[Any, Any, Any], ask: Any) -> None:
     _, _, session = running
-    report = ask(session, "tare", timeout=SLOW)
+    report = ask(session, "tare", timeout=PATIENCE_S)
     assert report["accepted"]
     assert report["cycles"] >= 8
     assert report["shift_ut"] < 100
 
 
-def test_the_rate_is_set_and_bad_rates_are_refused(
-    running: tuple[Any, Any, Any], hear: Any, ask: Any
-) -> None:
+def test_rate_is_set_and_bad_rates_are_refused(running: tuple[Any, Any, Any], ask: Any) -> None:
     _, _, session = running
-    assert ask(session, "set_rate", {"rate_hz": 50.0}, timeout=SLOW) == {"rate_hz": 50.0}
-    ear = hear(session)
+    assert ask(session, "set_rate", {"rate_hz": 50.0}, timeout=PATIENCE_S) == {"rate_hz": 50.0}
+    ear = Ear(session)
     ear.wait(60)
     steps = [
         b.captured_ns - a.captured_ns
@@ -74,7 +70,7 @@ def test_the_rate_is_set_and_bad_rates_are_refused(
         ask(session, "set_rate", {"rate_hz": 50.0}, name="skin0")
 
 
-def test_recalibrating_reads_the_file_again_or_says_why_not(
+def test_recalibrate_rereads_the_file_or_says_why_not(
     running: tuple[Any, Any, Any], ask: Any
 ) -> None:
     lab, _, session = running
@@ -93,11 +89,11 @@ def test_recalibrating_reads_the_file_again_or_says_why_not(
     assert [a["name"] for a in geometry["arrays"]] == ["left", "right", "tip"]
 
 
-def test_a_second_daemon_is_refused_the_port_and_the_name(
+def test_second_daemon_is_refused_port_and_name(
     running: tuple[Any, Any, Any],
 ) -> None:
     lab, _, _ = running
-    other = lab.free_endpoint()
+    other = free_endpoint()
     second = lab.tactiled("--port", "board0", "--no-log", endpoint=other)
     assert second.wait() == 3
     assert "board0 is held" in second.said

@@ -39,7 +39,7 @@ def test_one_port_alone_is_enough(make: Make) -> None:
     assert not settings.replay
 
 
-def test_ports_and_names_go_together_in_their_order(make: Make) -> None:
+def test_ports_and_names_are_paired_in_order(make: Make) -> None:
     settings = make(
         "--port", "a", "--name", "left", "--can", "socketcan:can0", "--name", "hand",
         "--port", "b", "--name", "right", "--board", "anyskin",
@@ -51,7 +51,7 @@ def test_ports_and_names_go_together_in_their_order(make: Make) -> None:
     ]
 
 
-def test_flags_win_over_the_file(make: Make, tmp_path: Path) -> None:
+def test_flags_override_the_file(make: Make, tmp_path: Path) -> None:
     file = tmp_path / "t.toml"
     file.write_text(
         "rate = 50\n[[board]]\nport = 'a'\n[compensation]\nmethod = 'off'\nrate = 2\n"
@@ -89,7 +89,7 @@ def test_calibrations_in_a_file_are_relative_to_it(make: Make, tmp_path: Path) -
     assert make("--config", str(file)).calibrations == (tmp_path / "x.cal.toml",)
 
 
-def test_a_replay_is_logged_only_when_asked(make: Make) -> None:
+def test_replay_is_logged_only_on_request(make: Make) -> None:
     settings = make("--mcap", "x.mcap", "--speed", "inf")
     assert settings.replay
     assert settings.log is None
@@ -115,7 +115,7 @@ def test_a_replay_is_logged_only_when_asked(make: Make) -> None:
         (["--port", "a", "--feature-rate", "1e9"], "allowed"),
     ],
 )
-def test_what_cannot_be_is_refused(make: Make, words: list[str], said: str) -> None:
+def test_impossible_settings_are_refused(make: Make, words: list[str], said: str) -> None:
     with pytest.raises(SettingsError, match=said):
         make(*words)
 
@@ -135,7 +135,7 @@ def test_what_cannot_be_is_refused(make: Make, words: list[str], said: str) -> N
         ("x = [\n", "t.toml"),
     ],
 )
-def test_a_bad_file_is_refused_with_its_place(
+def test_bad_file_is_refused_with_its_location(
     make: Make, tmp_path: Path, text: str, said: str
 ) -> None:
     file = tmp_path / "t.toml"
@@ -169,7 +169,7 @@ def test_exit_status_of_the_command(capsys: pytest.CaptureFixture[str], tmp_path
     assert main(["--list-ports"]) == 0
 
 
-def test_layouts_and_arrays_are_given_for_all_ports_or_for_each(make: Make, tmp_path: Path) -> None:
+def test_layouts_and_arrays_apply_to_all_ports_or_each(make: Make, tmp_path: Path) -> None:
     settings = make(
         "--port", "a", "--board", "floats:5xyz", "--arrays", "5",
         "--port", "b", "--board", "anyskin", "--arrays", "5+5",
@@ -195,7 +195,7 @@ def test_layouts_and_arrays_are_given_for_all_ports_or_for_each(make: Make, tmp_
         (("--port", "a", "--arrays", "15+10"), "at most 20"),
     ],
 )
-def test_layouts_and_arrays_that_are_none_are_bad_arguments(
+def test_invalid_layouts_and_arrays_are_bad_arguments(
     make: Make, words: tuple[str, ...], named: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -213,7 +213,7 @@ def test_layouts_and_arrays_that_are_none_are_bad_arguments(
         ("arrays = '15+10'", "at most 20"),
     ],
 )
-def test_a_file_says_where_a_layout_or_an_array_is_wrong(
+def test_file_error_locates_a_wrong_layout_or_array(
     make: Make, tmp_path: Path, text: str, named: str
 ) -> None:
     file = tmp_path / "t.toml"
@@ -224,14 +224,14 @@ def test_a_file_says_where_a_layout_or_an_array_is_wrong(
 
 
 @pytest.mark.parametrize("spec", ["slcan:/dev/x@123456", "slcan:/dev/x@1000000/7000000+fd"])
-def test_a_bit_rate_that_no_adapter_has_is_a_bad_argument(make: Make, spec: str) -> None:
+def test_unsupported_bit_rate_is_a_bad_argument(make: Make, spec: str) -> None:
     with pytest.raises(SettingsError, match=r"an slcan adapter has .*000"):
         make("--can", spec)
     for good in ("slcan:/dev/x@83333", "slcan:/dev/x@1000000/8000000+fd", "socketcan:can0@123456"):
         assert make("--can", good).ports[0].spec == good
 
 
-def test_arrays_are_of_serial_boards(make: Make) -> None:
+def test_arrays_apply_to_serial_boards_only(make: Make) -> None:
     with pytest.raises(SettingsError, match="boards on a CAN bus say it themselves"):
         make("--can", "socketcan:can0", "--arrays", "5+5")
     with pytest.raises(SettingsError, match="--arrays go with --port"):

@@ -41,7 +41,7 @@ def test_files_are_matched_by_serial_number(tmp_path: Path, descriptor: Descript
     assert chosen.warning == ""
 
 
-def test_a_calibration_of_another_board_is_refused_with_both_names(
+def test_calibration_of_another_board_is_refused_with_both_names(
     tmp_path: Path, descriptor: Descriptor
 ) -> None:
     path = file_of(tmp_path, descriptor, "00000000000000bb")
@@ -52,9 +52,7 @@ def test_a_calibration_of_another_board_is_refused_with_both_names(
     assert refusal.remedy
 
 
-def test_fewer_files_than_boards_leave_the_others_on_nominal_figures(
-    tmp_path: Path, descriptor: Descriptor
-) -> None:
+def test_boards_without_a_file_use_nominal_values(tmp_path: Path, descriptor: Descriptor) -> None:
     path = file_of(tmp_path, descriptor, "00000000000000bb")
     chosen = Shelf([path], strict=False).choose(pad(descriptor))
     assert isinstance(chosen, Choice)
@@ -62,7 +60,9 @@ def test_fewer_files_than_boards_leave_the_others_on_nominal_figures(
     assert "nominal" in chosen.warning
 
 
-def test_arrays_that_differ_are_refused(tmp_path: Path, descriptor: Descriptor) -> None:
+def test_calibration_with_different_arrays_is_refused(
+    tmp_path: Path, descriptor: Descriptor
+) -> None:
     path = file_of(tmp_path, descriptor, "00000000000000aa")
     grown = replace(pad(descriptor), shapes=((4, 4), (1, 3)))
     refusal = Shelf([path], strict=True).choose(grown)
@@ -71,13 +71,13 @@ def test_arrays_that_differ_are_refused(tmp_path: Path, descriptor: Descriptor) 
 
 
 @pytest.mark.parametrize("magnetometers", [1, 5, 7, 20])
-def test_boards_without_a_serial_number_run_on_nominal_figures(magnetometers: int) -> None:
+def test_boards_without_a_serial_number_use_nominal_values(magnetometers: int) -> None:
     chosen = Shelf([], strict=True).choose(skin(magnetometers=magnetometers))
     assert isinstance(chosen, Choice)
     assert chosen.calibration.geometry.taxels == magnetometers
 
 
-def test_a_board_without_a_serial_number_takes_the_one_file_that_fits_it(tmp_path: Path) -> None:
+def test_board_without_serial_number_takes_the_only_fitting_file(tmp_path: Path) -> None:
     path = tmp_path / "skin.cal.toml"
     save(replace(nominal("anyskin", "USB1"), nominal=False), path)
     chosen = Shelf([path], strict=True).choose(skin())
@@ -87,9 +87,7 @@ def test_a_board_without_a_serial_number_takes_the_one_file_that_fits_it(tmp_pat
     assert isinstance(Shelf([path], strict=True).choose(skin("USB2")), Refusal)
 
 
-def test_a_replay_uses_the_calibration_it_was_recorded_with(
-    tmp_path: Path, descriptor: Descriptor
-) -> None:
+def test_replay_uses_its_recorded_calibration(tmp_path: Path, descriptor: Descriptor) -> None:
     calibration = load(file_of(tmp_path, descriptor, "00000000000000aa"))
     log = tmp_path / "run.mcap"
     recorder = Recorder(log)
@@ -108,7 +106,7 @@ def test_a_replay_uses_the_calibration_it_was_recorded_with(
     assert chosen.path != log
 
 
-def test_reloading_reads_what_the_file_says_now(tmp_path: Path, descriptor: Descriptor) -> None:
+def test_reload_reads_the_current_file(tmp_path: Path, descriptor: Descriptor) -> None:
     path = file_of(tmp_path, descriptor, "00000000000000aa")
     shelf = Shelf([path], strict=True)
     first = shelf.choose(pad(descriptor))
@@ -124,7 +122,7 @@ def controller(arrays: tuple[int, ...] | None = None, magnetometers: int = 10) -
     return Identity("USB1", "anyskin", "", ((1, magnetometers),), None, arrays=arrays)
 
 
-def test_a_controller_has_arrays_of_five_unless_told_otherwise() -> None:
+def test_controller_defaults_to_arrays_of_five() -> None:
     for arrays, sizes in ((None, [5, 5]), ((5, 5), [5, 5]), ((6, 4), [6, 4]), ((10,), [10])):
         chosen = Shelf([], strict=True).choose(controller(arrays))
         assert isinstance(chosen, Choice)
@@ -137,7 +135,7 @@ def test_a_controller_has_arrays_of_five_unless_told_otherwise() -> None:
     assert "5+5" in refusal.remedy
 
 
-def test_the_file_says_how_a_controller_is_shared_and_where_its_boards_are(tmp_path: Path) -> None:
+def test_file_describes_arrays_of_a_shared_controller(tmp_path: Path) -> None:
     path = tmp_path / "jaws.cal.toml"
     jaws = anyskin_jaws(2)
     typical = nominal("anyskin", "USB1", 10)

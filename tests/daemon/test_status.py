@@ -17,7 +17,7 @@ from tactiled.cli import can_networks
 from tactiled.status import BAR, SIDES, Glimpse, bar, line
 
 
-def test_a_force_bar_fills_up_and_stays_full() -> None:
+def test_force_bar_saturates() -> None:
     shown = [BAR.index(bar(force)) for force in (-1.0, 0.0, 2.5, 5.0, 10.0, 99.0)]
     assert shown == sorted(shown)
     assert shown[:2] == [0, 0]
@@ -38,7 +38,7 @@ def a_glimpse(**values: object) -> Glimpse:
     return Glimpse(**(usual | values))  # type: ignore[arg-type]
 
 
-def test_force_comes_first_and_then_rate_latency_and_losses() -> None:
+def test_status_shows_force_then_rate_latency_and_losses() -> None:
     shown = line(a_glimpse()).plain
     assert " ".join(shown.split()) == "board0 2.35 N ▂ 99.9 Hz 0 dropped latency 1.7 ms"
     bounded = line(a_glimpse(bound=0.25)).plain
@@ -51,7 +51,7 @@ def test_force_comes_first_and_then_rate_latency_and_losses() -> None:
     assert "123456 dropped" in line(longest).plain
 
 
-def test_a_force_that_is_not_valid_is_not_shown_but_why_is() -> None:
+def test_invalid_force_is_replaced_by_its_reason() -> None:
     shown = line(a_glimpse(valid=False, reasons=("taring: leave the skin untouched",))).plain
     assert " N " not in shown
     assert "not valid" in shown
@@ -59,7 +59,7 @@ def test_a_force_that_is_not_valid_is_not_shown_but_why_is() -> None:
 
 
 @pytest.mark.parametrize("state", ["waiting", "silent", "unplugged", "refused"])
-def test_a_board_that_does_not_stream_shows_its_state_instead(state: str) -> None:
+def test_idle_board_shows_its_state(state: str) -> None:
     shown = line(a_glimpse(state=state, drops=1234)).plain
     assert state in shown
     assert " N " not in shown
@@ -79,12 +79,12 @@ def test_a_board_that_does_not_stream_shows_its_state_instead(state: str) -> Non
     width=st.sampled_from([40, 80, 120]),
 )
 @settings(max_examples=100, deadline=None)
-def test_a_line_fits_its_width(width: int, **values: object) -> None:
+def test_status_line_fits_its_width(width: int, **values: object) -> None:
     shown = line(a_glimpse(**values), width)
     assert shown.cell_len <= width
 
 
-def test_drops_are_named_the_largest_first() -> None:
+def test_drops_are_listed_largest_first() -> None:
     assert drops_text({}) == "0"
     assert drops_text({"crc": 2, "missing": 9}) == "missing=9 crc=2"
     assert drops_text({str(k): k for k in range(9)}).endswith("…")
@@ -100,13 +100,13 @@ def test_drops_are_named_the_largest_first() -> None:
         ({3: "left"}, (3, 4), False, {3: "left"}),
     ],
 )
-def test_names_on_a_bus(
+def test_boards_on_a_bus_are_named(
     given: dict[int, str], nodes: tuple[int, ...], late: bool, names: dict[int, str]
 ) -> None:
     assert bus_names("hand", given, nodes, late) == names
 
 
-def test_can_networks_are_told_by_their_type(tmp_path: Path) -> None:
+def test_can_networks_are_recognised_by_type(tmp_path: Path) -> None:
     for name, kind in (("can0", "280"), ("eth0", "1"), ("vcan1", "280")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "type").write_text(kind + "\n")

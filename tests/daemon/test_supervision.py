@@ -67,7 +67,7 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager
     manager.close()
 
 
-def test_a_manager_hears_each_line_and_its_absence_harms_nobody(
+def test_service_manager_hears_each_line_and_may_be_absent(
     manager: Manager, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert supervision.notify("READY=1", "STATUS=x")
@@ -82,7 +82,7 @@ def test_a_manager_hears_each_line_and_its_absence_harms_nobody(
     assert not supervision.notify("READY=1")
 
 
-def test_a_manager_that_does_not_read_never_holds_us_up(manager: Manager) -> None:
+def test_stalled_service_manager_never_blocks(manager: Manager) -> None:
     while supervision.notify("WATCHDOG=1"):  # until its queue is full
         pass
     watchdog = supervision.Watchdog()
@@ -94,7 +94,7 @@ def test_a_manager_that_does_not_read_never_holds_us_up(manager: Manager) -> Non
     [("400000", None, 0.2), ("", None, None), ("x", None, None), ("0", None, None),
      ("400000", "1", None)],
 )  # fmt: skip
-def test_beats_come_twice_as_often_as_asked_for(
+def test_watchdog_beats_twice_per_interval(
     monkeypatch: pytest.MonkeyPatch, microseconds: str, pid: str | None, period: float | None
 ) -> None:
     monkeypatch.setenv(supervision.WATCHDOG_VARIABLE, microseconds)
@@ -103,9 +103,7 @@ def test_beats_come_twice_as_often_as_asked_for(
     assert supervision.Watchdog().period_s == period
 
 
-def test_tactiled_says_when_it_is_ready_alive_and_stopping(
-    manager: Manager, tmp_path: Path
-) -> None:
+def test_tactiled_notifies_ready_alive_and_stopping(manager: Manager, tmp_path: Path) -> None:
     words = ["--port", str(tmp_path / "none"), "--wait", "--no-log"]
     words += ["--listen", f"unixsock-stream/{tmp_path}/t.sock"]
     process = subprocess.Popen(
@@ -123,9 +121,7 @@ def test_tactiled_says_when_it_is_ready_alive_and_stopping(
         process.wait()
 
 
-def test_when_the_thread_that_moves_the_data_is_stuck_the_beats_end(
-    manager: Manager, tmp_path: Path
-) -> None:
+def test_stuck_pipeline_thread_stops_the_watchdog(manager: Manager, tmp_path: Path) -> None:
     """All other threads go on: a watchdog fed by one of them would see nothing."""
     words = ["--port", str(tmp_path / "none"), "--wait", "--no-log"]
     words += ["--listen", f"unixsock-stream/{tmp_path}/t.sock"]
@@ -163,14 +159,14 @@ def watch(forces: list[float], seconds_each: float = 1.0) -> str | None:
 LONG = round(WINDOW_S * (WINDOWS + 1)) + 2
 
 
-def test_a_zero_that_wandered_sets_the_drift_alarm_off() -> None:
+def test_drifted_zero_raises_the_drift_alarm() -> None:
     text = watch([DRIFT_N * 1.5] * LONG)
     assert text is not None
     assert "tare" in text
     assert watch([math.nan, DRIFT_N * 1.5] * LONG) is not None
 
 
-def test_touch_that_is_let_go_of_is_no_drift() -> None:
+def test_released_touch_is_not_drift() -> None:
     touched = ([5.0] * 500 + [DRIFT_N / 2] * 20) * 3
     assert watch(touched) is None
     assert watch([DRIFT_N * 1.5] * (LONG // 2)) is None
@@ -178,7 +174,7 @@ def test_touch_that_is_let_go_of_is_no_drift() -> None:
     assert watch([]) is None
 
 
-def test_a_tare_ends_the_drift_alarm() -> None:
+def test_tare_clears_the_drift_alarm() -> None:
     drift = DriftWatch()
     for second in range(LONG):
         drift.add(1.0, Instant(second * NS_PER_S))
@@ -187,14 +183,7 @@ def test_a_tare_ends_the_drift_alarm() -> None:
     assert drift.alarm() is None
 
 
-def until(done: Any, seconds: float = 15.0) -> None:
-    end = time.monotonic() + seconds
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
-def test_a_disk_that_fills_fails_or_hangs_is_told_and_holds_nobody_up(tmp_path: Path) -> None:
+def test_full_failing_or_hanging_disk_is_reported_without_blocking(tmp_path: Path) -> None:
     free = [1 << 40]
     hang = threading.Event()
 
@@ -207,15 +196,15 @@ def test_a_disk_that_fills_fails_or_hangs_is_told_and_holds_nobody_up(tmp_path: 
 
     disk = DiskWatch(lambda: tmp_path, usage=usage, every=0.01)
     disk.start()
-    until(lambda: disk.free_bytes == 1 << 40)
+    wait_until(lambda: disk.free_bytes == 1 << 40)
     assert disk.alarm(monotonic_now()) is None
     free[0] = 2 << 30
-    until(lambda: "2.1 GB free" in str(disk.alarm(monotonic_now())))
+    wait_until(lambda: "2.1 GB free" in str(disk.alarm(monotonic_now())))
     free[0] = -1
-    until(lambda: "Input/output error" in str(disk.alarm(monotonic_now())))
+    wait_until(lambda: "Input/output error" in str(disk.alarm(monotonic_now())))
     free[0] = 0
     later = Instant(monotonic_now() + 60 * NS_PER_S)
-    until(lambda: "has not answered" in str(disk.alarm(later)))
+    wait_until(lambda: "has not answered" in str(disk.alarm(later)))
     disk.stop()
     hang.set()
 
@@ -223,13 +212,13 @@ def test_a_disk_that_fills_fails_or_hangs_is_told_and_holds_nobody_up(tmp_path: 
 # tactile health
 
 
-def test_health_of_a_rig_in_one_line(lab: Any, capsys: pytest.CaptureFixture) -> None:
+def test_health_summarises_a_rig(lab: Any, capsys: pytest.CaptureFixture) -> None:
     asked = ["health", "--connect", lab.endpoint, "--timeout", "20"]
     from tactile_tools.cli import main
 
     lab.boards("--pty", "board0", "--seed", "1", link="board0")
     lab.tactiled("--port", "board0", "--no-log")
-    until(lambda: main([*asked, "--board", "board0"]) == 0, 60)
+    wait_until(lambda: main([*asked, "--board", "board0"]) == 0, 60)
     capsys.readouterr()
     assert main([*asked, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -241,7 +230,7 @@ def test_health_of_a_rig_in_one_line(lab: Any, capsys: pytest.CaptureFixture) ->
     assert "CRITICAL: board other: nobody serves" in capsys.readouterr().out
 
 
-def test_health_where_nobody_is(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_health_without_daemons_fails(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     from tactile_tools.cli import main
 
     words = ["health", "--connect", f"unixsock-stream/{tmp_path}/x.sock", "--timeout", "0.3"]
@@ -268,14 +257,14 @@ GOOD = {"state": "streaming", "rate_hz": 100.0, "features_valid": True, "log": N
         ({"log": {"state": "recording"}}, health.HEALTHY, ""),
     ],
 )
-def test_what_is_wrong_with_a_board(change: dict[str, Any], level: int, said: str) -> None:
+def test_board_problems_are_described(change: dict[str, Any], level: int, said: str) -> None:
     part = health.Part("board", "b")
     health.JUDGES["tactile"](part, GOOD | change)
     assert part.level == level
     assert said in "; ".join(part.problems)
 
 
-def test_what_is_wrong_with_a_reach_and_an_arm() -> None:
+def test_reach_and_arm_problems_are_described() -> None:
     reach = health.Part("reach", "r")
     late = {"p99.9": 0.05}
     health.JUDGES["reach"](reach, {"state": "idle", "armed": False, "lateness_s": late})

@@ -74,7 +74,7 @@ def of(events: list[Any], kind: type) -> list[Any]:
         ("floats:5txyz", "floats:5txyz,end=crlf", ""),
     ],
 )
-def test_a_board_streams_that_is_plain_or_declared(
+def test_detected_or_declared_board_streams(
     board: str, sent: str, read: str | None, instant: At
 ) -> None:
     line = SerialLine("p", welcome, board)
@@ -106,7 +106,7 @@ def test_a_board_streams_that_is_plain_or_declared(
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("uart", [False, True])
-def test_what_is_not_plain_is_named_once_and_never_put_down_to_the_baud_rate(
+def test_ambiguous_layout_is_named_once_without_blaming_the_baud_rate(
     sent: str, words: str, board: str, uart: bool, instant: At
 ) -> None:
     line = SerialLine("/dev/ttyACM0", welcome)
@@ -128,14 +128,14 @@ def test_what_is_not_plain_is_named_once_and_never_put_down_to_the_baud_rate(
         [b""] * 800,
     ],
 )
-def test_on_usb_the_baud_rate_is_never_blamed(data: list[bytes], instant: At) -> None:
+def test_baud_rate_is_never_blamed_on_usb(data: list[bytes], instant: At) -> None:
     line = SerialLine("/dev/ttyACM0", welcome)
     line.connect(instant(0.0), byte_time=0.0)
     (diagnosed,) = of(play(line, instant, data), Diagnosed)
     assert "baud" not in diagnosed.problem + diagnosed.remedy
 
 
-def test_a_declared_board_is_not_second_guessed(instant: At) -> None:
+def test_declared_board_is_not_second_guessed(instant: At) -> None:
     """Twelve floats are four chips if the user says so, whatever they look like."""
     line = SerialLine("p", welcome, "floats:4xyz")
     line.connect(instant(0.0))
@@ -147,7 +147,7 @@ def test_a_declared_board_is_not_second_guessed(instant: At) -> None:
     assert of(events, Identified)[0].identity.shapes == ((1, 4),)
 
 
-def test_a_board_that_comes_back_with_other_firmware_is_read_again(instant: At) -> None:
+def test_board_with_changed_firmware_is_detected_again(instant: At) -> None:
     line = SerialLine("p", welcome)
     line.connect(instant(0.0))
     play(line, instant, frames("floats:5txyz,end=crlf", 200))
@@ -158,7 +158,7 @@ def test_a_board_that_comes_back_with_other_firmware_is_read_again(instant: At) 
     assert len(of(events, Sampled)) > 150
 
 
-def test_bytes_before_the_layout_was_known_are_counted(instant: At) -> None:
+def test_bytes_before_layout_detection_are_counted(instant: At) -> None:
     for board, sent in (("auto", "text:5xyzt"), ("floats:5xyz", "floats:5xyz,end=lf")):
         line = SerialLine("p", welcome, board)
         line.connect(instant(0.0))
@@ -168,7 +168,7 @@ def test_bytes_before_the_layout_was_known_are_counted(instant: At) -> None:
         assert lost > 0.5 * (len(data) - used - 10) * len(data[0])
 
 
-def test_a_slow_board_is_given_time(instant: At) -> None:
+def test_slow_board_is_given_time(instant: At) -> None:
     line = SerialLine("p", welcome)
     line.connect(instant(0.0))
     lines = [
@@ -180,12 +180,12 @@ def test_a_slow_board_is_given_time(instant: At) -> None:
 
 
 @pytest.mark.parametrize("text", ["skin", "floats", "floats:5", "auto:5xyz"])
-def test_a_kind_that_is_none_is_refused_with_those_there_are(text: str) -> None:
+def test_unknown_kind_lists_available_kinds(text: str) -> None:
     with pytest.raises(ValueError, match="floats:5xyz"):
         SerialLine("p", welcome, text)
 
 
-def test_boards_of_one_controller_are_arrays_of_their_own(instant: At) -> None:
+def test_boards_of_one_controller_are_separate_arrays(instant: At) -> None:
     """The link knows of one array; the calibration says how it is shared."""
     line = SerialLine("p", welcome)
     line.connect(instant(0.0))
@@ -206,7 +206,7 @@ def test_boards_of_one_controller_are_arrays_of_their_own(instant: At) -> None:
     assert parts[0].split((5, 5)) == (parts[0],)
 
 
-def test_arrays_whose_places_nobody_knows_lend_one_another_nothing(instant: At) -> None:
+def test_arrays_without_poses_share_no_ambient_field(instant: At) -> None:
     """A field that changes over both is taken off each by what it sees itself."""
     calibration = nominal("anyskin", "unknown", 10)
     assert not any(a.geometry.posed for a in calibration.arrays)
@@ -227,7 +227,7 @@ def test_arrays_whose_places_nobody_knows_lend_one_another_nothing(instant: At) 
     assert not any("borrowed" in reason for reason in reasons)
 
 
-def test_a_board_without_temperatures_has_forces(instant: At) -> None:
+def test_board_without_temperatures_has_forces(instant: At) -> None:
     line = SerialLine("p", welcome, "floats:5xyz")
     line.connect(instant(0.0))
     blocks = [

@@ -31,7 +31,7 @@ def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, s
     return code, told.out, told.err
 
 
-def test_names_in_the_arguments_are_those_there_are() -> None:
+def test_names_in_help_match_available_names() -> None:
     assert tuple(AXES) == AXIS_NAMES
     assert names.STRATEGIES == STRATEGIES
 
@@ -65,7 +65,7 @@ def test_names_in_the_arguments_are_those_there_are() -> None:
         (("compare", "nowhere", "elsewhere"), "nowhere is no folder of an experiment"),
     ],
 )
-def test_a_bad_argument_is_named_with_what_is_allowed(
+def test_bad_argument_is_named_with_allowed_values(
     words: tuple[str, ...],
     says: str,
     capsys: pytest.CaptureFixture[str],
@@ -79,7 +79,7 @@ def test_a_bad_argument_is_named_with_what_is_allowed(
     assert not list(tmp_path.iterdir()), "nothing is begun with a bad argument"
 
 
-def test_a_study_from_its_words_to_its_report(
+def test_study_runs_from_command_line_to_report(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -108,7 +108,7 @@ def test_a_study_from_its_words_to_its_report(
     assert "has rows 0 to 3" in error
 
 
-def test_a_row_that_comes_out_different_is_told(
+def test_rerun_with_a_different_row_is_reported(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, alone: Path
 ) -> None:
     (tmp_path / "experiment.json").write_bytes((alone / "experiment.json").read_bytes())
@@ -119,7 +119,7 @@ def test_a_row_that_comes_out_different_is_told(
     assert "ejected: 7 in the row, 0 now" in out
 
 
-def test_a_trial_by_its_columns_with_log_and_picture(
+def test_trial_is_rerun_from_its_columns_with_log_and_picture(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     log, png = tmp_path / "t.mcap", tmp_path / "t.png"
@@ -151,7 +151,7 @@ def test_comparing_runs_pairs_their_trials(
     assert head == "strategy,A [95 %],B [95 %],B − A [95 %],p,paired,same"
 
 
-def test_ctrl_c_keeps_what_is_finished(command: Command, tmp_path: Path) -> None:
+def test_ctrl_c_keeps_finished_trials(command: Command, tmp_path: Path) -> None:
     import signal
     import sys
     import time

@@ -63,7 +63,7 @@ def started() -> Iterator[Any]:
         yield made
 
 
-def test_two_dask_workers_give_the_rows_of_one_process(
+def test_two_dask_workers_give_the_same_rows_as_one_process(
     cluster: Any, study: Study, alone: Path, tmp_path: Path
 ) -> None:
     backend = DaskCluster(cluster.scheduler_address)
@@ -76,7 +76,7 @@ def test_two_dask_workers_give_the_rows_of_one_process(
     assert len({row["worker"] for row in rows}) == 2
 
 
-def test_a_trial_that_kills_its_worker_is_a_row_and_its_neighbours_are_not(
+def test_crashing_trial_is_recorded_without_affecting_others_on_dask(
     cluster: Any, options_of: Callable[..., Any], tmp_path: Path
 ) -> None:
     study = strategies_study(options_of(scenes=1), ("killer:Killer", "straight"))
@@ -86,7 +86,7 @@ def test_a_trial_that_kills_its_worker_is_a_row_and_its_neighbours_are_not(
     assert rows["straight"]["error"] is None
 
 
-def test_no_scheduler_says_where_and_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_scheduler_is_reported_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tactile_tools.experiments.dask_backend.CONNECT_S", 0.3)
     with (
         pytest.raises(BackendError, match=r"tcp://127\.0\.0\.1:1 .*start `dask scheduler`"),

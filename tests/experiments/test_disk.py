@@ -35,7 +35,7 @@ def rows(alone: Path) -> list[Row]:
     return list(parse_lines((alone / "trials.jsonl").read_bytes())[0].values())
 
 
-def test_a_folder_of_another_experiment_is_refused_by_what_differs(
+def test_folder_of_another_experiment_is_refused_naming_the_difference(
     study: Study, alone: Path, options_of: Callable[..., Any], run_of: Run
 ) -> None:
     other = strategies_study(options_of(scenes=2), ("straight",))
@@ -50,14 +50,14 @@ def test_a_folder_of_another_experiment_is_refused_by_what_differs(
     assert (alone / "trials.jsonl").read_bytes() == before
 
 
-def test_a_folder_with_other_files_is_left_alone(study: Study, tmp_path: Path) -> None:
+def test_folder_with_other_files_is_left_alone(study: Study, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(FolderError, match=r"not empty \(it has thesis.tex\)"):
         Journal(tmp_path, study.definition)
     assert sorted(p.name for p in tmp_path.iterdir()) == [".lock", "thesis.tex"]
 
 
-def test_a_folder_in_use_is_refused(study: Study, tmp_path: Path) -> None:
+def test_folder_in_use_is_refused(study: Study, tmp_path: Path) -> None:
     with (
         Journal(tmp_path / "run", study.definition),
         pytest.raises(FolderError, match="another run is writing"),
@@ -67,13 +67,13 @@ def test_a_folder_in_use_is_refused(study: Study, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"format": 99}', '{"format": 1}'])
-def test_a_damaged_definition_is_refused(text: str, study: Study, tmp_path: Path) -> None:
+def test_damaged_definition_is_refused(text: str, study: Study, tmp_path: Path) -> None:
     (tmp_path / "experiment.json").write_text(text)
     with pytest.raises(FolderError):
         Journal(tmp_path, study.definition)
 
 
-def test_a_disk_that_fills_up_keeps_what_was_finished(
+def test_full_disk_keeps_finished_trials(
     study: Study, alone: Path, run_of: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real, left = os.write, 3
@@ -100,7 +100,7 @@ def test_a_disk_that_fills_up_keeps_what_was_finished(
     ]
 
 
-def test_a_full_disk_while_the_tables_are_written_leaves_the_old_ones(
+def test_full_disk_while_writing_tables_keeps_the_old_ones(
     study: Study, alone: Path, run_of: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = (alone / "trials.parquet").read_bytes()
@@ -132,7 +132,7 @@ with Journal(folder, {"study": "x"}) as journal:
 """
 
 
-def test_a_real_short_write_leaves_whole_lines(alone: Path, tmp_path: Path) -> None:
+def test_short_write_leaves_whole_lines(alone: Path, tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", LIMITED, str(tmp_path / "run"), str(alone / "trials.jsonl")],
         capture_output=True,
@@ -146,15 +146,13 @@ def test_a_real_short_write_leaves_whole_lines(alone: Path, tmp_path: Path) -> N
     assert 1 <= len(found) < 9
 
 
-def test_a_folder_that_may_not_be_made_says_so(study: Study, tmp_path: Path) -> None:
+def test_folder_that_cannot_be_created_is_reported(study: Study, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(DiskError, match="cannot write to"):
         Journal(tmp_path / "file" / "run", study.definition)
 
 
-def test_a_run_killed_before_it_had_a_definition_can_be_begun_again(
-    study: Study, tmp_path: Path
-) -> None:
+def test_run_killed_before_its_definition_can_be_restarted(study: Study, tmp_path: Path) -> None:
     (tmp_path / ".lock").touch()
     (tmp_path / "experiment.json.part").write_text("{")
     with Journal(tmp_path, study.definition) as journal:
@@ -163,7 +161,7 @@ def test_a_run_killed_before_it_had_a_definition_can_be_begun_again(
 
 @QUICK
 @given(data=st.data())
-def test_a_journal_cut_off_anywhere_keeps_its_whole_lines(rows: list[Row], data: Any) -> None:
+def test_truncated_journal_keeps_its_whole_lines(rows: list[Row], data: Any) -> None:
     whole = b"".join(json.dumps(row).encode() + b"\n" for row in rows)
     cut = whole[: data.draw(st.integers(0, len(whole)))]
     found, damaged = parse_lines(cut)
@@ -173,7 +171,7 @@ def test_a_journal_cut_off_anywhere_keeps_its_whole_lines(rows: list[Row], data:
 
 @QUICK
 @given(data=st.data())
-def test_a_damaged_journal_never_makes_up_a_trial(rows: list[Row], data: Any) -> None:
+def test_damaged_journal_never_invents_a_trial(rows: list[Row], data: Any) -> None:
     lines = [json.dumps(row).encode() + b"\n" for row in rows]
     hit = data.draw(st.integers(0, len(lines) - 1))
     at = data.draw(st.integers(0, len(lines[hit]) - 1))
@@ -186,7 +184,7 @@ def test_a_damaged_journal_never_makes_up_a_trial(rows: list[Row], data: Any) ->
     assert all(row in found.values() for row in kept)
 
 
-def test_lines_that_are_no_trials_are_counted(rows: list[Row]) -> None:
+def test_lines_that_are_not_trials_are_counted(rows: list[Row]) -> None:
     lines = [
         b"null\n",
         b'{"source": "hardware"}\n',
@@ -198,13 +196,13 @@ def test_lines_that_are_no_trials_are_counted(rows: list[Row]) -> None:
     assert parse_lines(b"") == ({}, 0)
 
 
-def test_a_row_of_the_wrong_kind_is_no_trial(rows: list[Row]) -> None:
+def test_row_of_the_wrong_type_is_not_a_trial(rows: list[Row]) -> None:
     wrong = {**rows[0], "distance_m": "near"}
     assert parse_lines(json.dumps(wrong).encode() + b"\n")[1] == 1
     wrong = {k: v for k, v in rows[0].items() if k != "ejected"}
     assert parse_lines(json.dumps(wrong).encode() + b"\n")[1] == 1
 
 
-def test_specifications_of_equal_values_are_equal_trials(study: Study) -> None:
+def test_equal_specifications_are_equal_trials(study: Study) -> None:
     spec = study.specs[0]
     assert replace(spec) in {spec}

@@ -92,7 +92,7 @@ def told(document: Document) -> str:
     return "\n".join(f for s in document.sections for f in s.findings)
 
 
-def test_what_the_paper_found_is_found_in_rows_like_its_own(filled: Filled, tmp_path: Path) -> None:
+def test_findings_of_the_paper_are_found_in_similar_rows(filled: Filled, tmp_path: Path) -> None:
     run = filled(strategies_study(options()), tmp_path / "run", like_the_paper)
     text = told(build(load_run(run)))
     assert re.search(r"distance to the goal.* significantly worse than each of them", text)
@@ -105,7 +105,7 @@ def test_what_the_paper_found_is_found_in_rows_like_its_own(filled: Filled, tmp_
     assert "touch disturbs less" in text
 
 
-def test_the_opposite_is_found_in_opposite_rows(filled: Filled, tmp_path: Path) -> None:
+def test_opposite_findings_are_found_in_opposite_rows(filled: Filled, tmp_path: Path) -> None:
     def reverse(spec: TrialSpec, rng: Rng) -> dict[str, Any]:
         share = {"straight": 0.9, "hybrid_event": 0.05}.get(spec.strategy, 0.5)
         return ends(spec.scene_seed < round(100 * share), spec.strategy, rng)
@@ -118,9 +118,7 @@ def test_the_opposite_is_found_in_opposite_rows(filled: Filled, tmp_path: Path) 
     assert re.search(r"Significantly different .*straight \(90 %, above its 22 %", text)
 
 
-def test_the_page_needs_nothing_else_and_its_tables_come_first(
-    filled: Filled, tmp_path: Path
-) -> None:
+def test_report_page_is_self_contained_with_tables_first(filled: Filled, tmp_path: Path) -> None:
     run = filled(strategies_study(options(scenes=30)), tmp_path / "run", like_the_paper)
     path = write_report(run, tmp_path / "out")
     page = path.read_text()
@@ -138,12 +136,12 @@ def test_the_page_needs_nothing_else_and_its_tables_come_first(
     assert sum(p.stat().st_size for p in path.parent.iterdir()) < 1_000_000
 
 
-def test_one_trial_a_strategy_is_enough_for_a_report(filled: Filled, tmp_path: Path) -> None:
+def test_one_trial_per_strategy_is_enough_for_a_report(filled: Filled, tmp_path: Path) -> None:
     run = filled(strategies_study(options(scenes=1)), tmp_path / "run", like_the_paper)
     assert write_report(run, run).exists()
 
 
-def test_an_unfinished_run_says_so(filled: Filled, tmp_path: Path) -> None:
+def test_unfinished_run_is_marked(filled: Filled, tmp_path: Path) -> None:
     run = filled(strategies_study(options(scenes=4)), tmp_path / "run", like_the_paper)
     lines = (run / "trials.jsonl").read_bytes().splitlines(keepends=True)
     (run / "trials.jsonl").write_bytes(b"".join(lines[:12]))
@@ -153,7 +151,7 @@ def test_an_unfinished_run_says_so(filled: Filled, tmp_path: Path) -> None:
         build(load_run(run))
 
 
-def test_trials_that_failed_are_told_and_count_for_nothing(filled: Filled, tmp_path: Path) -> None:
+def test_failed_trials_are_reported_and_excluded(filled: Filled, tmp_path: Path) -> None:
     def half(spec: TrialSpec, rng: Rng) -> dict[str, Any]:
         if spec.scene_seed % 2:
             return {"error": "WorldError: <physics> gave up", "success": None}
@@ -166,7 +164,7 @@ def test_trials_that_failed_are_told_and_count_for_nothing(filled: Filled, tmp_p
     assert "100\u00a0% [57, 100]" in page
 
 
-def test_groups_are_told_apart(filled: Filled, tmp_path: Path) -> None:
+def test_groups_are_reported_separately(filled: Filled, tmp_path: Path) -> None:
     both = options(scenes=6, depths=("contacts", "taxels"))
     run = filled(strategies_study(both), tmp_path / "run", like_the_paper)
     document = build(load_run(run))
@@ -185,9 +183,7 @@ def test_groups_are_told_apart(filled: Filled, tmp_path: Path) -> None:
     assert len(values.rows) == 5
 
 
-def test_a_run_that_was_put_by_can_be_reported_and_run_again(
-    filled: Filled, tmp_path: Path
-) -> None:
+def test_archived_run_can_be_reported_and_rerun(filled: Filled, tmp_path: Path) -> None:
     run = filled(strategies_study(options(scenes=30)), tmp_path / "run", like_the_paper)
     first = write_report(run, tmp_path / "put", rows=True)
     assert {"experiment.json", "trials.parquet"} <= {p.name for p in first.parent.iterdir()}
@@ -197,7 +193,7 @@ def test_a_run_that_was_put_by_can_be_reported_and_run_again(
     assert sum(p.stat().st_size for p in first.parent.iterdir()) < 1_000_000
 
 
-def test_the_sweep_is_smoothed_and_judged(filled: Filled, tmp_path: Path) -> None:
+def test_sweep_is_smoothed_and_judged(filled: Filled, tmp_path: Path) -> None:
     def surface(spec: TrialSpec, rng: Rng) -> dict[str, Any]:
         if spec.strategy == "straight":
             return {"normalized_distance": 0.1, "normalized_time": 0.8, "success": False}
@@ -226,7 +222,7 @@ def test_the_sweep_is_smoothed_and_judged(filled: Filled, tmp_path: Path) -> Non
     assert "The least success of a setting is 100 %" in text
 
 
-def test_smoothing_passes_over_cells_that_are_missing() -> None:
+def test_smoothing_skips_missing_cells() -> None:
     values = np.full((10, 10), 2.0)
     values[4, 4] = np.nan
     smooth = report_sweep.smoothed(values)
@@ -235,7 +231,7 @@ def test_smoothing_passes_over_cells_that_are_missing() -> None:
     assert np.nanmax(smooth) == pytest.approx(2.0)
 
 
-def test_a_sweep_hardly_begun_can_be_reported(filled: Filled, tmp_path: Path) -> None:
+def test_barely_started_sweep_can_be_reported(filled: Filled, tmp_path: Path) -> None:
     study = sweep_study(options(scenes=1), ("burrow", "excavate"), ("rad", "hz"))
     run = filled(study, tmp_path / "run", lambda spec, rng: {"success": True})
     lines = (run / "trials.jsonl").read_bytes().splitlines(keepends=True)
@@ -243,7 +239,7 @@ def test_a_sweep_hardly_begun_can_be_reported(filled: Filled, tmp_path: Path) ->
     assert write_report(run, tmp_path / "out").exists()
 
 
-def test_robustness_says_where_a_conclusion_flips(filled: Filled, tmp_path: Path) -> None:
+def test_robustness_report_says_where_a_conclusion_flips(filled: Filled, tmp_path: Path) -> None:
     def outcome(spec: TrialSpec, rng: Rng) -> dict[str, Any]:
         crowded = "30" in spec.conditions
         if spec.strategy == "burrow":
@@ -273,7 +269,7 @@ def test_robustness_says_where_a_conclusion_flips(filled: Filled, tmp_path: Path
     assert [p.name for p in document.sections[0].pictures] == ["density"]
 
 
-def test_runs_that_share_no_scene_are_compared_unpaired(filled: Filled, tmp_path: Path) -> None:
+def test_runs_without_common_scenes_are_compared_unpaired(filled: Filled, tmp_path: Path) -> None:
     a = filled(strategies_study(options(scenes=20)), tmp_path / "a", like_the_paper)
     other = strategies_study(options(scenes=20, seed=50))
     b = filled(other, tmp_path / "b", like_the_paper)
@@ -283,7 +279,7 @@ def test_runs_that_share_no_scene_are_compared_unpaired(filled: Filled, tmp_path
     assert not values.rows
 
 
-def test_sets_are_compared_on_their_own_terms(filled: Filled, tmp_path: Path) -> None:
+def test_parameter_sets_are_compared_separately(filled: Filled, tmp_path: Path) -> None:
     study = strategies_study(options(scenes=20))
     slower = strategies_study(options(scenes=20, parameters={"time_limit": 30}))
     a = filled(study, tmp_path / "a", like_the_paper)
@@ -298,11 +294,11 @@ def test_sets_are_compared_on_their_own_terms(filled: Filled, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("p", "text"), [(0.5, "0.50"), (0.031, "0.031"), (0.0042, "0.0042"), (1e-9, "< 0.0001")]
 )
-def test_p_values_are_told_as_they_are_read(p: float, text: str) -> None:
+def test_p_values_are_formatted_readably(p: float, text: str) -> None:
     assert shown_p(p) == text
 
 
-def test_signs_stay_with_their_numbers() -> None:
+def test_minus_signs_stay_with_their_numbers() -> None:
     assert typeset("61 % (p = 0.03)") == "61\u00a0% (p\u00a0=\u00a00.03)"
     assert typeset("-8 [-20, +2] of t-test 12-16") == "−8 [−20, +2] of t-test 12-16"
 

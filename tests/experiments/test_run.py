@@ -29,7 +29,7 @@ def outcomes(folder: Path) -> list[Row]:
     return [outcome_of(row) for row in read_table(folder / "trials.parquet")]
 
 
-def test_two_workers_give_the_rows_of_one(
+def test_two_workers_give_the_same_rows_as_one(
     study: Study, alone: Path, run_of: Run, tmp_path: Path
 ) -> None:
     summary = run_of(study, tmp_path / "two", jobs=2)
@@ -45,7 +45,7 @@ def test_two_workers_give_the_rows_of_one(
     assert all(row["memory_mb"] > 10 and row["cpu_s"] > 0 for row in table)
 
 
-def test_the_csv_is_the_same_table(alone: Path) -> None:
+def test_csv_holds_the_same_table(alone: Path) -> None:
     import csv
 
     with (alone / "trials.csv").open(newline="") as stream:
@@ -56,7 +56,7 @@ def test_the_csv_is_the_same_table(alone: Path) -> None:
     assert all(t["error"] == "" for t in texts)
 
 
-def test_a_run_grows_by_scenes_and_strategies_and_keeps_what_is_finished(
+def test_extended_run_keeps_finished_trials(
     study: Study, alone: Path, run_of: Run, options_of: Callable[..., Any], tmp_path: Path
 ) -> None:
     folder = tmp_path / "grown"
@@ -69,7 +69,7 @@ def test_a_run_grows_by_scenes_and_strategies_and_keeps_what_is_finished(
 
 
 @pytest.mark.random
-def test_a_run_killed_at_a_random_moment_and_resumed_gives_the_table_of_one_left_alone(
+def test_run_killed_at_random_and_resumed_gives_the_same_table(
     alone: Path, run_of: Run, study: Study, tmp_path: Path, fresh_seed: int
 ) -> None:
     folder = tmp_path / "killed"
@@ -113,7 +113,7 @@ def finished(journal: Path) -> int:
     return len(parse_lines(journal.read_bytes())[0]) if journal.exists() else 0
 
 
-def test_a_finished_run_runs_nothing_again(
+def test_finished_run_reruns_nothing(
     study: Study, run_of: Run, alone: Path, tmp_path: Path
 ) -> None:
     before = (alone / "trials.jsonl").read_bytes()
@@ -122,7 +122,7 @@ def test_a_finished_run_runs_nothing_again(
     assert (alone / "trials.jsonl").read_bytes() == before
 
 
-def test_a_scene_that_cannot_be_made_is_a_row(
+def test_scene_that_cannot_be_made_is_a_failed_row(
     options_of: Callable[..., Any], run_of: Run, tmp_path: Path
 ) -> None:
     study = strategies_study(options_of(scenes=1), ("straight",))
@@ -159,7 +159,7 @@ class Killer:
 """
 
 
-def test_a_trial_that_kills_its_worker_is_a_row_and_the_others_go_on(
+def test_crashing_trial_is_a_failed_row_and_others_continue(
     options_of: Callable[..., Any],
     run_of: Run,
     tmp_path: Path,
@@ -179,7 +179,7 @@ def test_a_trial_that_kills_its_worker_is_a_row_and_the_others_go_on(
     assert (summary["trials"], summary["errors"]) == (2, 1)
 
 
-def test_torn_and_damaged_lines_are_trials_to_run_again(
+def test_torn_and_damaged_lines_are_rerun(
     study: Study, alone: Path, run_of: Run, tmp_path: Path
 ) -> None:
     folder = tmp_path / "torn"
@@ -198,7 +198,7 @@ def test_torn_and_damaged_lines_are_trials_to_run_again(
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "pymunk"])
-def test_a_row_is_the_same_in_a_process_that_has_run_others(
+def test_row_is_independent_of_earlier_trials_in_the_process(
     engine: str, options_of: Callable[..., Any]
 ) -> None:
     from tactile_tools.experiments.trial import run_one
@@ -211,14 +211,14 @@ def test_a_row_is_the_same_in_a_process_that_has_run_others(
     assert row["peak_load_n"] > 0
 
 
-def test_the_rows_of_a_run_are_those_of_its_study(alone: Path, study: Study) -> None:
+def test_run_has_exactly_the_rows_of_its_study(alone: Path, study: Study) -> None:
     run = load_run(alone)
     assert {spec_of(row) for row in run.rows} == set(study.specs)
     assert run.missing == 0
     assert run.study == study
 
 
-def test_workers_have_one_thread_each_and_the_parent_keeps_its_own_way(
+def test_workers_are_single_threaded_and_the_parent_is_unchanged(
     study: Study, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from tactile_tools.experiments import backends
@@ -237,7 +237,7 @@ def test_workers_have_one_thread_each_and_the_parent_keeps_its_own_way(
         worker.end()
 
 
-def test_batches_hold_one_scene_each() -> None:
+def test_each_batch_holds_one_scene() -> None:
     from tactile_tools.experiments.backends import batches
 
     specs = [

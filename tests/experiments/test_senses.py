@@ -53,13 +53,13 @@ def contacts_sense(**changed: Any) -> DegradedContacts:
     return DegradedContacts(3, **{**settings, **changed})
 
 
-def test_nothing_changed_needs_no_sense_of_its_own() -> None:
+def test_unchanged_condition_uses_plain_touch() -> None:
     assert sense_of(spec(), scene_of(spec())) is None
     crowded = spec(friction_all=0.3)
     assert sense_of(crowded, scene_of(crowded)) is None
 
 
-def test_noise_has_its_standard_deviation_and_no_force_is_negative() -> None:
+def test_noise_has_its_standard_deviation_and_forces_stay_positive() -> None:
     sense = contacts_sense(noise=0.5)
     world: Any = Pressed(press(0.05, 0.0285, 8.0))
     felt = [sense.feel(world, after(START, 0.01 * i)) for i in range(2000)]
@@ -71,7 +71,7 @@ def test_noise_has_its_standard_deviation_and_no_force_is_negative() -> None:
     assert min(t.peak_force for t in empty if t is not None) == 0.0
 
 
-def test_a_slow_stream_renews_touch_at_its_rate_and_tells_its_age() -> None:
+def test_slow_stream_renews_touch_at_its_rate_with_its_age() -> None:
     sense = contacts_sense(rate=15.0)
     stamps = []
     for i in range(200):
@@ -84,13 +84,13 @@ def test_a_slow_stream_renews_touch_at_its_rate_and_tells_its_age() -> None:
     assert len(set(stamps)) == pytest.approx(2.0 * 15, abs=1)
 
 
-def test_the_gate_waits_for_a_stream_that_is_known_to_be_slow() -> None:
+def test_gate_tolerates_a_stream_known_to_be_slow() -> None:
     safety = parameters_of(spec(feature_rate=5.0)).safety
     assert safety.features_age == pytest.approx(0.6)
     assert parameters_of(spec(feature_rate=50.0)).safety == parameters_of(spec()).safety
 
 
-def test_dead_taxels_are_that_fraction_and_grow_from_one_another() -> None:
+def test_dead_taxels_match_the_fraction_and_are_nested() -> None:
     few, more = dead_taxels(3, 0.1), dead_taxels(3, 0.4)
     assert len(few) == 8
     assert len(more) == 32
@@ -98,7 +98,7 @@ def test_dead_taxels_are_that_fraction_and_grow_from_one_another() -> None:
     assert set(few) != set(dead_taxels(4, 0.1))
 
 
-def test_a_contact_is_felt_as_its_column_is_alive() -> None:
+def test_contact_is_felt_only_if_its_column_is_alive() -> None:
     world: Any = Pressed(*(press(0.02 + 0.01 * i, 0.0285, 4.0) for i in range(10)))
     whole = contacts_sense().feel(world, START)
     half = contacts_sense(dead=0.5).feel(world, START)
@@ -112,7 +112,7 @@ def test_a_contact_is_felt_as_its_column_is_alive() -> None:
 
 
 @pytest.mark.parametrize("stretch", [0.7, 1.3])
-def test_a_stretched_finger_feels_the_same_forces_at_its_own_width(stretch: float) -> None:
+def test_wider_finger_feels_the_same_forces_at_its_width(stretch: float) -> None:
     y = 0.0285 * stretch
     slope = math.radians(14.0)
     pressed = FingerContact(
@@ -132,7 +132,7 @@ def test_a_stretched_finger_feels_the_same_forces_at_its_own_width(stretch: floa
 
 @pytest.mark.parametrize("width", [0.04, 0.075])
 @pytest.mark.parametrize("engine", ["mujoco", "pymunk"])
-def test_objects_meet_the_finger_at_its_width(width: float, engine: str) -> None:
+def test_objects_touch_the_finger_at_its_width(width: float, engine: str) -> None:
     from dataclasses import replace
 
     from sim_device.world.scenes import Pose, SceneObject, Shape
@@ -150,7 +150,7 @@ def test_objects_meet_the_finger_at_its_width(width: float, engine: str) -> None
     assert all(y == pytest.approx(width / 2, abs=1e-3) for y in touched)
 
 
-def test_every_condition_changes_what_happens_and_repeats_to_the_bit() -> None:
+def test_every_condition_has_an_effect_and_repeats_bit_for_bit() -> None:
     from tactile_tools.experiments.rows import outcome_of
 
     plain = run_one(spec(seconds=4.0))
@@ -166,7 +166,7 @@ def test_every_condition_changes_what_happens_and_repeats_to_the_bit() -> None:
         assert outcome_of(run_one(spec(seconds=4.0, **changed))) == outcome_of(row)
 
 
-def test_a_worse_board_is_felt_through_the_whole_chain() -> None:
+def test_degraded_board_affects_the_whole_chain() -> None:
     from tactile_tools.experiments.rows import outcome_of
 
     conditions = {"noise": 0.1, "dead_taxels": 0.1, "feature_rate": 10.0}
@@ -178,7 +178,7 @@ def test_a_worse_board_is_felt_through_the_whole_chain() -> None:
     assert outcome_of(run_one(spec("taxels", 4.0, **conditions))) == outcome_of(worse)
 
 
-def test_a_board_with_dead_taxels_flags_them() -> None:
+def test_board_flags_its_dead_taxels() -> None:
     bad = spec("taxels", dead_taxels=0.1)
     scene = scene_of(bad)
     sense = sense_of(bad, scene)

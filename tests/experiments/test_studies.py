@@ -27,7 +27,7 @@ from tactile_tools.experiments.studies import (
 OptionsOf = Callable[..., Any]
 
 
-def test_strategies_are_crossed_with_all_that_is_asked_for(options_of: OptionsOf) -> None:
+def test_strategies_are_crossed_with_all_options(options_of: OptionsOf) -> None:
     options = options_of(
         scenes=3,
         sets=("authors_sim", "hardware"),
@@ -41,7 +41,7 @@ def test_strategies_are_crossed_with_all_that_is_asked_for(options_of: OptionsOf
     assert [s.scene_seed for s in specs] == sorted(s.scene_seed for s in specs)
 
 
-def test_the_sweep_is_the_papers(options_of: OptionsOf) -> None:
+def test_sweep_is_that_of_the_paper(options_of: OptionsOf) -> None:
     options = options_of(scenes=2, sets=("authors_sim",), parameters={})
     study = sweep_study(options, ("burrow", "excavate"), ("rad", "hz"))
     assert len(study.specs) == 2 * (1 + 3 * 100)
@@ -64,7 +64,7 @@ def test_the_sweep_is_the_papers(options_of: OptionsOf) -> None:
 
 
 @pytest.mark.parametrize("set_name", ["authors_sim", "hardware"])
-def test_every_axis_has_the_sets_own_value_or_its_like_and_can_be_run(set_name: str) -> None:
+def test_every_axis_includes_the_default_and_can_be_run(set_name: str) -> None:
     for name in AXES:
         levels = levels_of(name, set_name)
         assert len(levels) >= 4
@@ -80,7 +80,7 @@ def test_every_axis_has_the_sets_own_value_or_its_like_and_can_be_run(set_name: 
                 world_of(spec, scene_of(spec))
 
 
-def test_levels_that_are_the_sets_own_are_run_once(options_of: OptionsOf) -> None:
+def test_default_levels_are_run_once(options_of: OptionsOf) -> None:
     options = options_of(scenes=1, sets=("authors_sim",), parameters={})
     whole = robustness_study(options, STRATEGIES)
     apart = sum(len(levels_of(axis, "authors_sim")) for axis in AXES) * len(STRATEGIES)
@@ -90,7 +90,7 @@ def test_levels_that_are_the_sets_own_are_run_once(options_of: OptionsOf) -> Non
     assert any(level.nominal for level in levels_of("density", "authors_sim"))
 
 
-def test_a_definition_gives_its_study_again(options_of: OptionsOf, tmp_path: Path) -> None:
+def test_definition_round_trips_to_its_study(options_of: OptionsOf, tmp_path: Path) -> None:
     options = options_of(scenes=2)
     for study in (
         strategies_study(options),
@@ -103,12 +103,12 @@ def test_a_definition_gives_its_study_again(options_of: OptionsOf, tmp_path: Pat
         assert found == options
 
 
-def test_a_study_of_nothing_is_refused() -> None:
+def test_empty_study_is_refused() -> None:
     with pytest.raises(StudyError, match="no trials"):
         check(Study({}, ()))
 
 
-def test_conditions_survive_their_text() -> None:
+def test_conditions_round_trip_through_text() -> None:
     conditions = Conditions(objects=(12, 16), noise=0.25, finger_width=0.05)
     assert Conditions.from_json(conditions.to_json()) == conditions
     assert Conditions().to_json() == "{}"
@@ -116,7 +116,7 @@ def test_conditions_survive_their_text() -> None:
         Conditions(objects=(20, 10))
 
 
-def test_speed_is_told_as_the_issue_counts_it(study: Study, made_row: Callable[..., Any]) -> None:
+def test_throughput_is_reported(study: Study, made_row: Callable[..., Any]) -> None:
     # 0.2 CPU-s for 20 simulated seconds is 0.01: thirty times faster than 0.30.
     rows = [made_row(spec) for spec in study.specs]
     summary = summarize(rows)
@@ -126,7 +126,7 @@ def test_speed_is_told_as_the_issue_counts_it(study: Study, made_row: Callable[.
     assert summarize(rows)["errors"] == 1
 
 
-def test_memory_that_grows_is_seen(study: Study, made_row: Callable[..., Any]) -> None:
+def test_growing_memory_is_detected(study: Study, made_row: Callable[..., Any]) -> None:
     spec = study.specs[0]
     flat = [made_row(spec, worker="a", worker_trials=i, memory_mb=80.0) for i in range(1, 400)]
     leak = [

@@ -9,12 +9,9 @@ import pytest
 
 from sensor_proto.can_transfers import CanFrame
 from sim_device.ports import PtyPort, SlcanPort
-from tactile_core.types import monotonic_now
-from tactiled.blocks import Chunk
+from support.slcan_adapter import AdapterThread
+from support.waiting import PATIENCE_S
 from tactiled.transports.base import Transport
-
-SLOW = 60.0
-"""s that anything may take on a busy machine before a test gives it up."""
 
 
 @pytest.fixture
@@ -23,42 +20,6 @@ def pty(tmp_path: Path) -> Iterator[PtyPort]:
     port.open()
     yield port
     port.close()
-
-
-class AdapterThread:
-    """A simulated slcan adapter that serves its port until it is stopped."""
-
-    def __init__(self, port: SlcanPort) -> None:
-        self.port = port
-        self.received: list[CanFrame] = []
-        self._to_send: list[tuple[CanFrame, ...]] = []
-        self._bus_off: bool | None = None
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        port.open()
-        self._thread.start()
-
-    def send(self, *frames: CanFrame) -> None:
-        self._to_send.append(frames)
-
-    def set_bus_off(self, fault: bool) -> None:
-        self._bus_off = fault
-
-    def stop(self) -> None:
-        self._stop.set()
-        self._thread.join()
-        self.port.close()
-
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            self.received += self.port.receive()
-            fault, self._bus_off = self._bus_off, None
-            if fault is not None:
-                self.port.set_bus_off(fault)
-            while self._to_send and self.port.adapter.is_open:
-                self.port.send(self._to_send.pop(0), monotonic_now())
-            self.port.flush(monotonic_now())
-            time.sleep(0.001)
 
 
 @pytest.fixture
@@ -82,7 +43,7 @@ def adapter_of(tmp_path: Path) -> Iterator[Callable[[str], AdapterThread]]:
         thread.stop()
 
 
-def read_payload(transport: Transport, wanted: int, seconds: float = SLOW) -> bytes:
+def read_payload(transport: Transport, wanted: int, seconds: float = PATIENCE_S) -> bytes:
     """``wanted`` bytes, or what came in ``seconds``."""
     data = b""
     end = time.monotonic() + seconds
@@ -94,7 +55,7 @@ def read_payload(transport: Transport, wanted: int, seconds: float = SLOW) -> by
     return data
 
 
-def read_frames(transport: Transport, wanted: int, seconds: float = SLOW) -> list[CanFrame]:
+def read_frames(transport: Transport, wanted: int, seconds: float = PATIENCE_S) -> list[CanFrame]:
     """``wanted`` frames, or what came in ``seconds``."""
     frames: list[CanFrame] = []
     end = time.monotonic() + seconds
@@ -106,16 +67,6 @@ def read_frames(transport: Transport, wanted: int, seconds: float = SLOW) -> lis
     return frames
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = SLOW) -> bool:
-    """Whether ``condition`` came true within ``seconds``."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if condition():
-            return True
-        time.sleep(0.005)
-    return condition()
-
-
 @pytest.fixture
 def read_bytes() -> Callable[..., bytes]:
     return read_payload
@@ -124,11 +75,6 @@ def read_bytes() -> Callable[..., bytes]:
 @pytest.fixture
 def read_can() -> Callable[..., list[CanFrame]]:
     return read_frames
-
-
-@pytest.fixture
-def eventually() -> Callable[..., bool]:
-    return wait_for
 
 
 @pytest.fixture
@@ -167,8 +113,5 @@ class Outcome:
         return not self._thread.is_alive()
 
     def join(self) -> None:
-        self._thread.join(SLOW)
+        self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive()
-
-
-__all__ = ["AdapterThread", "Chunk", "Outcome"]

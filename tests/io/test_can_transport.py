@@ -15,6 +15,7 @@ from sensor_proto.can_transfers import BusState, CanDecoder, CanEncoder, CanFram
 from sensor_proto.packets import ClockReply
 from sim_device.board.slcan_adapter import DIALECTS
 from sim_device.ports import PtyPort, VirtualCanPort
+from support.waiting import becomes_true
 from tactile_core.can_bus import CanSpec, can_links
 from tactile_core.types import monotonic_now
 from tactiled.transports import PortBusy, PortClosed, PortGone, PortMissing, PortUnsuitable
@@ -42,31 +43,31 @@ def transport(adapter: Any) -> Any:
         ("virtual:0+fd", CanSpec("virtual", "0", fd=True)),
     ],
 )  # fmt: skip
-def test_buses_are_written_as_the_readme_says(text: str, spec: CanSpec) -> None:
+def test_bus_specs_of_the_readme_are_accepted(text: str, spec: CanSpec) -> None:
     assert CanSpec.parse(text) == spec
     assert str(spec) == text
 
 
 @pytest.mark.parametrize("text", ["", "can0", "socketcan:", ":can0", "slcan:/dev/x@fast",
                                   "slcan:/dev/x@0", "virtual:0+FD", "slcan:/dev/x@-5"])  # fmt: skip
-def test_what_is_no_bus_is_refused_with_the_allowed_form(text: str) -> None:
+def test_invalid_bus_is_refused_with_expected_form(text: str) -> None:
     with pytest.raises(ValueError, match="allowed"):
         CanTransport(text)
 
 
 def test_frames_go_through_a_real_terminal_in_both_directions(
-    adapter: Any, transport: CanTransport, read_can: Callable[..., list[CanFrame]], eventually: Any
+    adapter: Any, transport: CanTransport, read_can: Callable[..., list[CanFrame]]
 ) -> None:
     adapter.send(*FRAMES)
     assert read_can(transport, len(FRAMES)) == FRAMES
     transport.write(tuple(FRAMES))
-    assert eventually(lambda: len(adapter.received) >= len(FRAMES))
+    assert becomes_true(lambda: len(adapter.received) >= len(FRAMES))
     assert adapter.received == FRAMES
     assert transport.losses == {}
     assert transport.state is BusState.ACTIVE
 
 
-def test_a_message_survives_the_bus_whole(adapter: Any, transport: Any, read_can: Any) -> None:
+def test_message_crosses_the_bus_intact(adapter: Any, transport: Any, read_can: Any) -> None:
     reply = ClockReply(7, 123456, 123999)
     frames = CanEncoder(5, fd=False).encode(reply)
     adapter.send(*frames)
@@ -75,21 +76,19 @@ def test_a_message_survives_the_bus_whole(adapter: Any, transport: Any, read_can
     assert received.board == 5
 
 
-def test_fd_frames_go_through_a_bus_opened_for_them(
-    adapter: Any, read_can: Any, eventually: Any
-) -> None:
+def test_fd_frames_go_through_a_bus_opened_for_them(adapter: Any, read_can: Any) -> None:
     transport = CanTransport(f"slcan:{adapter.port.pty.link}@1000000/5000000+fd")
     transport.open()
     frame = CanFrame(0x1FFFFFFF, bytes(range(64)), fd=True)
     adapter.send(frame)
     assert read_can(transport, 1) == [frame]
     transport.write((frame,))
-    assert eventually(lambda: adapter.received == [frame])
+    assert becomes_true(lambda: adapter.received == [frame])
     assert adapter.port.adapter.data_bitrate == 5_000_000
     transport.close()
 
 
-def test_misuse_is_refused_here_and_not_on_the_wire(transport: CanTransport) -> None:
+def test_misuse_is_refused_locally(transport: CanTransport) -> None:
     with pytest.raises(TypeError, match="CanFrame"):
         transport.write(b"abc")
     with pytest.raises(ValueError, match=r"without \+fd"):
@@ -100,9 +99,8 @@ def test_misuse_is_refused_here_and_not_on_the_wire(transport: CanTransport) -> 
         CanTransport("slcan:/dev/ttyACM0@1000000/7000000+fd")
 
 
-def test_bus_off_is_named_and_left_again(
-    adapter: Any, transport: CanTransport, read_can: Any, eventually: Any,
-    caplog: pytest.LogCaptureFixture,
+def test_bus_off_is_reported_and_recovered(
+    adapter: Any, transport: CanTransport, read_can: Any, caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
     adapter.set_bus_off(True)
     end = time.monotonic() + 60
@@ -124,35 +122,33 @@ def test_bus_off_is_named_and_left_again(
         adapter.send(FRAMES[1])
         return transport.state is BusState.ACTIVE
 
-    assert eventually(back)
+    assert becomes_true(back)
     assert transport.losses["can_restarts"] >= 1
     adapter.set_bus_off(True)
-    assert eventually(lambda: transport.read(0.02) and transport.state is BusState.BUS_OFF)
+    assert becomes_true(lambda: transport.read(0.02) and transport.state is BusState.BUS_OFF)
 
 
-def test_bus_off_is_left_also_while_every_board_is_silent(
-    adapter: Any, transport: CanTransport, eventually: Any
+def test_bus_off_is_recovered_while_boards_are_silent(
+    adapter: Any, transport: CanTransport
 ) -> None:
     adapter.set_bus_off(True)
-    assert eventually(lambda: transport.read(0.02) and transport.state is BusState.BUS_OFF)
+    assert becomes_true(lambda: transport.read(0.02) and transport.state is BusState.BUS_OFF)
     adapter.set_bus_off(False)
-    assert eventually(lambda: transport.read(0.02) and transport.state is BusState.ACTIVE)
+    assert becomes_true(lambda: transport.read(0.02) and transport.state is BusState.ACTIVE)
 
 
-def test_bus_off_is_found_on_adapters_that_tell_it_only_when_asked(
-    adapter: Any, eventually: Any
-) -> None:
+def test_bus_off_is_found_by_polling_the_adapter(adapter: Any) -> None:
     adapter.port.adapter._tells_state = False
     transport = CanTransport(f"slcan:{adapter.port.pty.link}")
     transport.open()
     adapter.set_bus_off(True)
-    assert eventually(lambda: transport.read(0.1) and transport.state is BusState.BUS_OFF)
+    assert becomes_true(lambda: transport.read(0.1) and transport.state is BusState.BUS_OFF)
     adapter.set_bus_off(False)
-    assert eventually(lambda: transport.read(0.05) and transport.state is BusState.ACTIVE)
+    assert becomes_true(lambda: transport.read(0.05) and transport.state is BusState.ACTIVE)
     transport.close()
 
 
-def test_unplugging_the_adapter_wakes_the_reader(
+def test_unplugged_adapter_wakes_the_reader(
     adapter: Any, transport: CanTransport, run_in_background: Any
 ) -> None:
     outcome = run_in_background(lambda: transport.read(600))
@@ -162,12 +158,12 @@ def test_unplugging_the_adapter_wakes_the_reader(
     assert isinstance(outcome.error, PortGone)
 
 
-def test_a_second_host_on_the_adapter_is_refused(adapter: Any, transport: CanTransport) -> None:
+def test_second_host_on_the_adapter_is_refused(adapter: Any, transport: CanTransport) -> None:
     with pytest.raises(PortBusy, match="is held by"):
         CanTransport(str(transport.spec)).open()
 
 
-def test_a_port_without_an_adapter_is_told_from_one_with(
+def test_port_without_adapter_is_recognised(
     pty: PtyPort, tmp_path: Path, run_in_background: Any
 ) -> None:
     outcome = run_in_background(CanTransport(f"slcan:{pty.link}").open)
@@ -181,7 +177,7 @@ def test_a_port_without_an_adapter_is_told_from_one_with(
         CanTransport(f"slcan:{tmp_path / 'nothing'}").open()
 
 
-def test_python_cans_own_driver_opens_the_simulated_adapter(adapter: Any, eventually: Any) -> None:
+def test_python_can_slcan_driver_opens_simulated_adapter(adapter: Any) -> None:
     bus: Any = can.Bus(
         interface="slcan",
         channel=str(adapter.port.pty.link),
@@ -196,7 +192,7 @@ def test_python_cans_own_driver_opens_the_simulated_adapter(adapter: Any, eventu
         assert message is not None
         assert (message.arbitration_id, bytes(message.data)) == (0x1234567, b"\x01\x02")
         bus.send(can.Message(arbitration_id=0x42, data=b"\x07", is_extended_id=True))
-        assert eventually(lambda: adapter.received == [CanFrame(0x42, b"\x07")])
+        assert becomes_true(lambda: adapter.received == [CanFrame(0x42, b"\x07")])
         assert adapter.port.adapter.bitrate == 500_000
     finally:
         bus.shutdown()
@@ -216,7 +212,7 @@ def test_python_cans_virtual_bus_joins_simulator_and_host_in_one_process(read_ca
     port.close()
 
 
-def test_frames_of_other_devices_are_counted_and_left_out(read_can: Any) -> None:
+def test_frames_of_other_devices_are_counted_and_ignored(read_can: Any) -> None:
     transport = CanTransport("virtual:others")
     transport.open()
     with can.Bus(interface="virtual", channel="others") as bus:
@@ -240,7 +236,7 @@ def test_closing_wakes_a_reader_of_any_driver(run_in_background: Any) -> None:
     assert isinstance(outcome.error, PortClosed)
 
 
-def test_a_virtual_bus_whose_reader_sleeps_neither_grows_nor_blocks() -> None:
+def test_virtual_bus_with_idle_reader_neither_grows_nor_blocks() -> None:
     transport = CanTransport("virtual:sleeper")
     transport.open()
     port = VirtualCanPort("sleeper")
@@ -252,7 +248,7 @@ def test_a_virtual_bus_whose_reader_sleeps_neither_grows_nor_blocks() -> None:
     port.close()
 
 
-def test_unknown_interfaces_and_absent_drivers_name_the_remedy() -> None:
+def test_unknown_interface_and_missing_driver_name_the_remedy() -> None:
     with pytest.raises(PortUnsuitable, match=r"no CAN interface 'socketcam'; allowed: .*socketcan"):
         CanTransport("socketcam:can0").open()
     with pytest.raises(PortMissing, match="install the driver of the kvaser adapter"):
@@ -260,12 +256,12 @@ def test_unknown_interfaces_and_absent_drivers_name_the_remedy() -> None:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="SocketCAN is of Linux")
-def test_a_missing_can_link_is_named_with_the_remedy() -> None:
+def test_missing_can_link_is_named_with_a_remedy() -> None:
     with pytest.raises(PortMissing, match=r"no CAN link 'can77'.*vcan"):
         CanTransport("socketcan:can77").open()
 
 
-def test_driver_errors_while_reading_are_an_unplugging(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_driver_read_errors_count_as_unplugged(monkeypatch: pytest.MonkeyPatch) -> None:
     link = PythonCanLink(CanSpec.parse("virtual:broken"))
     link.open()
 
@@ -295,7 +291,7 @@ def test_frames_go_through_socketcan(read_can: Any) -> None:
 
 @pytest.mark.parametrize("dialect", [name for name in DIALECTS if name != "late"])
 def test_adapters_of_every_firmware_are_opened(
-    dialect: str, adapter_of: Any, read_can: Any, eventually: Any
+    dialect: str, adapter_of: Any, read_can: Any
 ) -> None:
     adapter = adapter_of(dialect)
     transport = CanTransport(f"slcan:{adapter.port.pty.link}@500000")
@@ -306,14 +302,14 @@ def test_adapters_of_every_firmware_are_opened(
         assert got == FRAMES[: len(got)]
         assert got
         transport.write(tuple(FRAMES))
-        assert eventually(lambda: len(adapter.received) == len(FRAMES))
+        assert becomes_true(lambda: len(adapter.received) == len(FRAMES))
         assert adapter.port.adapter.bitrate == 500_000
         assert "malformed_line" not in transport.losses
     finally:
         transport.close()
 
 
-def test_an_adapter_that_answers_nothing_is_opened_and_said_to(
+def test_silent_adapter_is_opened_and_reported(
     adapter_of: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     transport = CanTransport(f"slcan:{adapter_of('canable').port.pty.link}")
@@ -322,8 +318,8 @@ def test_an_adapter_that_answers_nothing_is_opened_and_said_to(
     transport.close()
 
 
-def test_late_answers_are_matched_and_taken_for_no_others(
-    adapter_of: Any, eventually: Any, caplog: pytest.LogCaptureFixture
+def test_late_answers_are_matched_to_their_command(
+    adapter_of: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The refusal of closing a closed channel comes when the bit rate has long been sent."""
     adapter = adapter_of("late")
@@ -334,7 +330,7 @@ def test_late_answers_are_matched_and_taken_for_no_others(
         transport.read(0.05)
         return "s late" in caplog.text and not adapter.port.adapter._held
 
-    assert eventually(heard, 20)
+    assert becomes_true(heard, 20)
     for _ in range(10):
         transport.read(0.02)
     assert "refuses" not in caplog.text
@@ -342,14 +338,14 @@ def test_late_answers_are_matched_and_taken_for_no_others(
 
 
 @pytest.mark.parametrize("dialect", ["lawicel", "println", "plain", "canable2.5"])
-def test_an_adapter_that_refuses_a_command_is_refused(dialect: str, adapter_of: Any) -> None:
+def test_adapter_refusing_a_command_is_rejected(dialect: str, adapter_of: Any) -> None:
     adapter = adapter_of(dialect)
     adapter.port.adapter._fd = False
     with pytest.raises(PortUnsuitable, match=r"refuses the command Y2.*leave \+fd out"):
         CanTransport(f"slcan:{adapter.port.pty.link}@1000000/2000000+fd").open()
 
 
-def test_flags_of_an_adapter_are_counted_as_bus_errors(adapter_of: Any, eventually: Any) -> None:
+def test_adapter_flags_are_counted_as_bus_errors(adapter_of: Any) -> None:
     transport = CanTransport(f"slcan:{adapter_of('buserror').port.pty.link}")
     transport.open()
 
@@ -357,6 +353,6 @@ def test_flags_of_an_adapter_are_counted_as_bus_errors(adapter_of: Any, eventual
         transport.read(0.1)
         return transport.losses.get("can_bus-error") == 1
 
-    assert eventually(counted)
+    assert becomes_true(counted)
     assert transport.state is BusState.ACTIVE
     transport.close()

@@ -64,14 +64,14 @@ def play(transport: McapTransport) -> list[Chunk]:
 
 
 @pytest.mark.parametrize("chunk", [SERIAL_CHUNKS[3], CAN_CHUNK, Chunk(Instant(9), ())])
-def test_a_chunk_survives_its_message(chunk: Chunk) -> None:
+def test_chunk_round_trips_through_its_message(chunk: Chunk) -> None:
     message = codec().decode(RAW, codec().encode(RAW, to_raw(chunk, "/dev/ttyACM0", WALL)))
     assert from_raw(message) == chunk
     assert message.header.frame_id == "/dev/ttyACM0"
 
 
 @pytest.mark.parametrize("change", [{"medium": 2}, {"can_length": b"\x03"}, {"data": b"toolong"}])
-def test_a_message_whose_parts_disagree_is_refused(change: dict[str, Any]) -> None:
+def test_inconsistent_message_is_refused(change: dict[str, Any]) -> None:
     import numpy as np
 
     message = to_raw(CAN_CHUNK, "can0", WALL)
@@ -81,7 +81,7 @@ def test_a_message_whose_parts_disagree_is_refused(change: dict[str, Any]) -> No
         from_raw(message)
 
 
-def test_a_log_is_replayed_whole_with_its_own_spacing(tmp_path: Path) -> None:
+def test_log_is_replayed_completely_with_original_spacing(tmp_path: Path) -> None:
     path = write_log(tmp_path / "run.mcap", ("board0", SERIAL_CHUNKS))
     transport = McapTransport(path, speed=math.inf)
     transport.open()
@@ -97,7 +97,7 @@ def test_a_log_is_replayed_whole_with_its_own_spacing(tmp_path: Path) -> None:
     transport.close()
 
 
-def test_a_log_is_replayed_at_its_pace_or_faster(tmp_path: Path) -> None:
+def test_log_is_replayed_at_original_or_higher_speed(tmp_path: Path) -> None:
     path = write_log(tmp_path / "run.mcap", ("board0", SERIAL_CHUNKS))
     transport = McapTransport(path, speed=5)
     transport.open()
@@ -129,7 +129,7 @@ def test_one_board_of_several_is_replayed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
-def test_a_file_that_was_cut_off_is_replayed_to_the_break(tmp_path: Path, share: float) -> None:
+def test_truncated_log_is_replayed_up_to_the_cut(tmp_path: Path, share: float) -> None:
     path = write_log(tmp_path / "run.mcap", ("board0", SERIAL_CHUNKS))
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
@@ -141,7 +141,7 @@ def test_a_file_that_was_cut_off_is_replayed_to_the_break(tmp_path: Path, share:
     transport.close()
 
 
-def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
+def test_non_log_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(PortMissing, match="no log"):
         McapTransport(tmp_path / "none.mcap").open()
     path = tmp_path / "text.mcap"
@@ -157,9 +157,7 @@ def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
             McapTransport(path, speed=speed)
 
 
-def test_closing_wakes_a_reader_that_waits_for_its_time(
-    tmp_path: Path, run_in_background: Any
-) -> None:
+def test_closing_wakes_a_waiting_reader(tmp_path: Path, run_in_background: Any) -> None:
     far = [SERIAL_CHUNKS[0], Chunk(Instant(10**12), b"much later")]
     transport = McapTransport(write_log(tmp_path / "run.mcap", ("b", far)))
     transport.open()
@@ -171,7 +169,7 @@ def test_closing_wakes_a_reader_that_waits_for_its_time(
     assert isinstance(outcome.error, PortClosed)
 
 
-def test_a_message_that_is_no_raw_chunk_is_counted_and_passed_over(tmp_path: Path) -> None:
+def test_non_chunk_message_is_counted_and_skipped(tmp_path: Path) -> None:
     path = tmp_path / "odd.mcap"
     with path.open("wb") as file:
         writer = Writer(file)

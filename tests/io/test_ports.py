@@ -17,9 +17,7 @@ KERNEL_BUFFER = 65_536
 """Bytes that a Linux terminal takes before its line discipline shows them, on a busy machine."""
 
 
-def test_a_port_that_nobody_reads_drops_the_oldest_whole_messages_and_counts_them(
-    pty: PtyPort, read_bytes: Any
-) -> None:
+def test_unread_port_drops_oldest_messages_and_counts_them(pty: PtyPort, read_bytes: Any) -> None:
     messages = [bytes([100 + k % 100]) * 99 + b"\n" for k in range(1000)]
     host = SerialTransport(str(pty.link))
     host.open()
@@ -42,9 +40,7 @@ def test_a_port_that_nobody_reads_drops_the_oldest_whole_messages_and_counts_the
     host.close()
 
 
-def test_a_host_that_comes_late_gets_nothing_that_waited_in_the_terminal(
-    pty: PtyPort, read_bytes: Any
-) -> None:
+def test_late_host_receives_no_stale_bytes(pty: PtyPort, read_bytes: Any) -> None:
     pty.send(b"stale")
     host = SerialTransport(str(pty.link))
     host.open()
@@ -53,7 +49,7 @@ def test_a_host_that_comes_late_gets_nothing_that_waited_in_the_terminal(
     host.close()
 
 
-def test_hosts_may_come_and_go(pty: PtyPort, read_bytes: Any) -> None:
+def test_hosts_may_connect_and_disconnect(pty: PtyPort, read_bytes: Any) -> None:
     for word in (b"one", b"two"):
         host = SerialTransport(str(pty.link))
         host.open()
@@ -62,7 +58,7 @@ def test_hosts_may_come_and_go(pty: PtyPort, read_bytes: Any) -> None:
         host.close()
 
 
-def test_a_closed_port_takes_its_link_along(tmp_path: Path) -> None:
+def test_closing_a_port_removes_its_link(tmp_path: Path) -> None:
     port = PtyPort(tmp_path / "board0")
     port.open()
     assert os.path.realpath(port.link).startswith("/dev/")
@@ -74,7 +70,7 @@ def test_a_closed_port_takes_its_link_along(tmp_path: Path) -> None:
     assert port.receive() == b""
 
 
-def test_a_link_of_a_killed_run_is_replaced(tmp_path: Path) -> None:
+def test_stale_link_of_a_killed_run_is_replaced(tmp_path: Path) -> None:
     link = tmp_path / "board0"
     code = (
         "import os, signal, sys\n"
@@ -90,7 +86,7 @@ def test_a_link_of_a_killed_run_is_replaced(tmp_path: Path) -> None:
     port.close()
 
 
-def test_a_link_that_is_served_is_left_alone(pty: PtyPort) -> None:
+def test_link_in_use_is_left_alone(pty: PtyPort) -> None:
     before = os.readlink(pty.link)
     with pytest.raises(LinkRefused, match="another simdevice") as caught:
         PtyPort(pty.link).open()
@@ -98,7 +94,7 @@ def test_a_link_that_is_served_is_left_alone(pty: PtyPort) -> None:
     assert os.readlink(pty.link) == before
 
 
-def test_files_that_are_not_ours_are_left_alone(tmp_path: Path) -> None:
+def test_foreign_files_are_left_alone(tmp_path: Path) -> None:
     file = tmp_path / "precious"
     file.write_text("data")
     other = tmp_path / "link"
@@ -111,13 +107,13 @@ def test_files_that_are_not_ours_are_left_alone(tmp_path: Path) -> None:
     assert os.readlink(other) == str(file)
 
 
-def test_a_link_that_was_replaced_meanwhile_is_not_removed(pty: PtyPort) -> None:
+def test_link_replaced_meanwhile_is_not_removed(pty: PtyPort) -> None:
     pty.link.unlink()
     pty.link.write_text("somebody else's")
     pty.close()
     assert pty.link.read_text() == "somebody else's"
 
 
-def test_a_folder_that_is_not_there_is_an_error_of_the_system(tmp_path: Path) -> None:
+def test_missing_folder_is_an_os_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         PtyPort(tmp_path / "nowhere" / "board0").open()

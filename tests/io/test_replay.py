@@ -78,7 +78,7 @@ def test_a_recording_is_read_as_written(tmp_path: Path) -> None:
         (["t,x,y,z", "t,x,y,z"], 2, "column 1: 't' given"),
     ],
 )
-def test_what_is_no_recording_is_refused_with_file_and_line(
+def test_invalid_recording_is_refused_with_file_and_line(
     tmp_path: Path, rows: list[str], line: int, said: str
 ) -> None:
     path = write(tmp_path / "r.csv", *rows)
@@ -120,7 +120,7 @@ def test_rows_are_sent_when_they_are_due(tmp_path: Path) -> None:
     assert board.sent == 4
 
 
-def test_a_looped_recording_goes_on_one_period_after_its_end(tmp_path: Path) -> None:
+def test_looped_recording_continues_one_period_after_its_end(tmp_path: Path) -> None:
     path = write(tmp_path / "r.csv", "0,1,2,3", "0.1,4,5,6", "0.2,7,8,9")
     board = ReplayBoard(load(path), loop=True)
     board.tick(Instant(0))
@@ -130,7 +130,7 @@ def test_a_looped_recording_goes_on_one_period_after_its_end(tmp_path: Path) -> 
     assert not board.finished
 
 
-def test_a_postponed_recording_keeps_its_spacing(tmp_path: Path) -> None:
+def test_postponed_recording_keeps_its_spacing(tmp_path: Path) -> None:
     board = ReplayBoard(load(write(tmp_path / "r.csv", "0,1,2,3", "0.1,4,5,6")))
     board.start(Instant(0))
     board.tick(Instant(0))
@@ -140,7 +140,7 @@ def test_a_postponed_recording_keeps_its_spacing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("magnetometers", [5, 10])
-def test_real_recordings_come_out_of_the_decoder_as_they_went_in(
+def test_real_recordings_decode_to_their_original_values(
     magnetometers: int, tmp_path: Path
 ) -> None:
     """Ten: two recordings side by side."""
@@ -166,7 +166,7 @@ def test_real_recordings_come_out_of_the_decoder_as_they_went_in(
     assert {float(t) for s in samples for t in s.temperature_c} == {TEMPERATURE_C}
 
 
-def test_a_recording_goes_whole_through_simdevice_and_a_terminal(tmp_path: Path) -> None:
+def test_recording_passes_completely_through_simdevice_and_pty(tmp_path: Path) -> None:
     path = NORMAL[0]
     link = tmp_path / "skin0"
     process = subprocess.Popen(

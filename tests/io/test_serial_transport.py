@@ -16,6 +16,7 @@ import pytest
 from sensor_proto.can_transfers import CanFrame
 from sensor_proto.framing import SerialDecoder
 from sim_device.ports import PTY_ROOM, PtyPort
+from support.waiting import becomes_true
 from tactile_core.types import monotonic_now
 from tactiled.transports import (
     PortBusy,
@@ -44,18 +45,18 @@ def transport(pty: PtyPort) -> Any:
 
 
 def test_bytes_go_through_unchanged_in_both_directions(
-    pty: PtyPort, transport: SerialTransport, read_bytes: Callable[..., bytes], eventually: Any
+    pty: PtyPort, transport: SerialTransport, read_bytes: Callable[..., bytes]
 ) -> None:
     pty.send(EVERY_BYTE * 4)
     assert read_bytes(transport, 1024) == EVERY_BYTE * 4
     transport.write(EVERY_BYTE)
     got = bytearray()
-    assert eventually(lambda: got.extend(pty.receive()) or len(got) >= 256)
+    assert becomes_true(lambda: got.extend(pty.receive()) or len(got) >= 256)
     assert got == EVERY_BYTE
     assert transport.losses == {}
 
 
-def test_a_chunk_holds_all_that_waits_and_is_stamped_between_send_and_return(
+def test_chunk_holds_all_waiting_bytes_and_is_stamped_on_arrival(
     pty: PtyPort, transport: SerialTransport
 ) -> None:
     before = monotonic_now()
@@ -67,14 +68,14 @@ def test_a_chunk_holds_all_that_waits_and_is_stamped_between_send_and_return(
     assert before < chunk.received <= monotonic_now()
 
 
-def test_read_gives_up_after_its_timeout(transport: SerialTransport) -> None:
+def test_read_returns_after_its_timeout(transport: SerialTransport) -> None:
     start = time.monotonic()
     assert transport.read(0.05) is None
     assert time.monotonic() - start > 0.04
     assert transport.read(0) is None
 
 
-def test_unplugging_wakes_a_waiting_reader(
+def test_unplugged_port_wakes_a_waiting_reader(
     pty: PtyPort, transport: SerialTransport, run_in_background: Any
 ) -> None:
     outcome = run_in_background(lambda: transport.read(600))
@@ -85,7 +86,7 @@ def test_unplugging_wakes_a_waiting_reader(
     assert str(pty.link) in str(outcome.error)
 
 
-def test_what_came_before_the_unplugging_is_not_lost(
+def test_bytes_before_unplugging_are_not_lost(
     pty: PtyPort, transport: SerialTransport, read_bytes: Any
 ) -> None:
     pty.send(b"last words")
@@ -98,7 +99,7 @@ def test_what_came_before_the_unplugging_is_not_lost(
 
 
 @pytest.mark.parametrize("kind", [OSError, None])
-def test_an_input_output_error_is_an_unplugging(
+def test_io_error_counts_as_unplugged(
     transport: SerialTransport, pty: PtyPort, monkeypatch: pytest.MonkeyPatch, kind: Any
 ) -> None:
     def read(fd: int, size: int) -> bytes:
@@ -112,7 +113,7 @@ def test_an_input_output_error_is_an_unplugging(
         transport.read(1)
 
 
-def test_a_replugged_port_is_opened_again_by_its_path(
+def test_replugged_port_is_reopened_by_its_path(
     pty: PtyPort, transport: SerialTransport, read_bytes: Any
 ) -> None:
     pty.close()
@@ -139,7 +140,7 @@ def test_closing_from_another_thread_wakes_a_waiting_reader(
         transport.read(0)
 
 
-def test_writing_to_a_board_that_does_not_read_ends_and_is_counted(
+def test_write_to_a_board_that_does_not_read_times_out_and_is_counted(
     transport: SerialTransport,
 ) -> None:
     for _ in range(90):
@@ -150,12 +151,12 @@ def test_writing_to_a_board_that_does_not_read_ends_and_is_counted(
     assert transport.losses["write_closed_bytes"] == 3
 
 
-def test_a_serial_port_takes_no_can_frames(transport: SerialTransport) -> None:
+def test_serial_port_refuses_can_frames(transport: SerialTransport) -> None:
     with pytest.raises(TypeError, match="bytes"):
         transport.write((CanFrame(1, b""),))
 
 
-def test_a_second_process_is_refused_and_told_who_holds_the_port(
+def test_second_process_is_refused_with_the_holder_of_the_port(
     pty: PtyPort, transport: SerialTransport
 ) -> None:
     code = (
@@ -172,14 +173,14 @@ def test_a_second_process_is_refused_and_told_who_holds_the_port(
     assert "end that process" in done.stdout
 
 
-def test_a_second_open_in_the_same_process_is_refused_too(
+def test_second_open_in_the_same_process_is_refused(
     pty: PtyPort, transport: SerialTransport
 ) -> None:
     with pytest.raises(PortBusy, match="this process"):
         SerialTransport(str(pty.link)).open()
 
 
-def test_a_missing_port_is_named_with_those_there_are(
+def test_missing_port_lists_available_ports(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     port = listing.PortInfo("/dev/ttyACM7", "AnySkin", 0x2341, 0x0058, "ABC")
@@ -191,7 +192,7 @@ def test_a_missing_port_is_named_with_those_there_are(
         SerialTransport(str(tmp_path / "board9")).open()
 
 
-def test_what_is_no_terminal_is_refused(tmp_path: Path) -> None:
+def test_non_terminal_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "board0"
     file.write_bytes(b"")
     with pytest.raises(PortUnsuitable, match="not a serial port"):
@@ -202,7 +203,7 @@ def test_what_is_no_terminal_is_refused(tmp_path: Path) -> None:
         SerialTransport("/dev/null").open()
 
 
-def test_a_forbidden_port_names_group_and_udev_rule(
+def test_forbidden_port_names_group_and_udev_rule(
     pty: PtyPort, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Root may open everything, so the refusal of the system is played.
@@ -215,7 +216,7 @@ def test_a_forbidden_port_names_group_and_udev_rule(
 
 
 @pytest.mark.parametrize(("port", "baud"), [("", 9600), ("usb:", 9600), ("x", 0), ("x", -5)])
-def test_arguments_that_make_no_sense_are_refused(port: str, baud: int) -> None:
+def test_invalid_arguments_are_refused(port: str, baud: int) -> None:
     with pytest.raises(ValueError, match="given"):
         SerialTransport(port, baud)
 
@@ -234,7 +235,7 @@ def usb_port(device: str | None, serial_number: str) -> SimpleNamespace:
     )
 
 
-def test_a_board_plugged_in_elsewhere_is_found_by_its_usb_serial_number(
+def test_moved_board_is_found_by_its_usb_serial_number(
     tmp_path: Path, usb: list[SimpleNamespace], read_bytes: Any
 ) -> None:
     first, second = PtyPort(tmp_path / "ttyACM0"), PtyPort(tmp_path / "ttyACM1")
@@ -259,7 +260,7 @@ def test_a_board_plugged_in_elsewhere_is_found_by_its_usb_serial_number(
     second.close()
 
 
-def test_another_device_at_the_old_path_is_not_taken_for_the_board(
+def test_other_device_at_the_old_path_is_not_mistaken_for_the_board(
     pty: PtyPort, usb: list[SimpleNamespace]
 ) -> None:
     usb[:] = [usb_port(str(pty.link), "E6614")]
@@ -283,7 +284,7 @@ def test_a_port_can_be_given_by_its_usb_serial_number(
         SerialTransport("usb:F1").open()
 
 
-def test_ports_are_listed_usb_first_with_what_tells_them_apart(
+def test_ports_are_listed_usb_first_with_distinguishing_details(
     usb: list[SimpleNamespace],
 ) -> None:
     plain = SimpleNamespace(
@@ -298,7 +299,7 @@ def test_ports_are_listed_usb_first_with_what_tells_them_apart(
     assert listing.find_by_serial("nobody") is None
 
 
-def test_a_port_that_floods_zeros_gives_bounded_chunks_and_no_message(
+def test_flood_of_zeros_gives_bounded_chunks_and_no_message(
     pty: PtyPort, transport: SerialTransport
 ) -> None:
     decoder = SerialDecoder()
@@ -315,7 +316,7 @@ def test_a_port_that_floods_zeros_gives_bounded_chunks_and_no_message(
     assert messages == []
 
 
-def test_a_spec_picks_the_transport() -> None:
+def test_port_spec_selects_the_transport() -> None:
     assert type(make_transport("/dev/ttyACM0")).__name__ == "SerialTransport"
     assert type(make_transport("./board0")).__name__ == "SerialTransport"
     assert type(make_transport("usb:E6614")).__name__ == "SerialTransport"
@@ -324,7 +325,7 @@ def test_a_spec_picks_the_transport() -> None:
     assert type(make_transport("logs/run.mcap")).__name__ == "McapTransport"
 
 
-def test_open_spec_opens(pty: PtyPort) -> None:
+def test_open_spec_opens_the_transport(pty: PtyPort) -> None:
     transport = open_spec(str(pty.link))
     assert transport.read(0) is None
     transport.close()

@@ -89,7 +89,7 @@ def greeted(messages: list[Any]) -> bool:
     return bool(kinds(messages, Descriptor)) and len(kinds(messages, Samples)) >= 9
 
 
-def test_a_serial_board_is_announced_answers_and_streams(launch: Launch, tmp_path: Path) -> None:
+def test_serial_board_is_announced_answers_and_streams(launch: Launch, tmp_path: Path) -> None:
     process = launch("boards", "--pty", "./board0", "--serial", "ABC")
     assert "tactiled --port board0" in process.announced[0]
     assert "0000000000000abc" in process.announced[0]
@@ -103,7 +103,7 @@ def test_a_serial_board_is_announced_answers_and_streams(launch: Launch, tmp_pat
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_a_signal_ends_it_in_order_and_no_link_stays(
+def test_signal_ends_simdevice_cleanly_and_removes_links(
     launch: Launch, tmp_path: Path, number: signal.Signals
 ) -> None:
     process = launch("boards", "--pty", "board0", "--slcan", "can0", lines=2)
@@ -116,7 +116,7 @@ def test_a_signal_ends_it_in_order_and_no_link_stays(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_it_ends_by_itself_after_its_duration(launch: Launch, tmp_path: Path) -> None:
+def test_simdevice_exits_after_its_duration(launch: Launch, tmp_path: Path) -> None:
     process = launch("boards", "--pty", "board0", "--duration", "0.2")
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 0
@@ -124,7 +124,7 @@ def test_it_ends_by_itself_after_its_duration(launch: Launch, tmp_path: Path) ->
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_killed_run_can_be_started_again(launch: Launch, tmp_path: Path) -> None:
+def test_simdevice_restarts_after_a_kill(launch: Launch, tmp_path: Path) -> None:
     first = launch("boards", "--pty", "board0")
     first.kill()
     first.communicate()
@@ -170,7 +170,7 @@ def test_boards_on_can_fd_stream_through_an_adapter(launch: Launch, tmp_path: Pa
     host.close()
 
 
-def test_an_anyskin_board_streams_floats_unasked(launch: Launch, tmp_path: Path) -> None:
+def test_anyskin_board_streams_floats_without_commands(launch: Launch, tmp_path: Path) -> None:
     launch("boards", "--pty", "skin0", "--board", "anyskin")
     host = SerialTransport(str(tmp_path / "skin0"))
     host.open()
@@ -180,7 +180,7 @@ def test_an_anyskin_board_streams_floats_unasked(launch: Launch, tmp_path: Path)
     host.close()
 
 
-def test_an_unplugged_board_vanishes_and_comes_back_freshly_booted(
+def test_unplugged_board_vanishes_and_returns_freshly_booted(
     launch: Launch, tmp_path: Path, eventually: Any
 ) -> None:
     launch("boards", "--pty", "board0", "--unplug", "2s+0.5s")
@@ -197,9 +197,7 @@ def test_an_unplugged_board_vanishes_and_comes_back_freshly_booted(
     host.close()
 
 
-def test_calibration_is_of_the_very_board_that_boards_simulates(
-    launch: Launch, tmp_path: Path
-) -> None:
+def test_calibration_command_describes_the_simulated_board(launch: Launch, tmp_path: Path) -> None:
     out = tmp_path / "skin.cal.toml"
     make = ["calibration", "--out", str(out), "--board", "anyskin", "--seed", "7"]
     assert main(make) == 0
@@ -262,7 +260,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("arguments", "said"), BAD, ids=lambda v: " ".join(v)[:40])
-def test_bad_input_is_refused_with_what_is_allowed(
+def test_bad_input_is_refused_with_allowed_values(
     arguments: list[str],
     said: str,
     tmp_path: Path,
@@ -282,7 +280,7 @@ def test_bad_input_is_refused_with_what_is_allowed(
     assert [p.name for p in tmp_path.iterdir()] == ["bad.csv"]
 
 
-def test_what_the_system_refuses_is_told_apart(
+def test_system_errors_are_distinguished_from_bad_input(
     launch: Launch,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -321,7 +319,7 @@ def test_help_names_units_and_defaults(
         assert expected in text
 
 
-def test_version_is_told_both_ways(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_is_shown_by_both_forms(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["version"]) == 0
     with pytest.raises(SystemExit):
         main(["--version"])

@@ -29,7 +29,7 @@ def opened(**options: bool) -> SlcanAdapter:
 
 
 @pytest.mark.parametrize(("frame", "line"), [(FRAME, LINE), (FD_FRAME, FD_LINE)])
-def test_frames_are_written_and_read_as_the_manual_has_them(frame: CanFrame, line: bytes) -> None:
+def test_frames_are_encoded_and_decoded_as_in_the_manual(frame: CanFrame, line: bytes) -> None:
     assert slcan.encode_frame(frame) == line + b"\r"
     assert slcan.decode_frame(line) == frame
     assert slcan.decode_frame(line.lower().replace(line[:1].lower(), line[:1], 1)) == frame
@@ -60,7 +60,7 @@ def test_an_empty_frame_has_no_data_digits() -> None:
         (b"T\xff0000000\xff", slcan.Rejected.MALFORMED),
     ],
 )
-def test_lines_that_carry_no_frame_of_ours_say_why(line: bytes, reason: slcan.Rejected) -> None:
+def test_lines_without_a_usable_frame_say_why(line: bytes, reason: slcan.Rejected) -> None:
     assert slcan.decode_frame(line) is reason
 
 
@@ -75,7 +75,7 @@ def test_lines_that_carry_no_frame_of_ours_say_why(line: bytes, reason: slcan.Re
         CanFrame(1, b"", error=True),
     ],
 )
-def test_frames_no_bus_can_carry_are_refused(frame: CanFrame) -> None:
+def test_impossible_frames_are_refused(frame: CanFrame) -> None:
     with pytest.raises(ValueError, match=r"can be sent|data bytes"):
         slcan.encode_frame(frame)
 
@@ -85,7 +85,7 @@ STREAM = b"\rS8\r"[:1] + LINE + b"\r\a" + FD_LINE + b"\rt10020102\rF84\rsb128256
 
 @given(st.lists(st.integers(0, len(STREAM)), max_size=8))
 @settings(max_examples=60, deadline=None)
-def test_any_chunking_of_the_adapters_bytes_gives_the_same(cuts: list[int]) -> None:
+def test_chunking_of_adapter_bytes_does_not_matter(cuts: list[int]) -> None:
     decoder = slcan.SlcanDecoder()
     frames = []
     edges = [0, *sorted(cuts), len(STREAM)]
@@ -107,7 +107,7 @@ def test_any_chunking_of_the_adapters_bytes_gives_the_same(cuts: list[int]) -> N
 
 @given(st.binary(max_size=2000))
 @settings(max_examples=100, deadline=None)
-def test_noise_neither_raises_nor_piles_up(noise: bytes) -> None:
+def test_noise_neither_raises_nor_accumulates(noise: bytes) -> None:
     decoder = slcan.SlcanDecoder()
     for _ in range(3):
         for frame in decoder.feed(noise):
@@ -148,7 +148,7 @@ def test_an_endless_line_is_dropped() -> None:
         (b"V1013", None),
     ],
 )
-def test_status_flags_tell_the_state(answer: bytes, state: BusState | None) -> None:
+def test_status_flags_give_the_bus_state(answer: bytes, state: BusState | None) -> None:
     assert slcan.state_of_flags(answer) is state
 
 
@@ -205,7 +205,7 @@ def test_socketcan_error_frames_have_their_kernel_names() -> None:
         (b"S6\rO\rT00000001\r", b"\r\r\a"),
     ],
 )
-def test_the_adapter_answers_as_the_manual_says(command: bytes, answer: bytes) -> None:
+def test_adapter_answers_as_in_the_manual(command: bytes, answer: bytes) -> None:
     adapter = SlcanAdapter()
     adapter.feed(command)
     assert adapter.take_output() == answer
@@ -222,7 +222,7 @@ def test_bit_rates_are_those_of_the_manual() -> None:
     assert adapter.data_bitrate == 5_000_000
 
 
-def test_frames_pass_only_while_the_channel_is_open() -> None:
+def test_frames_pass_only_while_channel_is_open() -> None:
     adapter = SlcanAdapter()
     adapter.deliver((FRAME,), NOW)
     assert adapter.take_output() == b""
@@ -233,7 +233,7 @@ def test_frames_pass_only_while_the_channel_is_open() -> None:
     assert adapter.feed(LINE + b"\r" + FD_LINE + b"\r") == [FRAME, FD_FRAME]
 
 
-def test_an_adapter_without_fd_refuses_fd_frames() -> None:
+def test_adapter_without_fd_refuses_fd_frames() -> None:
     adapter = opened(fd=False)
     assert adapter.feed(FD_LINE + b"\r") == []
     assert adapter.take_output() == b"\a"
@@ -247,7 +247,7 @@ def test_time_stamps_are_milliseconds_in_four_digits() -> None:
     assert adapter.take_output() == LINE + b"04D2\r"  # 61,234 mod 60,000
 
 
-def test_bus_off_lasts_until_the_channel_is_opened_again() -> None:
+def test_bus_off_lasts_until_channel_is_reopened() -> None:
     adapter = opened()
     adapter.set_bus_off(True)
     assert adapter.take_output() == b"sb128256\r"
@@ -264,14 +264,14 @@ def test_bus_off_lasts_until_the_channel_is_opened_again() -> None:
     assert adapter.losses == {"tx_refused": 1, "rx_bus_off": 1}
 
 
-def test_errors_are_told_in_the_words_of_newer_firmware() -> None:
+def test_errors_use_the_format_of_newer_firmware() -> None:
     adapter = opened()
     adapter.report_error("aB")
     adapter.set_state(BusState.PASSIVE)
     assert adapter.take_output() == b"e2aB\rsp128128\r"
 
 
-def test_frame_times_are_those_of_the_literature() -> None:
+def test_frame_times_match_the_literature() -> None:
     # Davis et al. 2007: a classic 29-bit frame of 8 bytes takes at most 160 bit times, of 0 80.
     assert frame_seconds(CanFrame(1, bytes(8)), 1_000_000, 1) == pytest.approx(160e-6)
     assert frame_seconds(CanFrame(1, b""), 500_000, 1) == pytest.approx(160e-6)
@@ -280,7 +280,7 @@ def test_frame_times_are_those_of_the_literature() -> None:
     assert fd < 0.2 * 8 * 160e-6
 
 
-def test_the_bus_carries_one_frame_at_a_time_lowest_identifier_first() -> None:
+def test_bus_carries_one_frame_at_a_time_lowest_identifier_first() -> None:
     bus = TimedBus()
     low, high = CanFrame(1, bytes(8)), CanFrame(9, bytes(8))
     bus.push([high, high, low], Instant(0))
@@ -291,7 +291,7 @@ def test_the_bus_carries_one_frame_at_a_time_lowest_identifier_first() -> None:
     assert bus.load(Instant(2_000_000)) == 0
 
 
-def test_a_bus_that_is_too_slow_drops_whole_batches_and_counts_them() -> None:
+def test_overloaded_bus_drops_whole_batches_and_counts_them() -> None:
     bus = TimedBus()
     batch = [CanFrame(1, bytes(8))] * 100
     for _ in range(10):
@@ -308,7 +308,7 @@ CRLF_STREAM = b"\r\n\a\r\n" + LINE + b"\r\n" + FD_LINE + b"\r\nF84\r\n\r\nsb1282
 
 @given(st.lists(st.integers(3, len(CRLF_STREAM)), max_size=8))
 @settings(max_examples=60, deadline=None)
-def test_lines_may_end_in_cr_lf_wherever_they_are_cut(cuts: list[int]) -> None:
+def test_crlf_line_ends_are_accepted_at_any_chunking(cuts: list[int]) -> None:
     decoder = slcan.SlcanDecoder()
     frames = []
     for start, end in pairwise([0, *sorted(cuts), len(CRLF_STREAM)]):
@@ -318,18 +318,18 @@ def test_lines_may_end_in_cr_lf_wherever_they_are_cut(cuts: list[int]) -> None:
     assert decoder.counters == {}
 
 
-def test_lines_may_end_in_lf_alone() -> None:
+def test_lf_line_ends_are_accepted() -> None:
     decoder = slcan.SlcanDecoder()
     assert decoder.feed(LINE + b"\n" + LINE + b"\n") == [FRAME, FRAME]
 
 
-def test_x_stands_for_a_frame_with_a_long_identifier() -> None:
+def test_x_marks_a_frame_with_extended_identifier() -> None:
     assert slcan.decode_frame(b"x" + LINE[1:]) == FRAME
     adapter = opened()
     assert adapter.feed(b"x" + LINE[1:] + b"\r") == [FRAME]
 
 
-def test_answers_of_other_firmware_are_answers() -> None:
+def test_answers_of_other_firmware_are_understood() -> None:
     decoder = slcan.SlcanDecoder()
     decoder.feed(b"\x06\r\x15\r#\r#1\rL34\rz\r")
     assert list(decoder.answers) == [b"", b"\a", b"", b"\a"]
@@ -348,7 +348,7 @@ def test_answers_of_other_firmware_are_answers() -> None:
         (b"FA0", ("bus-error",), BusState.PASSIVE),
     ],
 )
-def test_flags_are_read_as_bus_errors(
+def test_flags_are_decoded_as_bus_errors(
     flags: bytes, names: tuple[str, ...], state: BusState | None
 ) -> None:
     state_frame, errors = slcan.SlcanDecoder().feed(flags + b"\r")
@@ -357,7 +357,7 @@ def test_flags_are_read_as_bus_errors(
     assert can_transfers.told_state(errors) is None
 
 
-def test_a_flag_that_stays_is_told_once() -> None:
+def test_persistent_flag_is_reported_once() -> None:
     decoder = slcan.SlcanDecoder()
     told = [len(decoder.feed(line)) for line in (b"F80\r", b"F80\r", b"F00\r", b"F80\r", b"F88\r")]
     assert told == [2, 1, 1, 2, 2]
@@ -372,7 +372,7 @@ def test_a_flag_that_stays_is_told_once() -> None:
         (b"E16040000", BusState.WARNING, ("protocol-violation", "bus-error", "tx-overflow")),
     ],
 )
-def test_error_reports_of_newer_firmware(
+def test_error_reports_of_newer_firmware_are_understood(
     line: bytes, state: BusState, names: tuple[str, ...]
 ) -> None:
     first, *rest = slcan.SlcanDecoder().feed(line + b"\r")
@@ -394,6 +394,6 @@ def test_every_bit_rate_has_a_command() -> None:
     assert slcan.DATA_BITRATES[8_000_000] == b"Y8"
 
 
-def test_an_unknown_dialect_is_refused_with_those_there_are() -> None:
+def test_unknown_dialect_lists_available_dialects() -> None:
     with pytest.raises(ValueError, match="candapter"):
         SlcanAdapter(dialect="brand")

@@ -40,9 +40,7 @@ def request_of(tmp_path: Path) -> BoardsRequest:
     return BoardsRequest(ptys=(tmp_path / "board0", tmp_path / "board1"), seed=40)
 
 
-def test_every_board_is_another_one_and_the_same_each_time(
-    request_of: BoardsRequest, tmp_path: Path
-) -> None:
+def test_boards_differ_but_are_reproducible(request_of: BoardsRequest, tmp_path: Path) -> None:
     wanted = replace(request_of, slcans=(tmp_path / "can0",), nodes=(3, 4), serials=(b"\0" * 8,))
     first, second = plan_boards(wanted), plan_boards(wanted)
     lines = [line for plan in first for line in plan.lines]
@@ -57,7 +55,7 @@ def test_every_board_is_another_one_and_the_same_each_time(
     ]
 
 
-def test_press_and_turn_reach_the_skin_and_go_on_while_a_board_is_unplugged(
+def test_press_and_rotation_continue_while_board_is_unplugged(
     request_of: BoardsRequest, tmp_path: Path
 ) -> None:
     script = tmp_path / "press.toml"
@@ -78,7 +76,7 @@ def test_press_and_turn_reach_the_skin_and_go_on_while_a_board_is_unplugged(
     assert np.allclose(later.at(6.0).attitude, world.at(10.0).attitude)
 
 
-def test_a_board_without_power_is_gone_and_then_boots_anew(request_of: BoardsRequest) -> None:
+def test_unpowered_board_disappears_and_reboots(request_of: BoardsRequest) -> None:
     wanted = replace(request_of, ptys=request_of.ptys[:1], unplugged=(Window(1.0, 0.5),))
     (plan,) = plan_boards(wanted)
     station = plan.station
@@ -111,7 +109,7 @@ def ask_can(node: int) -> bytes:
     return b"".join(map(encode_frame, CanEncoder(node, False).encode(Start(1))))
 
 
-def test_a_bus_that_is_too_slow_costs_whole_cycles_and_breaks_no_message(tmp_path: Path) -> None:
+def test_overloaded_bus_loses_whole_cycles_and_corrupts_no_message(tmp_path: Path) -> None:
     (plan,) = plan_boards(BoardsRequest(slcans=(tmp_path / "can0",)))
     assert isinstance(plan.station, CanStation)
     plan.station.open()
@@ -132,7 +130,7 @@ def test_a_bus_that_is_too_slow_costs_whole_cycles_and_breaks_no_message(tmp_pat
     plan.station.close()
 
 
-def test_a_boards_bus_off_befalls_the_adapter(tmp_path: Path) -> None:
+def test_bus_off_of_a_board_reaches_the_adapter(tmp_path: Path) -> None:
     (plan,) = plan_boards(BoardsRequest(slcans=(tmp_path / "can0",), faults="busoff@0.5s+0.2s"))
     station = plan.station
     assert isinstance(station, CanStation)
@@ -156,7 +154,7 @@ def test_a_boards_bus_off_befalls_the_adapter(tmp_path: Path) -> None:
     station.close()
 
 
-def test_when_one_port_cannot_be_opened_none_is_left_open(request_of: BoardsRequest) -> None:
+def test_failed_port_closes_all_other_ports(request_of: BoardsRequest) -> None:
     request_of.ptys[1].write_text("in the way")
     runner = Runner([plan.station for plan in plan_boards(request_of)])
     with pytest.raises(Exception, match="exists and is not a link"):
@@ -165,12 +163,12 @@ def test_when_one_port_cannot_be_opened_none_is_left_open(request_of: BoardsRequ
 
 
 @pytest.mark.parametrize("text", ["5", "5s", "5s+0s", "s+s", "-1s+1s", "5s+1s+1s", "nans+1s"])
-def test_windows_that_make_no_sense_are_refused(text: str) -> None:
+def test_invalid_time_windows_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"allowed: Ts\+Ds"):
         parse_window(text)
 
 
-def test_serial_numbers_are_filled_up_and_checked() -> None:
+def test_serial_numbers_are_padded_and_validated() -> None:
     assert parse_serial("0xABC") == bytes.fromhex("0000000000000abc")
     assert parse_window("5s+1.5s") == Window(5.0, 1.5)
     for text in ("", "xyz", "1" * 17):
@@ -178,7 +176,7 @@ def test_serial_numbers_are_filled_up_and_checked() -> None:
             parse_serial(text)
 
 
-def test_virtual_buses_may_be_served_too() -> None:
+def test_virtual_buses_can_be_served() -> None:
     spec = CanSpec.parse("virtual:stations+fd")
     (plan,) = plan_boards(BoardsRequest(cans=(spec,), nodes=(7,)))
     assert plan.connect == "tactiled --can virtual:stations+fd"

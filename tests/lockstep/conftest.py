@@ -2,35 +2,20 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
+from support import trial_trace
 from tactile_tools.cli import main
 
 
 @pytest.fixture(scope="session")
-def trace() -> ModuleType:
-    """``trace.py`` of this folder."""
-    path = Path(__file__).with_name("trace.py")
-    spec = importlib.util.spec_from_file_location("lockstep_trace", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["lockstep_trace"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="session")
-def scene_file(trace: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The crowded scene as a user would give it."""
     path = tmp_path_factory.mktemp("scene") / "crowded.json"
-    path.write_text(trace.crowded().to_json(), encoding="utf-8")
+    path.write_text(trial_trace.crowded().to_json(), encoding="utf-8")
     return path
 
 

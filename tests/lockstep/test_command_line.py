@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
+from support import trial_trace
 from tactile_tools.cli import main
 
 BAD = [
@@ -43,7 +43,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize(("words", "said"), BAD, ids=[" ".join(words) for words, _ in BAD])
-def test_bad_input_is_refused_with_what_is_allowed(
+def test_bad_input_is_refused_with_allowed_values(
     words: list[str], said: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("bad.json").write_text("{")
@@ -55,7 +55,7 @@ def test_bad_input_is_refused_with_what_is_allowed(
 
 
 @pytest.mark.parametrize("log", ["taken.mcap", "/proc/nowhere/x.mcap"])
-def test_a_log_that_cannot_be_written_is_said_before_the_trial(
+def test_unwritable_log_is_reported_before_the_trial(
     log: str, folder: Path, scene_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("taken.mcap").write_bytes(b"mine")
@@ -66,20 +66,18 @@ def test_a_log_that_cannot_be_written_is_said_before_the_trial(
     assert Path("taken.mcap").read_bytes() == b"mine"
 
 
-def test_a_picture_that_cannot_be_written_is_said(
-    folder: Path, trace: ModuleType, capsys: pytest.CaptureFixture[str]
-) -> None:
-    Path("free.json").write_text(trace.crowded(0).to_json())
+def test_unwritable_picture_is_reported(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("free.json").write_text(trial_trace.crowded(0).to_json())
     Path("x.png").mkdir()
     words = ["--strategy", "straight", "--log", "x.mcap", "--png", "x.png"]
     assert code_of(["reach", "--scene", "free.json", *words]) == 3
     assert "x.png" in capsys.readouterr().err
 
 
-def test_the_exit_code_says_whether_the_target_was_reached(
-    folder: Path, trace: ModuleType, capsys: pytest.CaptureFixture[str]
+def test_exit_code_says_whether_the_target_was_reached(
+    folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    free = trace.crowded(0)
+    free = trial_trace.crowded(0)
     Path("free.json").write_text(free.to_json())
     assert code_of(["reach", "--scene", "free.json", "--strategy", "straight"]) == 0
     assert "straight: reached within" in capsys.readouterr().out
@@ -98,8 +96,8 @@ def test_the_exit_code_says_whether_the_target_was_reached(
     assert "not reached within 20 s" in capsys.readouterr().out
 
 
-def test_a_strategy_of_ones_own_lies_in_the_folder_and_may_fail(
-    folder: Path, trace: ModuleType, capsys: pytest.CaptureFixture[str]
+def test_own_strategy_in_the_working_folder_may_fail(
+    folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Row 18: what it raises ends the reach with the zero twist, and is told."""
     Path("own_strategy.py").write_text(
@@ -116,7 +114,7 @@ def test_a_strategy_of_ones_own_lies_in_the_folder_and_may_fail(
         "            raise RuntimeError('lost my way')\n"
         "        return Twist(0.04, 0.0, 0.0)\n"
     )
-    Path("free.json").write_text(trace.crowded(0).to_json())
+    Path("free.json").write_text(trial_trace.crowded(0).to_json())
     assert code_of(["reach", "--scene", "free.json", "--strategy", "own_strategy:Own"]) == 1
     said = capsys.readouterr().out
     assert "lost my way" in said
@@ -133,7 +131,7 @@ def test_a_strategy_of_ones_own_lies_in_the_folder_and_may_fail(
         (["--png", "nowhere/x.png"], 2, "no such folder: nowhere"),
     ],
 )
-def test_demo_refuses_what_it_cannot_do(
+def test_demo_refuses_impossible_arguments(
     words: list[str], code: int, said: str, folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     assert code_of(["demo", *words]) == code
@@ -142,7 +140,7 @@ def test_demo_refuses_what_it_cannot_do(
     assert not list(folder.iterdir())
 
 
-def test_demo_deletes_no_file_that_is_no_log(
+def test_demo_never_deletes_a_file_that_is_not_a_log(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("thesis.txt").write_text("years of work")
@@ -153,7 +151,7 @@ def test_demo_deletes_no_file_that_is_no_log(
     assert Path("thesis.txt").read_text() == "years of work"
 
 
-def test_bench_measures_a_part_and_keeps_the_rest(
+def test_bench_updates_one_part_and_keeps_the_rest(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     report = Path("bench.json")

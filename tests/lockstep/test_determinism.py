@@ -6,8 +6,6 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -18,22 +16,21 @@ DEPTHS = ("contacts", "taxels")
 
 
 @pytest.mark.parametrize("depth", DEPTHS)
-def test_the_same_seed_gives_the_same_trial_to_the_bit(trace: ModuleType, depth: str) -> None:
-    scene = trace.crowded()
-    first, digest = trace.traced(scene, "hybrid_event", 3, depth)
-    second, again = trace.traced(scene, "hybrid_event", 3, depth)
+def test_same_seed_gives_the_same_trial_bit_for_bit(depth: str) -> None:
+    scene = trial_trace.crowded()
+    first, digest = trial_trace.traced(scene, "hybrid_event", 3, depth)
+    second, again = trial_trace.traced(scene, "hybrid_event", 3, depth)
     assert digest == again
     assert first == second
     assert first.peak_load > 1.0, "nothing was touched: the comparison would say little"
 
 
 @pytest.mark.parametrize("depth", DEPTHS)
-def test_workers_of_their_own_run_the_same_trial(trace: ModuleType, depth: str) -> None:
+def test_separate_process_runs_the_same_trial(depth: str) -> None:
     """In another process, with another hash seed; in this one another kind of trial came before."""
-    here = trace.traced(trace.crowded(), "hybrid_event", 3, depth)[1]
-    script = Path(__file__).with_name("trace.py")
+    here = trial_trace.traced(trial_trace.crowded(), "hybrid_event", 3, depth)[1]
     said = subprocess.run(
-        [sys.executable, str(script), "hybrid_event", "3", depth],
+        [sys.executable, trial_trace.__file__, "hybrid_event", "3", depth],
         env=os.environ | {"PYTHONHASHSEED": "77"},
         check=True,
         capture_output=True,
@@ -43,23 +40,24 @@ def test_workers_of_their_own_run_the_same_trial(trace: ModuleType, depth: str) 
 
 
 @pytest.mark.parametrize("depth", DEPTHS)
-def test_whoever_watches_changes_nothing(trace: ModuleType, depth: str) -> None:
-    scene = trace.crowded()
-    watched = trace.traced(scene, "burrow", 5, depth)[0]
-    assert trace.traced(scene, "burrow", 5, depth, watched=False)[0] == watched
+def test_watching_changes_nothing(depth: str) -> None:
+    scene = trial_trace.crowded()
+    watched = trial_trace.traced(scene, "burrow", 5, depth)[0]
+    assert trial_trace.traced(scene, "burrow", 5, depth, watched=False)[0] == watched
 
 
-def test_another_seed_is_another_board(trace: ModuleType) -> None:
-    scene = trace.crowded()
-    one, other = (trace.traced(scene, "burrow", k, "taxels", seconds=2.0)[1] for k in (1, 2))
+def test_another_seed_gives_another_board() -> None:
+    scene = trial_trace.crowded()
+    one, other = (trial_trace.traced(scene, "burrow", k, "taxels", seconds=2.0)[1] for k in (1, 2))
     assert one != other
 
 
-def test_another_seed_is_another_chance_of_the_strategy(trace: ModuleType) -> None:
+def test_another_seed_gives_other_random_choices() -> None:
     """Excavation turns in a random direction."""
-    scene = replace(trace.crowded(0), goal=(0.3, 0.0))
+    scene = replace(trial_trace.crowded(0), goal=(0.3, 0.0))
     digests = {
-        trace.traced(scene, "excavate", seed, "contacts", seconds=15.0)[1] for seed in range(5)
+        trial_trace.traced(scene, "excavate", seed, "contacts", seconds=15.0)[1]
+        for seed in range(5)
     }
     assert len(digests) > 1
 

@@ -12,12 +12,14 @@ from tactile_tools.cli import main
 RECORDED = Path(__file__).parents[1] / "data" / "recorded_scenes"
 
 
-def test_without_recordings_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_recordings_are_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["fidelity", "--scenes", str(tmp_path / "none.gz")]) == 3
     assert "none.gz" in capsys.readouterr().err
 
 
-def test_a_scene_is_compared_outcome_by_outcome(
+def test_scenes_are_compared_outcome_by_outcome(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Our own outcomes, so that they agree but where a machine calculates otherwise."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import signal
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from matplotlib.image import imread
 
+from support import trial_trace
 from tactile_core.bus.topics import ARM_STATE, COMMAND, FEATURES
 from tactile_tools.cli import main
 from tactile_tools.dev.benches.stop import SpoiltTrialError, rest_after, zero_after
@@ -21,7 +22,7 @@ MS = 1_000_000
 
 
 @pytest.mark.timeout(400)  # three programs start, reach for up to half a minute, and draw
-def test_the_demo_reaches_says_so_and_leaves_log_and_picture(
+def test_demo_reaches_and_leaves_log_and_picture(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """The first command that a newcomer runs; on a busy machine it may not reach."""
@@ -43,9 +44,9 @@ def test_the_demo_reaches_says_so_and_leaves_log_and_picture(
 
 
 @pytest.mark.timeout(400)
-def test_each_of_the_three_may_stop_and_all_stands_still(tmp_path: Path, trace: ModuleType) -> None:
+def test_stopping_any_of_the_three_processes_stops_the_arm(tmp_path: Path) -> None:
     """Rows 13 to 15 and 24 with the whole chain; how soon is measured by `tactile bench`."""
-    shelf = dataclasses.replace(trace.crowded(0), goal=(0.3, 0.0))
+    shelf = dataclasses.replace(trial_trace.crowded(0), goal=(0.3, 0.0))
     (tmp_path / "shelf.json").write_text(shelf.to_json())
     with LiveReach(tmp_path, ("--scene", "shelf.json"), strategy="straight") as live:
         for process, number in (
@@ -93,7 +94,7 @@ def sample(ms: float, vx: float = 0.0) -> tuple[int, Any]:
     return int((ms + 3) * MS), message
 
 
-def test_what_is_measured_is_last_word_to_standing_still() -> None:
+def test_measured_time_runs_from_last_message_to_standstill() -> None:
     features = [sample(t) for t in range(0, 101, 10)]
     commands = [sample(t, 0.05 if t < 290 else 0.0) for t in range(0, 400, 10)]
     live: Any = Heard(features=features, commands=commands)
@@ -103,7 +104,7 @@ def test_what_is_measured_is_last_word_to_standing_still() -> None:
     assert rest_after(live, 90 * MS) == pytest.approx(180 - 103)
 
 
-def test_an_arm_that_did_not_move_tells_nothing() -> None:
+def test_arm_that_did_not_move_is_no_measurement() -> None:
     still = [sample(t) for t in range(0, 400, 10)]
     live: Any = Heard(features=still, commands=still, states=still)
     with pytest.raises(SpoiltTrialError):

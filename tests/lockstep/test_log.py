@@ -28,7 +28,7 @@ TYPES = {
 
 
 @pytest.mark.parametrize("depth", ["contacts", "taxels"])
-def test_a_foreign_reader_reads_every_message(recorded: Recorded, depth: str) -> None:
+def test_mcap_reader_reads_every_message(recorded: Recorded, depth: str) -> None:
     code, path = recorded(depth)
     assert code in (0, 1)
     with path.open("rb") as file:
@@ -62,7 +62,7 @@ def test_a_foreign_reader_reads_every_message(recorded: Recorded, depth: str) ->
                                      if d.channel.topic == "/reach/reach/state")  # fmt: skip
 
 
-def test_the_same_trial_is_the_same_log(recorded: Recorded) -> None:
+def test_same_trial_gives_the_same_log(recorded: Recorded) -> None:
     """Message by message, times included: nothing in it comes from a clock of ours."""
     logs = []
     for again in ("", " again"):
@@ -74,7 +74,7 @@ def test_the_same_trial_is_the_same_log(recorded: Recorded) -> None:
     assert logs[0] == logs[1]
 
 
-def test_the_series_tells_the_reach(recorded: Recorded) -> None:
+def test_series_describe_the_reach(recorded: Recorded) -> None:
     code, path = recorded("taxels")
     reach = read_reach(path)
     assert reach.time[0] == 0.0

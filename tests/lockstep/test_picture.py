@@ -12,6 +12,7 @@ import pytest
 from matplotlib import colors
 from matplotlib.image import imread
 
+from support.log_rewriting import rewrite
 from tactile_tools.cli import main
 from tactile_tools.plot import reach as plot_reach
 from tactile_tools.plot.curves import holes
@@ -30,7 +31,7 @@ def share(picture: np.ndarray, colour: str) -> float:
 
 
 @pytest.mark.parametrize("depth", ["contacts", "taxels"])
-def test_path_contacts_target_and_curves_are_there(recorded: Recorded, depth: str) -> None:
+def test_picture_shows_path_contacts_target_and_curves(recorded: Recorded, depth: str) -> None:
     _, log = recorded(depth)
     picture = imread(log.with_suffix(".png"))
     height, width = picture.shape[:2]
@@ -47,7 +48,7 @@ def test_path_contacts_target_and_curves_are_there(recorded: Recorded, depth: st
 
 
 @pytest.fixture(scope="module")
-def several(recorded: Recorded, rewrite: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def several(recorded: Recorded, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """As of ``reachd --serve``: two reaches 60 s apart; a second board, and arm, in the first."""
     _, log = recorded("contacts")
 
@@ -66,7 +67,7 @@ def several(recorded: Recorded, rewrite: Any, tmp_path_factory: pytest.TempPathF
     return Path(rewrite(log, tmp_path_factory.mktemp("several") / "served.mcap", edit))
 
 
-def test_of_several_reaches_and_boards_each_can_be_chosen(
+def test_any_of_several_reaches_and_boards_can_be_chosen(
     several: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     last, first = read_reach(several), read_reach(several, 1)
@@ -105,7 +106,7 @@ def test_of_several_reaches_and_boards_each_can_be_chosen(
 
 
 @pytest.mark.parametrize("size", LOOKS)
-def test_a_reach_says_what_it_says_inside_the_picture_and_off_the_data(
+def test_labels_of_a_reach_stay_inside_the_picture_and_off_the_data(
     several: Path, size: str
 ) -> None:
     reach = read_reach(several)
@@ -132,7 +133,7 @@ def test_a_reach_says_what_it_says_inside_the_picture_and_off_the_data(
     assert all(t.get_position()[1] > curves for t in numbers)
 
 
-def test_what_a_hole_hides_is_not_drawn(recorded: Recorded, rewrite: Any, tmp_path: Path) -> None:
+def test_missing_data_is_not_drawn(recorded: Recorded, tmp_path: Path) -> None:
     """Neither a path nor bars through it, nor contacts of which the place is not known."""
     _, log = recorded("contacts")
     start = read_reach(log)
@@ -165,7 +166,7 @@ def test_what_a_hole_hides_is_not_drawn(recorded: Recorded, rewrite: Any, tmp_pa
     assert not set(lost) & set(reach.moments(6, 0.0))
 
 
-def test_a_log_without_a_reach_is_refused(tmp_path: Path) -> None:
+def test_log_without_a_reach_is_refused(tmp_path: Path) -> None:
     from tactile_core.log.recorder import Recorder
     from tactile_core.types import WallClock
 
@@ -178,7 +179,7 @@ def test_a_log_without_a_reach_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "out.png").exists()
 
 
-def test_plot_draws_it_too(recorded: Recorded, tmp_path: Path) -> None:
+def test_plot_command_draws_a_reach(recorded: Recorded, tmp_path: Path) -> None:
     _, log = recorded("contacts")
     out = tmp_path / "again.png"
     assert main(["plot", str(log), "--what", "reach", "--out", str(out)]) == 0

@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -20,6 +19,8 @@ import numpy as np
 import pytest
 import zenoh
 
+from support.network import free_port
+from support.waiting import PATIENCE_S, wait_until
 from tactile_core.bus.messages import MSG, codec, header
 from tactile_core.bus.runtime import RUNTIME_VARIABLE
 from tactile_core.bus.services import ServiceError, call
@@ -28,8 +29,6 @@ from tactile_core.bus.streams import ATTACHMENT, Tap
 from tactile_core.bus.topics import ARM_STATE, COMMAND, FEATURES, service_key
 from tactile_tools.cli import main
 from tactile_tools.reach.process_rig import is_moving
-
-PATIENCE_S = 60.0
 
 
 @dataclass
@@ -47,18 +46,11 @@ class Rig:
         name = {"reach": "reach", "arm": "arm", "world": "world"}[kind]
         return call(self.operator, service_key(name, service, kind), request, timeout=20)
 
-    def until(self, done: Callable[[], object], seconds: float = PATIENCE_S) -> None:
-        end = time.monotonic() + seconds
-        while not done():
-            said = [p.read_text(errors="replace")[-500:] for p in self.folder.glob("*.txt")]
-            assert time.monotonic() < end, said
-            time.sleep(0.02)
+    def until(self, done: Callable[[], object], timeout_s: float = PATIENCE_S) -> None:
+        wait_until(done, timeout_s, self.said)
 
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    def said(self) -> list[str]:
+        return [p.read_text(errors="replace")[-500:] for p in self.folder.glob("*.txt")]
 
 
 ROLES = ("cupboard", "tactiled", "reachd")
@@ -201,7 +193,7 @@ def raw(endpoint: str, **settings: Any) -> zenoh.Session:
 
 
 @pytest.mark.timeout(240)
-def test_over_plain_tcp_a_stranger_moves_nothing_and_locks_nobody_out(tmp_path: Path) -> None:
+def test_stranger_over_plain_tcp_moves_nothing_and_blocks_nobody(tmp_path: Path) -> None:
     places = {name: f"tcp/127.0.0.1:{free_port()}" for name in ROLES}
     with running_rig(tmp_path, places) as rig:
         for place in (places["cupboard"], places["reachd"]):
@@ -214,7 +206,7 @@ def test_over_plain_tcp_a_stranger_moves_nothing_and_locks_nobody_out(tmp_path: 
 
 
 @pytest.mark.timeout(240)
-def test_over_tls_each_role_does_its_own_and_a_viewer_only_looks(
+def test_tls_roles_have_only_their_rights_and_viewer_only_reads(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     pytest.importorskip("cryptography", reason="making keys needs cryptography")
@@ -243,7 +235,7 @@ def test_over_tls_each_role_does_its_own_and_a_viewer_only_looks(
 
 
 @pytest.mark.timeout(240)
-def test_by_default_a_rig_meets_in_its_folder_and_a_second_one_in_another(
+def test_default_rigs_meet_in_separate_folders(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No flag at all; a socket's path is short, so that the folder is one of the system's."""

@@ -59,7 +59,7 @@ def test_cat_picks_topics_and_times(
     assert "2023-11-14 22:13:20.001Z" in log_tool("cat", path, "--absolute", "--limit", "1").out
 
 
-def test_cat_into_a_pipe_that_closes_ends_quietly(recorded: Any, tmp_path: Path) -> None:
+def test_cat_into_a_closed_pipe_ends_quietly(recorded: Any, tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", 3.0)
     command = f"{sys.executable} -m tactile_tools.cli log cat {path} | head -2"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
@@ -72,7 +72,7 @@ def test_cat_into_a_pipe_that_closes_ends_quietly(recorded: Any, tmp_path: Path)
 
 
 @pytest.mark.parametrize("cut", [False, True])
-def test_exports_hold_what_the_log_holds(
+def test_exports_contain_every_value_of_the_log(
     log_tool: Any, recorded: Any, tmp_path: Path, cut: bool, rows_of: Any
 ) -> None:
     path = recorded(tmp_path / "run.mcap", 1.0, chunk_bytes=4096)
@@ -138,7 +138,7 @@ def test_lists_of_numbers_are_columns_lists_or_matrices(log_tool: Any, tmp_path:
         assert arrays["force.offsets"].tolist() == [0, 9, 18, 24]
 
 
-def test_exports_are_overwritten_only_when_asked(
+def test_exports_are_overwritten_only_on_request(
     log_tool: Any, recorded: Any, tmp_path: Path
 ) -> None:
     path = recorded(tmp_path / "run.mcap", 0.1)

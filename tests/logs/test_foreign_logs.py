@@ -12,7 +12,7 @@ from mcap.writer import Writer
 pytestmark = pytest.mark.timeout(600)
 
 
-def test_logs_of_other_programs_are_read_as_far_as_can_be(
+def test_logs_of_other_programs_are_read_as_far_as_possible(
     log_tool: Any, tmp_path: Path, counts: Any, rows_of: Any
 ) -> None:
     path = tmp_path / "other.mcap"
@@ -56,7 +56,7 @@ def test_logs_of_other_programs_are_read_as_far_as_can_be(
     assert counts(tmp_path / "s" / "other_0000.mcap") == counts(path)
 
 
-def test_a_newer_version_is_told(log_tool: Any, tiny_log: Any, tmp_path: Path) -> None:
+def test_newer_version_is_reported(log_tool: Any, tiny_log: Any, tmp_path: Path) -> None:
     data = tiny_log(tmp_path / "t.mcap", library="tactile-reach 99.1.2")
     outcome = log_tool("doctor", tmp_path / "t.mcap")
     assert outcome.code == 1
@@ -69,7 +69,7 @@ def test_a_newer_version_is_told(log_tool: Any, tiny_log: Any, tmp_path: Path) -
         assert "version '1' of the MCAP format" in newer.err
 
 
-def test_doctor_tells_time_that_goes_back_clocks_that_part_and_what_is_lost(
+def test_doctor_reports_backward_time_diverging_clocks_and_losses(
     log_tool: Any, tmp_path: Path
 ) -> None:
     path = tmp_path / "odd.mcap"

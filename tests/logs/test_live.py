@@ -11,7 +11,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,16 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from support.network import free_port
+from support.processes import command
+from support.waiting import wait_until
 from tactile_core.bus.messages import codec
 from tactile_core.bus.services import ServiceError, call
 from tactile_core.bus.session import BusConfig, close_session, open_session
 from tactile_core.bus.streams import Tap
 from tactile_core.bus.topics import service_key
 from tactile_core.log.info import info
-from tactile_tools.processes import command, free_port, running, wait_for
+from tactile_tools.processes import running, wait_for
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -44,13 +47,6 @@ start_s = 2.0
 ramp_s = 0.3
 hold_s = 30.0
 """
-
-
-def until(condition: Callable[[], object], seconds: float = 120.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.02)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +67,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
         running([*boards, "--pty", str(b), *press], folder / "b.txt") as first,
         running([*boards, "--pty", str(s), "--board", "anyskin"], folder / "s.txt") as second,
     ):
-        until(lambda: (b.exists() and s.exists()) or first.poll() or second.poll())
+        wait_until(lambda: (b.exists() and s.exists()) or first.poll() or second.poll())
         wait_for(b, first, folder / "b.txt")
         wait_for(s, second, folder / "s.txt")
         words = [
@@ -97,22 +93,22 @@ def _disturb(folder: Path, endpoint: str, daemon: subprocess.Popen[bytes]) -> No
 
     tap = Tap(session, "tactile/*/features", count)
     try:
-        until(lambda: min(heard.values()) > 100)
+        wait_until(lambda: min(heard.values()) > 100)
         with contextlib.suppress(ServiceError):  # on a busy machine the field may seem to move
             call(session, service_key("skin", "tare"), {}, timeout=60)
         daemon.send_signal(signal.SIGSTOP)
         time.sleep(0.9)
         daemon.send_signal(signal.SIGCONT)
         before = dict(heard)
-        until(lambda: all(heard[name] > before[name] + 50 for name in heard))
+        wait_until(lambda: all(heard[name] > before[name] + 50 for name in heard))
         shutil.copy(folder / "run.mcap", folder / "cut.mcap")
-        until(lambda: all(heard[name] > before[name] + 80 for name in heard))
+        wait_until(lambda: all(heard[name] > before[name] + 80 for name in heard))
     finally:
         tap.close()
         close_session(session)
 
 
-def test_features_of_real_daemons_come_again_to_the_bit(lab: Path, log_tool: Any) -> None:
+def test_features_of_real_daemons_are_reproduced_bit_for_bit(lab: Path, log_tool: Any) -> None:
     outcome = log_tool("reprocess", lab / "run.mcap", "--out", lab / "again.mcap")
     assert outcome.code == 0, outcome.err
     assert "estimated anew" not in outcome.out
@@ -124,7 +120,7 @@ def test_features_of_real_daemons_come_again_to_the_bit(lab: Path, log_tool: Any
         assert int(new) == int(old) == int(same) > 10, (topic, outcome.out)
 
 
-def test_what_a_kill_leaves_comes_again_to_the_bit(lab: Path, log_tool: Any) -> None:
+def test_log_of_a_killed_daemon_is_reproduced_bit_for_bit(lab: Path, log_tool: Any) -> None:
     outcome = log_tool("reprocess", lab / "cut.mcap", "--out", lab / "cut-again.mcap")
     assert outcome.code == 0, outcome.err
     rows = re.findall(
@@ -137,7 +133,7 @@ def test_what_a_kill_leaves_comes_again_to_the_bit(lab: Path, log_tool: Any) -> 
         assert int(same) > 5
 
 
-def test_doctor_finds_the_log_sound_and_the_cut_one_not(lab: Path, log_tool: Any) -> None:
+def test_doctor_accepts_the_log_and_rejects_the_truncated_one(lab: Path, log_tool: Any) -> None:
     sound = log_tool("doctor", lab / "run.mcap")
     assert "not closed" not in sound.out
     assert "unknown_schema" not in log_tool("doctor", lab / "run.mcap", "--json").out
@@ -146,7 +142,7 @@ def test_doctor_finds_the_log_sound_and_the_cut_one_not(lab: Path, log_tool: Any
     assert f"tactile log recover {lab / 'cut.mcap'}" in cut.out
 
 
-def test_a_replay_has_keys_of_its_own_and_the_spacing_it_had(lab: Path, tmp_path: Path) -> None:
+def test_replay_uses_its_own_keys_and_original_spacing(lab: Path, tmp_path: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     session = open_session(BusConfig(listen=(endpoint,), connect=()))
     heard: list[tuple[float, str]] = []
@@ -156,7 +152,7 @@ def test_a_replay_has_keys_of_its_own_and_the_spacing_it_had(lab: Path, tmp_path
         with running(
             [command("tactile"), *words, "--speed", "4", "--connect", endpoint], tmp_path / "r.txt"
         ) as player:
-            until(lambda: len(heard) > 300)
+            wait_until(lambda: len(heard) > 300)
             os.kill(player.pid, signal.SIGINT)
             assert player.wait(60) == 0
     finally:
@@ -202,7 +198,7 @@ def test_mcap_reads_and_decodes_every_message_of_every_channel(any_log: Path) ->
     assert counts == expected
 
 
-def test_rosbags_plays_the_folder_we_make(any_log: Path, log_tool: Any, tmp_path: Path) -> None:
+def test_rosbags_reads_the_exported_folder(any_log: Path, log_tool: Any, tmp_path: Path) -> None:
     outcome = log_tool("rosbag", any_log, "--out", tmp_path / "bag")
     assert outcome.code == 0, outcome.err
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -220,7 +216,7 @@ def test_rosbags_plays_the_folder_we_make(any_log: Path, log_tool: Any, tmp_path
     assert counts == {topic: count for topic, count in expected.items() if count}
 
 
-def test_a_3d_view_finds_frames_finger_contacts_and_objects(trial: Path) -> None:
+def test_log_contains_what_a_3d_view_needs(trial: Path) -> None:
     seen: dict[str, set[str]] = {}
     frames = set()
     with trial.open("rb") as file:
@@ -241,10 +237,10 @@ def test_a_3d_view_finds_frames_finger_contacts_and_objects(trial: Path) -> None
 def _no_thread_is_left() -> Iterator[None]:
     before = threading.active_count()
     yield
-    until(lambda: threading.active_count() <= before + 2, 10)
+    wait_until(lambda: threading.active_count() <= before + 2, 10)
 
 
-def test_the_layout_for_foxglove_names_what_is_in_a_log(trial: Path, lab: Path) -> None:
+def test_foxglove_layout_names_topics_of_the_log(trial: Path, lab: Path) -> None:
     layout = json.loads((ROOT / "docs" / "foxglove-layout.json").read_text())
     panels = layout["configById"]
     placed = set(re.findall(r'"(?:first|second)": "([^"]+)"', json.dumps(panels)))

@@ -56,7 +56,7 @@ def steady(count: int, start: int = BASE_NS, sequence: int | None = None) -> lis
 # Numbers
 
 
-def test_a_recorder_that_does_not_number_loses_nothing(
+def test_unnumbered_messages_are_not_counted_as_lost(
     log_tool: Any, tmp_path: Path, counts: Any
 ) -> None:
     path = write(tmp_path / "x.mcap", steady(100, sequence=0))
@@ -71,9 +71,7 @@ def test_a_recorder_that_does_not_number_loses_nothing(
     assert log_tool("doctor", parts).code == 0
 
 
-def test_one_counter_over_all_channels_is_taken_for_what_it_is(
-    log_tool: Any, tmp_path: Path
-) -> None:
+def test_counter_shared_by_all_channels_is_recognised(log_tool: Any, tmp_path: Path) -> None:
     rows = [(k % 3, k, BASE_NS + k * 10**7, 0.0) for k in range(300)]
     whole = write(tmp_path / "w.mcap", rows, ("/a", "/b", "/c"))
     healthy = log_tool("doctor", whole)
@@ -94,7 +92,7 @@ def test_late_messages_are_not_missing(log_tool: Any, tmp_path: Path) -> None:
 # Merging
 
 
-def test_equal_payloads_of_other_times_are_no_copies(
+def test_equal_payloads_at_other_times_are_not_duplicates(
     log_tool: Any, tmp_path: Path, counts: Any
 ) -> None:
     first = write(tmp_path / "a.mcap", steady(50))
@@ -106,7 +104,9 @@ def test_equal_payloads_of_other_times_are_no_copies(
     assert counts(tmp_path / "m.mcap") == {"/a": 150}
 
 
-def test_copies_are_kept_once_and_told_by_topic(log_tool: Any, tmp_path: Path, counts: Any) -> None:
+def test_duplicates_are_kept_once_and_reported_by_topic(
+    log_tool: Any, tmp_path: Path, counts: Any
+) -> None:
     rows = [*steady(30), (1, 0, BASE_NS + 1, 2.0), (1, 1, BASE_NS + 1, 2.0)]
     paths = [write(tmp_path / f"{n}.mcap", rows, ("/a", "/b")) for n in "xyz"]
     outcome = log_tool("merge", *paths, "--out", tmp_path / "m.mcap")
@@ -116,7 +116,7 @@ def test_copies_are_kept_once_and_told_by_topic(log_tool: Any, tmp_path: Path, c
 
 
 @pytest.mark.parametrize("held", [1 << 30, 40_000])
-def test_a_merged_log_is_in_order_however_far_back_times_go(
+def test_merged_log_is_ordered_despite_backward_times(
     log_tool: Any, tmp_path: Path, held: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With little memory the messages that wait go to files, which are made one now and then."""
@@ -141,9 +141,7 @@ def test_a_merged_log_is_in_order_however_far_back_times_go(
     assert {p.name for p in tmp_path.iterdir()} == {"x.mcap", "y.mcap", "m.mcap"}
 
 
-def test_tables_and_attachments_of_one_name_are_all_kept_and_listed(
-    log_tool: Any, tmp_path: Path
-) -> None:
+def test_metadata_and_attachments_of_equal_name_are_all_kept(log_tool: Any, tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
@@ -173,7 +171,7 @@ def test_tables_and_attachments_of_one_name_are_all_kept_and_listed(
     assert info(tmp_path / "r.mcap").attachment_count == 3
 
 
-def test_latched_messages_of_others_begin_every_part_and_come_out_once(
+def test_latched_messages_start_every_part_and_are_exported_once(
     log_tool: Any, tmp_path: Path, counts: Any
 ) -> None:
     map_ = (1, 0, BASE_NS, 7.0)
@@ -218,7 +216,7 @@ def test_cat_and_export_end_with_1_when_messages_were_lost(log_tool: Any, tmp_pa
         {"enable_crcs": False},
     ],
 )
-def test_a_time_is_found_whatever_the_summary_lacks(
+def test_time_range_is_found_without_a_summary(
     log_tool: Any, tmp_path: Path, how: dict[str, Any]
 ) -> None:
     path = write(tmp_path / "x.mcap", steady(100), chunk_size=400, **how)
@@ -237,7 +235,7 @@ def test_a_time_is_found_whatever_the_summary_lacks(
 # What is shown
 
 
-def test_nothing_of_a_log_acts_on_the_terminal(log_tool: Any, tmp_path: Path) -> None:
+def test_log_contents_cannot_control_the_terminal(log_tool: Any, tmp_path: Path) -> None:
     evil = "/x\x1b[2J\x9b1m\u202e:smile:[red]\n\x00"
     path = tmp_path / "x.mcap"
     with path.open("wb") as file:
@@ -272,7 +270,7 @@ def test_nothing_of_a_log_acts_on_the_terminal(log_tool: Any, tmp_path: Path) ->
     assert not any(p.name != "x" and "PWN" in p.name for p in tmp_path.rglob("*"))
 
 
-def test_stamps_that_no_clock_shows_are_named_and_exported(log_tool: Any, tmp_path: Path) -> None:
+def test_impossible_stamps_are_named_and_exported(log_tool: Any, tmp_path: Path) -> None:
     last = (1 << 64) - 5
     path = write(tmp_path / "x.mcap", [(0, 0, BASE_NS, 1.0), (0, 1, last, 2.0)])
     doctor = log_tool("doctor", path)
@@ -295,9 +293,7 @@ def test_stamps_that_no_clock_shows_are_named_and_exported(log_tool: Any, tmp_pa
 # Exports
 
 
-def test_topics_of_any_length_and_likeness_get_files_of_their_own(
-    log_tool: Any, tmp_path: Path
-) -> None:
+def test_long_and_similar_topics_get_separate_files(log_tool: Any, tmp_path: Path) -> None:
     names = ("/" + "x" * 300, "/" + "x" * 300 + "y", "/a/b", "/a_b", "/A/B", "", "/con", "../../z")
     rows = [(k, 0, BASE_NS + k, float(k)) for k in range(len(names))]
     path = write(tmp_path / "x.mcap", rows, names)
@@ -310,7 +306,7 @@ def test_topics_of_any_length_and_likeness_get_files_of_their_own(
         assert all((tmp_path / f"x_{kind}" / name).exists() for name in files.values())
 
 
-def test_raw_bytes_are_exported_only_when_asked_for(
+def test_raw_bytes_are_exported_only_on_request(
     log_tool: Any, recorded: Any, tmp_path: Path
 ) -> None:
     path = recorded(tmp_path / "run.mcap", 0.2)
@@ -379,7 +375,7 @@ def test_service_events_and_wide_strings_are_read(
         assert next(csv.DictReader(table))["text"] == wide
 
 
-def test_definitions_that_contain_themselves_are_refused(log_tool: Any, tmp_path: Path) -> None:
+def test_recursive_definitions_are_refused(log_tool: Any, tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
@@ -411,7 +407,7 @@ def test_definitions_that_contain_themselves_are_refused(log_tool: Any, tmp_path
         {"use_statistics": False},
     ],
 )
-def test_a_bag_of_a_log_without_indexes_is_written_anew(
+def test_bag_of_an_unindexed_log_is_rewritten(
     log_tool: Any, tmp_path: Path, how: dict[str, Any]
 ) -> None:
     path = write(tmp_path / "x.mcap", steady(20), qos=LATCHED, **how)
@@ -428,9 +424,7 @@ def test_a_bag_of_a_log_without_indexes_is_written_anew(
     assert (tmp_path / "same" / "w.mcap").read_bytes() == whole.read_bytes()
 
 
-def test_the_recorded_qos_is_carried_over_and_latched_topics_stay_latched(
-    log_tool: Any, tmp_path: Path
-) -> None:
+def test_recorded_qos_and_latching_are_preserved(log_tool: Any, tmp_path: Path) -> None:
     from rosbags.rosbag2 import Reader
     from rosbags.rosbag2.metadata import dump_qos_v8, parse_qos
     from ruamel.yaml import YAML

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import itertools
-import sys
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from support import virtual_daemon
 from tactile_tools.plot import curves, skin
 from tactile_tools.plot.curves import broken, holes, presses
 from tactile_tools.plot.look import LOOKS, Sheet, drawn
@@ -33,16 +31,11 @@ REASON = "the ambient field is not known: fewer than half of the taxels of the l
 @pytest.fixture(scope="module")
 def board(tmp_path_factory: pytest.TempPathFactory) -> BoardSeries:
     """A simulated finger that is pressed on its left side from 1.5 s on."""
-    place = Path(__file__).with_name("virtual_daemon.py")
-    spec = importlib.util.spec_from_file_location("virtual_daemon", place)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["virtual_daemon"] = module
-    spec.loader.exec_module(module)
     path = tmp_path_factory.mktemp("skin") / "run.mcap"
-    daemon: Any = module.VirtualDaemon(
-        path, [module.make_board(contacts=module.press, rate=50.0)], [module.calibration()]
+    daemon = virtual_daemon.VirtualDaemon(
+        path,
+        [virtual_daemon.make_board(contacts=virtual_daemon.press, rate=50.0)],
+        [virtual_daemon.calibration()],
     )
     daemon.run(2.2)
     daemon.close()
@@ -104,9 +97,7 @@ def laid_out(sheet: Sheet) -> Any:
 @pytest.mark.parametrize(
     ("size", "count"), [("screen", 0), ("column", 4), ("page", 200), ("column", 200)]
 )
-def test_any_number_of_events_stands_off_the_data(
-    board: BoardSeries, size: str, count: int
-) -> None:
+def test_event_labels_never_cover_the_data(board: BoardSeries, size: str, count: int) -> None:
     look = LOOKS[size]
     with drawn(look):
         figure = laid_out(curves.forces_sheet(with_events(board, count), look))
@@ -122,7 +113,7 @@ def test_any_number_of_events_stands_off_the_data(
 
 @pytest.mark.parametrize("what", SHEETS)
 @pytest.mark.parametrize("size", ["column", "screen"])
-def test_every_picture_keeps_its_words_inside_and_off_the_data(
+def test_labels_stay_inside_every_picture_and_off_the_data(
     board: BoardSeries, what: str, size: str
 ) -> None:
     """Also with long and odd names, a hole and features that are not valid."""
@@ -152,7 +143,7 @@ def test_every_picture_keeps_its_words_inside_and_off_the_data(
         assert any(text.strip("\u200a ").endswith("_left $x$") for text in named)
 
 
-def test_no_line_is_drawn_through_a_hole(board: BoardSeries) -> None:
+def test_no_line_is_drawn_across_missing_data(board: BoardSeries) -> None:
     look = LOOKS["screen"]
     with drawn(look):
         for build in (curves.forces_sheet, curves.field_sheet, curves.timing_sheet):
@@ -169,7 +160,7 @@ def test_no_line_is_drawn_through_a_hole(board: BoardSeries) -> None:
             assert drawn_lines >= 3
 
 
-def test_a_hole_is_told_from_what_a_scheduler_delays_and_from_another_rate() -> None:
+def test_missing_data_is_distinguished_from_delay_and_rate_change() -> None:
     time = np.arange(0.0, 10.0, 0.01)
     assert holes(time) == []
     late = time + np.where(np.arange(len(time)) % 97 == 0, 0.03, 0.0)
@@ -185,7 +176,7 @@ def test_a_hole_is_told_from_what_a_scheduler_delays_and_from_another_rate() -> 
     assert 3.0 < x[np.isnan(y)][0] < 3.2
 
 
-def test_the_strongest_moments_are_different_presses() -> None:
+def test_strongest_moments_are_different_presses() -> None:
     """A jam that chatters is one; a press held while another comes and goes is one of its own."""
     rng = np.random.default_rng(1)
     time = np.arange(0.0, 20.0, 0.01)
@@ -205,7 +196,7 @@ def test_the_strongest_moments_are_different_presses() -> None:
     assert presses([], np.zeros((0, 3)), 0.3, 6) == []
 
 
-def test_what_a_clock_was_before_it_was_known_does_not_set_the_scale(board: BoardSeries) -> None:
+def test_early_clock_estimates_do_not_set_the_scale(board: BoardSeries) -> None:
     told = Track()
     rng = np.random.default_rng(2)
     for second in range(60):
@@ -220,7 +211,7 @@ def test_what_a_clock_was_before_it_was_known_does_not_set_the_scale(board: Boar
     assert any("3 points, 4e+03" in t.get_text() for t in axes.get_legend().texts)
 
 
-def test_a_board_of_very_many_arrays_is_drawn_in_part_and_says_so(board: BoardSeries) -> None:
+def test_board_of_very_many_arrays_is_drawn_partially_with_a_note(board: BoardSeries) -> None:
     times = 40
     geometry = SimpleNamespace(
         array_side=[0] * times, array_rows=[2] * times, array_columns=[2] * times,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import subprocess
 import sys
@@ -13,6 +12,8 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from support import virtual_daemon
+from support.log_rewriting import rewrite
 from tactile_tools.cli import main
 from tactile_tools.plot.series import BoardSeries, Spread, Track, read_boards
 
@@ -22,16 +23,11 @@ pytestmark = pytest.mark.timeout(600)
 @pytest.fixture(scope="module")
 def skin_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated finger that is pressed on its left side."""
-    place = Path(__file__).with_name("virtual_daemon.py")
-    spec = importlib.util.spec_from_file_location("virtual_daemon", place)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["virtual_daemon"] = module
-    spec.loader.exec_module(module)
     path = tmp_path_factory.mktemp("skin") / "run.mcap"
-    daemon: Any = module.VirtualDaemon(
-        path, [module.make_board(contacts=module.press, rate=50.0)], [module.calibration()]
+    daemon = virtual_daemon.VirtualDaemon(
+        path,
+        [virtual_daemon.make_board(contacts=virtual_daemon.press, rate=50.0)],
+        [virtual_daemon.calibration()],
     )
     daemon.run(2.2)
     daemon.close()
@@ -64,7 +60,7 @@ def test_every_picture_is_drawn_without_a_display(skin_log: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize(("size", "inches"), [("column", 3.5), ("page", 7.1)])
-def test_a_picture_for_a_paper_has_its_width(
+def test_paper_picture_has_the_requested_width(
     size: str, inches: float, skin_log: Path, tmp_path: Path
 ) -> None:
     words = ["plot", str(skin_log), "--what", "forces", "--size", size]
@@ -73,7 +69,7 @@ def test_a_picture_for_a_paper_has_its_width(
     assert picture(out).shape[1] == pytest.approx(120 * inches, abs=1)
 
 
-def test_vector_formats_are_written_beside_the_log_and_the_same_each_time(
+def test_vector_formats_are_written_beside_the_log_deterministically(
     skin_log: Path, tmp_path: Path
 ) -> None:
     log = tmp_path / "run.mcap"
@@ -87,8 +83,8 @@ def test_vector_formats_are_written_beside_the_log_and_the_same_each_time(
         assert written[0].startswith(begin)
 
 
-def test_of_two_boards_it_is_said_which_is_drawn(
-    skin_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], rewrite: Any
+def test_drawn_board_of_two_is_named(
+    skin_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def with_thumb(topic: str, at: int, message: Any) -> list[tuple[str, int, Any]]:
         return [(topic, at, message), (topic.replace("finger", "thumb_2"), at, message)]
@@ -102,7 +98,7 @@ def test_of_two_boards_it_is_said_which_is_drawn(
     assert "choose" not in capsys.readouterr().out
 
 
-def test_the_strongest_moment_is_that_of_the_press(skin_log: Path) -> None:
+def test_strongest_moment_is_the_press(skin_log: Path) -> None:
     from tactile_tools.plot.skin import strongest
 
     board = read_boards(skin_log)["finger"]
@@ -137,7 +133,7 @@ def test_bad_arguments_are_refused(
         assert "Traceback" not in said
 
 
-def test_a_long_log_keeps_its_peaks_in_bounded_memory() -> None:
+def test_long_log_keeps_its_peaks_in_bounded_memory() -> None:
     track = Track(limit=1000)
     for i in range(100_000):
         track.add(i * 0.01, i, 50.0 if i == 31_415 else 1.0)
@@ -148,7 +144,7 @@ def test_a_long_log_keeps_its_peaks_in_bounded_memory() -> None:
     assert track.items[-1] > 99_000
 
 
-def test_percentiles_are_right_to_six_per_cent() -> None:
+def test_percentiles_are_accurate_to_six_per_cent() -> None:
     spread = Spread()
     rng = np.random.default_rng(3)
     values = rng.lognormal(-6, 1, 20_000)
@@ -160,7 +156,7 @@ def test_percentiles_are_right_to_six_per_cent() -> None:
     assert spread.number == len(values)
 
 
-def test_a_board_without_compensation_or_clock_is_drawn(skin_log: Path, tmp_path: Path) -> None:
+def test_board_without_compensation_or_clock_is_drawn(skin_log: Path, tmp_path: Path) -> None:
     from tactile_tools.plot.curves import draw_field, draw_timing
     from tactile_tools.plot.skin import draw
 

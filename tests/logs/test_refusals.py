@@ -18,7 +18,7 @@ pytestmark = pytest.mark.timeout(600)
 FEATURES, COMMAND, EVENT = "/tactile/finger/features", "/arm/arm/cmd_vel", "/reach/reach/event"
 
 
-def test_bad_arguments_are_named_with_what_is_allowed(
+def test_bad_arguments_are_named_with_allowed_values(
     log_tool: Any, recorded: Any, tmp_path: Path, counts: Any
 ) -> None:
     path = recorded(tmp_path / "run.mcap", 0.1)
@@ -49,7 +49,7 @@ def test_bad_arguments_are_named_with_what_is_allowed(
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0", b"GIF89a" + bytes(3000)])
-def test_every_tool_refuses_what_is_no_log(log_tool: Any, tmp_path: Path, content: bytes) -> None:
+def test_every_tool_refuses_a_non_log_file(log_tool: Any, tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
     out = ("--out", tmp_path / "o.mcap")
@@ -64,9 +64,7 @@ def test_every_tool_refuses_what_is_no_log(log_tool: Any, tmp_path: Path, conten
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
-def test_files_that_may_not_be_read_are_refused(
-    log_tool: Any, recorded: Any, tmp_path: Path
-) -> None:
+def test_unreadable_files_are_refused(log_tool: Any, recorded: Any, tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", 0.1)
     path.chmod(0)
     outcome = log_tool("info", path)
@@ -74,7 +72,7 @@ def test_files_that_may_not_be_read_are_refused(
     assert "permissions" in outcome.err
 
 
-def test_a_file_that_the_system_refuses_is_told(
+def test_file_system_errors_are_reported(
     log_tool: Any, recorded: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = recorded(tmp_path / "run.mcap", 0.1)
@@ -89,7 +87,7 @@ def test_a_file_that_the_system_refuses_is_told(
         assert "check the file's permissions" in outcome.err
 
 
-def test_a_full_disk_ends_with_a_message_and_leaves_nothing(
+def test_full_disk_ends_with_a_message_and_no_file(
     log_tool: Any, recorded: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = recorded(tmp_path / "run.mcap", 0.3)
@@ -110,7 +108,7 @@ def test_a_full_disk_ends_with_a_message_and_leaves_nothing(
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
-def test_output_to_a_full_device_is_told(recorded: Any, tmp_path: Path) -> None:
+def test_output_to_a_full_device_is_reported(recorded: Any, tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", 1.0)
     with open("/dev/full", "w") as full:
         done = subprocess.run(
@@ -122,9 +120,7 @@ def test_output_to_a_full_device_is_told(recorded: Any, tmp_path: Path) -> None:
     assert "cannot write" in done.stderr
 
 
-def test_an_export_to_a_place_that_is_not_there_is_refused(
-    log_tool: Any, recorded: Any, tmp_path: Path
-) -> None:
+def test_export_to_a_missing_place_is_refused(log_tool: Any, recorded: Any, tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", 0.1)
     for words in (
         ("export", path, "--to", "csv", "--out", "/proc/none/x"),

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ import pytest
 
 from sim_device.board.firmware import ClockParameters
 from sim_device.faults import FaultPlan
+from support import virtual_daemon as virtual
 from tactile_core.bus.messages import codec
 from tactile_core.bus.topics import FEATURES
 from tactile_core.calibration import save
@@ -25,19 +24,6 @@ from tactiled.sensing.settings import PipelineSettings
 pytestmark = pytest.mark.timeout(600)
 
 COUNTED = re.compile(r"^(\S+): (\d+) messages, (\d+) in the log; (\d+) the same to the bit$", re.M)
-
-
-@pytest.fixture(scope="module")
-def virtual() -> Any:
-    """The helper module beside this file: there is no package to import it from."""
-    path = Path(__file__).with_name("virtual_daemon.py")
-    spec = importlib.util.spec_from_file_location("virtual_daemon", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["virtual_daemon"] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def counts(out: str) -> dict[str, tuple[int, int, int]]:
@@ -60,7 +46,7 @@ def features(path: Path, board: str = "finger") -> list[Any]:
 
 
 @pytest.fixture(scope="module")
-def pressed_log(virtual: Any, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def pressed_log(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     path = tmp_path_factory.mktemp("pressed") / "run.mcap"
     board = virtual.make_board(contacts=virtual.press, clock=ClockParameters(error=0.03))
     daemon = virtual.VirtualDaemon(path, [board], [virtual.calibration()])
@@ -90,9 +76,7 @@ def test_the_same_settings_give_the_same_bytes(log_tool: Any, pressed: Path) -> 
     all_same(log_tool("reprocess", out, "--out", out.with_name("third.mcap")), 150)
 
 
-def test_so_it_does_whatever_happened_on_the_way(
-    log_tool: Any, virtual: Any, tmp_path: Path
-) -> None:
+def test_reprocessing_is_exact_after_any_event(log_tool: Any, tmp_path: Path) -> None:
     """Bad wire, tare, new rate, silence, unplugging, reset, a stalled pipeline, a recalibration."""
     path = tmp_path / "run.mcap"
     plan = FaultPlan(seed=3, flip=2e-5, loss=0.01, duplicate=0.01, reorder=0.01, reset=(4.9,))
@@ -128,7 +112,7 @@ def test_so_it_does_whatever_happened_on_the_way(
     all_same(log_tool("reprocess", path), 120)
 
 
-def test_boards_on_a_can_bus_in_split_files(log_tool: Any, virtual: Any, tmp_path: Path) -> None:
+def test_boards_on_a_can_bus_in_split_files(log_tool: Any, tmp_path: Path) -> None:
     boards = [virtual.make_can_board(seed, node, rate=50.0) for seed, node in ((7, 3), (8, 4))]
     small = RecorderSettings(min_free_bytes=0, split_bytes=40_000, flush_period=0.02)
     daemon = virtual.VirtualDaemon(
@@ -145,7 +129,7 @@ def test_boards_on_a_can_bus_in_split_files(log_tool: Any, virtual: Any, tmp_pat
 
 
 def test_new_settings_and_calibrations_give_new_features(
-    log_tool: Any, virtual: Any, pressed: Path, tmp_path: Path
+    log_tool: Any, pressed: Path, tmp_path: Path
 ) -> None:
     first = virtual.calibration()
     arrays = tuple(replace(a, newton_per_ut=a.newton_per_ut * 2) for a in first.arrays)
@@ -177,9 +161,7 @@ def test_new_settings_and_calibrations_give_new_features(
     assert not any(f.patches for f in features(tmp_path / "high.mcap"))
 
 
-def test_a_log_that_was_cut_off_gives_what_its_bytes_give(
-    log_tool: Any, pressed: Path, tmp_path: Path
-) -> None:
+def test_truncated_log_reprocesses_its_bytes(log_tool: Any, pressed: Path, tmp_path: Path) -> None:
     data = pressed.read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(data[: len(data) * 4 // 5])
@@ -191,9 +173,7 @@ def test_a_log_that_was_cut_off_gives_what_its_bytes_give(
     assert "not closed" in outcome.out
 
 
-def test_a_log_whose_beginning_is_missing_is_only_listened_to(
-    log_tool: Any, virtual: Any, tmp_path: Path
-) -> None:
+def test_log_without_its_beginning_is_reprocessed_passively(log_tool: Any, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     board = virtual.make_board(rate=50.0)
     daemon = virtual.VirtualDaemon(path, [board], [virtual.calibration()])
@@ -228,8 +208,8 @@ def without_state(part: Path, out: Path) -> None:
 
 
 @pytest.mark.parametrize("medium", ["serial", "can"])
-def test_a_later_file_alone_runs_from_what_it_says_itself_or_not_at_all(
-    log_tool: Any, virtual: Any, tmp_path: Path, medium: str
+def test_later_file_alone_is_reprocessed_from_its_own_records_or_refused(
+    log_tool: Any, tmp_path: Path, medium: str
 ) -> None:
     path = tmp_path / "run.mcap"
     contacts = {"contacts": virtual.press}
@@ -261,9 +241,7 @@ def test_a_later_file_alone_runs_from_what_it_says_itself_or_not_at_all(
     assert {p.name for p in tmp_path.iterdir()} == {"run.mcap", "run_split", "old.mcap"}
 
 
-def test_every_file_of_a_recorder_says_what_it_needs_to_be_run_alone(
-    log_tool: Any, virtual: Any, tmp_path: Path
-) -> None:
+def test_every_file_holds_what_reprocessing_needs(log_tool: Any, tmp_path: Path) -> None:
     small = RecorderSettings(min_free_bytes=0, split_bytes=700_000, flush_period=0.02)
     daemon = virtual.VirtualDaemon(
         tmp_path / "run.mcap", [virtual.make_board()], [virtual.calibration()], recorder=small
@@ -278,8 +256,8 @@ def test_every_file_of_a_recorder_says_what_it_needs_to_be_run_alone(
     assert tables["state:finger"]["rest"]
 
 
-def test_what_cannot_be_reprocessed_is_refused(
-    log_tool: Any, virtual: Any, pressed: Path, recorded: Any, tmp_path: Path
+def test_log_that_cannot_be_reprocessed_is_refused(
+    log_tool: Any, pressed: Path, recorded: Any, tmp_path: Path
 ) -> None:
     other = tmp_path / "other.cal.toml"
     save(virtual.calibration(99), other)
@@ -303,7 +281,7 @@ def test_what_cannot_be_reprocessed_is_refused(
     assert not (tmp_path / "o.mcap").exists()
 
 
-def test_settings_of_a_newer_version_are_named(log_tool: Any, virtual: Any, tmp_path: Path) -> None:
+def test_newer_settings_are_named(log_tool: Any, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     daemon = virtual.VirtualDaemon(path, [virtual.make_board()], [virtual.calibration()])
     daemon.recorder.metadata("pipeline", {"method": '"off"', "quantum": "1"})
@@ -317,7 +295,7 @@ def test_settings_of_a_newer_version_are_named(log_tool: Any, virtual: Any, tmp_
 
 
 @pytest.mark.parametrize("flag", ["--config", "--calibration"])
-def test_a_log_is_not_reprocessed_by_what_cannot_be_read(
+def test_log_with_unreadable_calibration_is_not_reprocessed(
     pressed: Path, log_tool: Any, tmp_path: Path, flag: str
 ) -> None:
     os.mkfifo(tmp_path / "pipe.toml")

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.timeout(600)
 COMMAND = "/arm/arm/cmd_vel"
 
 
-def test_files_of_one_log_are_read_as_one(log_tool: Any, recorded: Any, tmp_path: Path) -> None:
+def test_split_files_are_read_as_one_log(log_tool: Any, recorded: Any, tmp_path: Path) -> None:
     recorded(tmp_path / "one.mcap", 2.0)
     assert log_tool("split", tmp_path / "one.mcap", "--every", "0.5").code == 0
     parts = tmp_path / "one_split"
@@ -40,7 +40,7 @@ def test_files_of_one_log_are_read_as_one(log_tool: Any, recorded: Any, tmp_path
     assert "files of this log are not here: number 1" in lacking.out
 
 
-def test_a_split_by_size_or_moment_keeps_everything(
+def test_split_by_size_or_time_keeps_everything(
     log_tool: Any, recorded: Any, tmp_path: Path, counts: Any
 ) -> None:
     path = recorded(tmp_path / "run.mcap", 2.0)
@@ -59,7 +59,7 @@ def test_a_split_by_size_or_moment_keeps_everything(
         assert total == counts(path)
 
 
-def test_values_that_hold_begin_every_part(
+def test_latched_values_start_every_part(
     log_tool: Any, recorded: Any, tmp_path: Path, counts: Any
 ) -> None:
     from tactile_core.bus.messages import MSG, codec, header
@@ -90,7 +90,7 @@ def test_values_that_hold_begin_every_part(
     assert counts(merged) == counts(path)  # the repeated ones are told apart
 
 
-def test_logs_of_two_daemons_become_one_trial(
+def test_logs_of_two_daemons_merge_into_one(
     log_tool: Any, recorded: Any, tmp_path: Path, counts: Any
 ) -> None:
     """The second heard what the first said and logged it too; it began a little later."""
@@ -114,7 +114,7 @@ def test_logs_of_two_daemons_become_one_trial(
     assert counts(kept)[COMMAND] == 200
 
 
-def test_logs_whose_clocks_differ_are_put_together(
+def test_logs_with_different_clocks_are_aligned(
     log_tool: Any, recorded: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = recorded(tmp_path / "a.mcap", 0.2)
@@ -132,7 +132,7 @@ def test_logs_whose_clocks_differ_are_put_together(
     assert (span[1] - span[0]) / 1e9 < 1.0
 
 
-def test_a_bag_is_made_beside_the_files_or_of_recovered_ones(
+def test_bag_is_written_beside_files_or_from_recovered_ones(
     log_tool: Any, recorded: Any, tmp_path: Path
 ) -> None:
     path = recorded(tmp_path / "run.mcap", 0.5)

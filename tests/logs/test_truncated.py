@@ -63,7 +63,9 @@ def tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Callable
     }
 
 
-def test_cut_off_at_every_byte(tools: Any, tmp_path: Path, tiny_log: Any) -> None:
+def test_log_cut_at_any_byte_is_read_up_to_the_cut(
+    tools: Any, tmp_path: Path, tiny_log: Any
+) -> None:
     whole = tiny_log(tmp_path / "whole.mcap")
     cut = tmp_path / "cut.mcap"
     codes: dict[str, list[int]] = {name: [] for name in tools}
@@ -80,9 +82,7 @@ def test_cut_off_at_every_byte(tools: Any, tmp_path: Path, tiny_log: Any) -> Non
     assert set(codes["info"][8:]) == {0}
 
 
-def test_a_byte_spoilt_anywhere_is_noticed_or_harmless(
-    tools: Any, tmp_path: Path, tiny_log: Any
-) -> None:
+def test_corrupted_byte_is_noticed_or_harmless(tools: Any, tmp_path: Path, tiny_log: Any) -> None:
     whole = tiny_log(tmp_path / "whole.mcap")
     rng = random.Random(2)
     path = tmp_path / "spoilt.mcap"

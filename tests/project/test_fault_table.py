@@ -24,14 +24,14 @@ def table() -> dict[int, list[tuple[str, str]]]:
     return found
 
 
-def test_every_fault_has_its_row_and_every_row_a_test() -> None:
+def test_every_fault_has_a_row_and_every_row_a_test() -> None:
     rows = table()
     assert set(rows) == set(range(1, ROWS + 1))
     assert [row for row, named in rows.items() if not named] == []
 
 
 @pytest.mark.parametrize("row", sorted(table()))
-def test_the_tests_that_a_row_names_exist(row: int) -> None:
+def test_tests_named_by_a_row_exist(row: int) -> None:
     for file, function in table()[row]:
         tree = ast.parse((TESTS / file).read_text(encoding="utf-8"))
         functions = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}

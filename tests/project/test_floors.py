@@ -50,7 +50,7 @@ def test_imports_point_downward(room: str) -> None:
         assert not upward, f"{path.relative_to(ROOT)} imports {sorted(upward)}"
 
 
-def test_the_protocol_does_no_io() -> None:
+def test_protocol_does_no_io() -> None:
     allowed = set(sys.stdlib_module_names) | {"numpy", "sensor_proto"}
     for path in sorted(ROOMS["sensor_proto"].rglob("*.py")):
         names = imported(path)

@@ -38,7 +38,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return next(out.glob("*.whl"))
 
 
-def test_the_wheel_holds_our_packages_and_nothing_generic(wheel: Path) -> None:
+def test_wheel_holds_only_our_packages(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     tops = {name.split("/")[0] for name in names}
     assert {t for t in tops if not t.endswith(".dist-info")} == TOP_LEVEL
@@ -47,7 +47,7 @@ def test_the_wheel_holds_our_packages_and_nothing_generic(wheel: Path) -> None:
 
 
 @pytest.mark.timeout(300)
-def test_every_command_starts_from_a_clean_environment(wheel: Path, tmp_path: Path) -> None:
+def test_every_command_starts_in_a_clean_environment(wheel: Path, tmp_path: Path) -> None:
     home = tmp_path / "env"
     run(sys.executable, "-m", "venv", "--without-pip", home)
     python = home / "bin" / "python"

@@ -40,7 +40,7 @@ ALL = {
 }
 
 
-def test_it_puts_in_place_and_takes_away_what_it_says(root: Path) -> None:
+def test_service_installs_and_uninstalls_the_listed_files(root: Path) -> None:
     assert files(root) == ALL
     assert main(["service", "uninstall", "--root", str(root)]) == 0
     assert files(root) == {"etc/tactile/tactiled.toml", "etc/tactile/reachd.toml"}
@@ -49,7 +49,7 @@ def test_it_puts_in_place_and_takes_away_what_it_says(root: Path) -> None:
     assert main(["service", "uninstall", "--root", str(root), "--purge"]) == 0
 
 
-def test_a_configuration_of_the_users_is_kept(root: Path) -> None:
+def test_user_configuration_is_kept(root: Path) -> None:
     mine = root / "etc/tactile/tactiled.toml"
     mine.write_text("rate = 50\n", encoding="utf-8")
     (root / "etc/systemd/system/tactiled.service").write_text("old", encoding="utf-8")
@@ -59,9 +59,7 @@ def test_a_configuration_of_the_users_is_kept(root: Path) -> None:
     assert unit.startswith("# Made by")
 
 
-def test_a_dry_run_writes_and_deletes_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_dry_run_writes_and_deletes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert main(["service", "install", "--root", str(tmp_path), "--dry-run"]) == 0
     assert files(tmp_path) == set()
     assert capsys.readouterr().out.count("would write") == len(ALL)
@@ -71,9 +69,7 @@ def test_a_dry_run_writes_and_deletes_nothing(
     assert capsys.readouterr().out.count("would delete") == len(ALL)
 
 
-def test_bad_input_is_refused_with_its_remedy(
-    tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_bad_input_is_refused_with_a_remedy(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert main(["service", "install", "--root", str(tmp_path / "none")]) == 2
     assert "no such folder" in capsys.readouterr().err
     (tmp_path / "a b").mkdir()
@@ -85,7 +81,7 @@ def test_bad_input_is_refused_with_its_remedy(
 
 
 @pytest.mark.parametrize("unit", UNITS)
-def test_the_units_say_what_a_month_on_a_robot_needs(root: Path, unit: str) -> None:
+def test_units_have_the_settings_for_unattended_use(root: Path, unit: str) -> None:
     text = (root / "etc/systemd/system" / unit).read_text(encoding="utf-8")
     said = dict(line.split("=", 1) for line in text.splitlines() if "=" in line and line[0] != "#")
     assert "@" not in text.replace("~@privileged", "").replace("@system-service", "")
@@ -109,7 +105,7 @@ def test_the_units_say_what_a_month_on_a_robot_needs(root: Path, unit: str) -> N
 
 
 @pytest.mark.parametrize("unit", UNITS)
-def test_systemd_takes_the_units_and_finds_little_to_attack(root: Path, unit: str) -> None:
+def test_systemd_accepts_the_units_with_low_exposure(root: Path, unit: str) -> None:
     if shutil.which("systemd-analyze") is None:
         pytest.skip("needs systemd-analyze, which comes with systemd")
     path = root / "etc/systemd/system" / unit
@@ -128,7 +124,7 @@ def test_systemd_takes_the_units_and_finds_little_to_attack(root: Path, unit: st
     assert float(judged[1]) < ALLOWED_EXPOSURE
 
 
-def test_the_udev_rules_are_rules(root: Path) -> None:
+def test_udev_rules_are_valid(root: Path) -> None:
     text = (root / "etc/udev/rules.d/70-tactile.rules").read_text(encoding="utf-8")
     lines = [line for line in text.splitlines() if line and line[0] != "#"]
     assert lines
@@ -140,7 +136,7 @@ def test_the_udev_rules_are_rules(root: Path) -> None:
     assert set(re.findall(r'GOTO="(\w+)"', text)) <= labels
 
 
-def test_the_first_configurations_are_taken_by_the_daemons(root: Path) -> None:
+def test_installed_configurations_are_accepted_by_the_daemons(root: Path) -> None:
     skin = load_toml(root / "etc/tactile/tactiled.toml", SkinConfig)
     assert skin.board[0].port == "/dev/ttyACM0"
     assert skin.log.recorder.max_bytes == 32 << 30

@@ -67,7 +67,7 @@ def test_features_lost_for_a_second_latch(
     assert aged(off, off.fresh_touch(), age).held is None
 
 
-def test_the_older_of_capture_and_arrival_counts(rig: Callable, codes: Callable) -> None:
+def test_older_of_capture_and_arrival_counts(rig: Callable, codes: Callable) -> None:
     for captured, received in ((195 * MS, 0), (0, 195 * MS)):
         r = rig()
         for _ in range(30):
@@ -78,7 +78,7 @@ def test_the_older_of_capture_and_arrival_counts(rig: Callable, codes: Callable)
 
 
 @pytest.mark.parametrize("spoil", [{"valid": False}, {"tip_force": math.nan}, {"peak_x": math.inf}])
-def test_only_valid_features_count(spoil: dict, rig: Callable, passes: Callable) -> None:
+def test_only_valid_features_renew_touch(spoil: dict, rig: Callable, passes: Callable) -> None:
     r = rig()
     moved = 0
     for _ in range(30):
@@ -93,7 +93,7 @@ def test_only_valid_features_count(spoil: dict, rig: Callable, passes: Callable)
 
 
 @pytest.mark.parametrize(("every", "moves"), [(1, True), (2, True), (3, False), (18, False)])
-def test_touch_that_is_valid_now_and_then_stops(
+def test_intermittently_valid_touch_stops(
     every: int, moves: bool, rig: Callable, codes: Callable
 ) -> None:
     """Half of the last 200 ms is enough, a third is not."""
@@ -108,7 +108,7 @@ def test_touch_that_is_valid_now_and_then_stops(
     assert r.step().twist != ZERO, "it goes on by itself"
 
 
-def test_time_that_goes_back_tells_nothing_of_touch(rig: Callable) -> None:
+def test_backward_time_does_not_renew_touch(rig: Callable) -> None:
     r = rig(Check.CLOCK_BACKWARDS)
     for _ in range(30):
         r.step(touch=replace(r.fresh_touch(), valid=False))
@@ -116,7 +116,7 @@ def test_time_that_goes_back_tells_nothing_of_touch(rig: Callable) -> None:
     assert "features_sparse" not in {i.code.value for i in r.step().interventions}
 
 
-def test_features_out_of_order_do_not_make_older(rig: Callable, passes: Callable) -> None:
+def test_out_of_order_features_do_not_age_touch(rig: Callable, passes: Callable) -> None:
     r = rig()
     r.step()
     assert passes(r.step(touch=r.fresh_touch(age=500 * MS)))
@@ -125,7 +125,7 @@ def test_features_out_of_order_do_not_make_older(rig: Callable, passes: Callable
 @pytest.mark.parametrize(
     ("ahead", "used"), [(0, True), (10 * MS, True), (10 * MS + 1, False), (10**12, False)]
 )
-def test_features_from_the_future_are_not_used(
+def test_future_features_are_not_used(
     ahead: int, used: bool, rig: Callable, codes: Callable, passes: Callable
 ) -> None:
     for field in ("captured", "received"):
@@ -150,7 +150,7 @@ def test_features_from_the_future_are_not_used(
     ("age", "moves"),
     [(0, True), (37 * MS, True), (37 * MS + 1, False), (50 * MS, False), (1000 * MS, False)],
 )
-def test_motion_ends_before_the_arms_state_is_50_ms_old(
+def test_motion_ends_before_arm_state_is_50_ms_old(
     age: int, moves: bool, rig: Callable, codes: Callable, passes: Callable
 ) -> None:
     for captured, received in ((age, 0), (0, age), (age, age)):
@@ -166,7 +166,7 @@ def test_motion_ends_before_the_arms_state_is_50_ms_old(
 
 
 @pytest.mark.parametrize(("age", "latches"), [(1000 * MS, False), (1000 * MS + 1, True)])
-def test_an_arm_that_was_away_latches(age: int, latches: bool, rig: Callable) -> None:
+def test_missing_arm_latches(age: int, latches: bool, rig: Callable) -> None:
     r = rig()
     assert (r.step(arm=r.fresh_arm(age=age - r.period)).held is Check.ARM_LOST) == latches
     r = rig(Check.ARM_LOST)
@@ -174,9 +174,7 @@ def test_an_arm_that_was_away_latches(age: int, latches: bool, rig: Callable) ->
 
 
 @pytest.mark.parametrize(("ahead", "moves"), [(10 * MS, True), (10 * MS + 1, False)])
-def test_arm_state_from_the_future_stops(
-    ahead: int, moves: bool, rig: Callable, passes: Callable
-) -> None:
+def test_future_arm_state_stops(ahead: int, moves: bool, rig: Callable, passes: Callable) -> None:
     for field in ("captured", "received"):
         for off, expected in (((), moves), ((Check.ARM_FUTURE,), True)):
             r = rig(*off)
@@ -185,7 +183,7 @@ def test_arm_state_from_the_future_stops(
             assert passes(r.step(arm=arm)) == expected
 
 
-def test_without_any_input_nothing_moves(rig: Callable, codes: Callable, passes: Callable) -> None:
+def test_without_inputs_nothing_moves(rig: Callable, codes: Callable, passes: Callable) -> None:
     r = rig(Check.ARM_STALE, Check.ARM_LOST)
     decision = r.step(arm=None)
     assert not passes(decision)
@@ -197,7 +195,7 @@ def test_without_any_input_nothing_moves(rig: Callable, codes: Callable, passes:
 
 @pytest.mark.parametrize("field", ["x", "y", "heading", "fx", "fy", "mz"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_an_arm_state_that_is_not_finite_stops(
+def test_non_finite_arm_state_stops(
     field: str, value: float, rig: Callable, codes: Callable, passes: Callable
 ) -> None:
     r = rig()
@@ -215,7 +213,7 @@ def still(r: Any, cycles: int, wanted: Twist = STEP, **values: object) -> list[D
     return [r.step(wanted, arm=r.fresh_arm(-r.period, **values)) for _ in range(cycles)]
 
 
-def test_a_frozen_arm_state_latches(rig: Callable, passes: Callable) -> None:
+def test_frozen_arm_state_latches(rig: Callable, passes: Callable) -> None:
     """Once the state is 300 ms old in which nothing had moved yet."""
     r = rig()
     held = [d.held for d in still(r, 33)]
@@ -239,7 +237,7 @@ def test_a_frozen_arm_state_latches(rig: Callable, passes: Callable) -> None:
         ({"fx": -9.0, "twist": Twist(0.0, 0.0, -0.002)}, True),
     ],
 )
-def test_a_jammed_arm_is_not_a_frozen_one(values: dict, frozen: bool, rig: Callable) -> None:
+def test_jammed_arm_is_not_frozen(values: dict, frozen: bool, rig: Callable) -> None:
     assert (still(rig(), 60, **values)[-1].held is Check.ARM_FROZEN) == frozen
 
 
@@ -253,13 +251,13 @@ def test_a_jammed_arm_is_not_a_frozen_one(values: dict, frozen: bool, rig: Calla
         (Twist(0.0, 0.0, -0.014), True),
     ],
 )
-def test_an_arm_at_rest_is_not_a_frozen_one(wanted: Twist, frozen: bool, rig: Callable) -> None:
+def test_arm_at_rest_is_not_frozen(wanted: Twist, frozen: bool, rig: Callable) -> None:
     assert (still(rig(), 60, wanted)[-1].held is Check.ARM_FROZEN) == frozen
 
 
 @pytest.mark.parametrize("name", ["x", "y", "heading"])
 @pytest.mark.parametrize("step", [1.1e-5, 1e-6])
-def test_a_creep_is_not_the_motion_that_was_told(name: str, step: float, rig: Callable) -> None:
+def test_creep_is_not_the_commanded_motion(name: str, step: float, rig: Callable) -> None:
     for sign in (1.0, -1.0):
         r = rig()
         at = 0.0 if name != "x" else -0.2

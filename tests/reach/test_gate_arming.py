@@ -21,7 +21,7 @@ MS = 1_000_000
 T0 = Instant(5_000_000_000)
 
 
-def test_it_begins_disarmed(rig: Callable, codes: Callable, passes: Callable) -> None:
+def test_gate_starts_disarmed(rig: Callable, codes: Callable, passes: Callable) -> None:
     r = rig(armed=False)
     assert not r.gate.armed
     decision = r.step()
@@ -50,7 +50,7 @@ def test_it_begins_disarmed(rig: Callable, codes: Callable, passes: Callable) ->
         ((0.0, 0.0), -0.2, False),
     ],
 )
-def test_a_biased_force_sensor_does_not_arm(
+def test_biased_force_sensor_prevents_arming(
     force: tuple[float, float], torque: float, arms: bool, rig: Callable
 ) -> None:
     for off, expected in (((), arms), ((Check.FREE_AIR,), True)):
@@ -60,7 +60,7 @@ def test_a_biased_force_sensor_does_not_arm(
         assert r.gate.armed == expected
 
 
-def test_in_contact_it_arms_only_after_free_air_was_once_seen(rig: Callable) -> None:
+def test_arming_in_contact_requires_free_air_first(rig: Callable) -> None:
     r = rig(armed=False)
     pressed = {"fx": -6.0}
     assert r.request(arm=r.fresh_arm(**pressed), free_air=False) == {"free_air"}
@@ -81,7 +81,7 @@ def test_in_contact_it_arms_only_after_free_air_was_once_seen(rig: Callable) -> 
         (-10 * MS - 1, False),
     ],
 )
-def test_only_a_fresh_request_arms(age: int, arms: bool, rig: Callable) -> None:
+def test_only_a_new_request_arms(age: int, arms: bool, rig: Callable) -> None:
     r = rig(armed=False)
     refused = r.request(requested=Instant(r.now - age))
     assert refused == (set() if arms else {"request_stale"})
@@ -92,7 +92,7 @@ def estop(r: Any) -> Decision:
 
 
 @pytest.mark.parametrize(("delay", "arms"), [(-1, False), (0, False), (1, True)])
-def test_only_a_request_newer_than_the_latch_arms_again(
+def test_rearming_requires_a_request_newer_than_the_latch(
     delay: int, arms: bool, rig: Callable
 ) -> None:
     r = rig()
@@ -104,7 +104,7 @@ def test_only_a_request_newer_than_the_latch_arms_again(
     assert refused == (set() if arms else {"request_stale"})
 
 
-def test_a_request_made_while_the_fault_lasts_is_not_kept(rig: Callable, passes: Callable) -> None:
+def test_request_during_a_fault_is_not_kept(rig: Callable, passes: Callable) -> None:
     r = rig()
     estop(r)
     asked = Instant(r.now + 1)
@@ -125,13 +125,13 @@ def test_a_request_made_while_the_fault_lasts_is_not_kept(rig: Callable, passes:
         ({"duplicate": True}, "duplicate_publisher"),
     ],
 )
-def test_every_condition_must_be_healthy_to_arm(how: dict, code: str, rig: Callable) -> None:
+def test_arming_requires_every_condition(how: dict, code: str, rig: Callable) -> None:
     r = rig(armed=False)
     assert code in r.request(**how)
     assert not r.gate.armed
 
 
-def test_an_arm_that_stopped_by_itself_may_be_armed_but_not_moved(
+def test_stopped_arm_may_be_armed_but_not_moved(
     rig: Callable, codes: Callable, passes: Callable
 ) -> None:
     r = rig(armed=False)
@@ -140,14 +140,14 @@ def test_an_arm_that_stopped_by_itself_may_be_armed_but_not_moved(
     assert passes(r.step())
 
 
-def test_an_invalid_first_feature_does_not_arm(rig: Callable) -> None:
+def test_invalid_first_feature_does_not_arm(rig: Callable) -> None:
     r = rig(armed=False)
     assert "features_stale" in r.request(touch=replace(r.fresh_touch(), valid=False))
     ahead = replace(r.fresh_touch(), captured=Instant(r.now + 10**9))
     assert "features_stale" in r.request(touch=ahead)
 
 
-def test_a_second_publisher_latches(rig: Callable, passes: Callable) -> None:
+def test_second_publisher_latches(rig: Callable, passes: Callable) -> None:
     r = rig()
     assert r.step(duplicate=True).held is Check.DUPLICATE_PUBLISHER
     assert r.step().held is Check.DUPLICATE_PUBLISHER
@@ -155,7 +155,9 @@ def test_a_second_publisher_latches(rig: Callable, passes: Callable) -> None:
     assert passes(r.step(duplicate=True))
 
 
-def test_the_first_reason_stays_and_later_ones_are_told(rig: Callable, codes: Callable) -> None:
+def test_first_latch_reason_stays_and_later_ones_are_reported(
+    rig: Callable, codes: Callable
+) -> None:
     r = rig()
     estop(r)
     decision = r.step(Twist(math.nan, 0, 0), lateness=1.0)
@@ -168,7 +170,7 @@ def test_the_first_reason_stays_and_later_ones_are_told(rig: Callable, codes: Ca
     assert [i.code for i in estop(r).interventions] == [Check.ARM_MODE]
 
 
-def test_disarming_holds_until_a_newer_request(rig: Callable) -> None:
+def test_disarm_holds_until_a_newer_request(rig: Callable) -> None:
     r = rig()
     r.gate.disarm(r.now, "the operator said so")
     decision = r.step()
@@ -178,13 +180,13 @@ def test_disarming_holds_until_a_newer_request(rig: Callable) -> None:
     assert r.request() == set()
 
 
-def test_arming_an_armed_gate_changes_nothing(rig: Callable, passes: Callable) -> None:
+def test_arming_twice_changes_nothing(rig: Callable, passes: Callable) -> None:
     r = rig()
     assert r.request(arm=None) == set()
     assert passes(r.step())
 
 
-def test_after_arming_motion_grows_from_rest(rig: Callable) -> None:
+def test_motion_after_arming_starts_from_rest(rig: Callable) -> None:
     """Not from what was last sent before the latch: 0.5 m/s² is 5 mm/s a cycle."""
     r = rig()
     for _ in range(20):

@@ -30,7 +30,7 @@ def speed(twist: Twist) -> float:
     return math.hypot(twist.vx, twist.vy)
 
 
-def test_only_what_offends_is_taken_away() -> None:
+def test_only_violating_velocity_is_removed() -> None:
     wall = Constraint(1.0, 0.0, 0.0, 0.01)
     assert constrained(Twist(0.05, 0.03, 0.2), [wall]) == Twist(pytest.approx(0.01), 0.03, 0.2)
     assert constrained(Twist(0.01, 0.03, 0.2), [wall]) == Twist(0.01, 0.03, 0.2)
@@ -45,7 +45,7 @@ def test_only_what_offends_is_taken_away() -> None:
     assert (got.vx, got.omega) == pytest.approx((-0.02, 0.06)), "so does moving away"
 
 
-def test_moving_away_along_a_slant_makes_room_for_turning() -> None:
+def test_retreat_along_a_slant_allows_turning() -> None:
     lever = Constraint(0.6, 0.8, 0.5, 0.01)
     got = constrained(Twist(-0.012, -0.016, 0.1), [lever])
     assert (got.vx, got.vy, got.omega) == pytest.approx((-0.012, -0.016, 0.06))
@@ -62,7 +62,7 @@ def test_rounding_does_not_end_motion() -> None:
         assert speed(got) == pytest.approx(expected, abs=1e-12)
 
 
-def test_in_a_narrow_wedge_the_nearest_velocity_is_none_at_all() -> None:
+def test_narrow_wedge_leaves_zero_velocity() -> None:
     """Taking one component after the other would send the arm back out of the wedge."""
     wedge = [Constraint(math.cos(a), math.sin(a), 0.0, 0.0) for a in (1.0, 2.0)]
     assert speed(constrained(Twist(0.0, 1.0, 0.0), wedge)) == pytest.approx(0.0, abs=1e-12)
@@ -73,7 +73,7 @@ def test_in_a_narrow_wedge_the_nearest_velocity_is_none_at_all() -> None:
     assert constrained(Twist(0.3, 1.0, 0.0), same) == Twist(0.3, pytest.approx(0.1), 0.0)
 
 
-def test_contradicting_constraints_scale_the_whole() -> None:
+def test_contradicting_constraints_scale_the_whole_twist() -> None:
     """Less turning takes the room that a velocity had: then all of it is scaled."""
     rules = [Constraint(1.0, 0.0, -1.0, 0.0), Constraint(0.0, 0.0, 1.0, 0.1)]
     got = constrained(Twist(0.2, 0.1, 0.2), rules)
@@ -131,7 +131,7 @@ def test_constrained_obeys_every_rule_and_adds_nothing(
     FINITE,
     FINITE,
 )
-def test_workspace_constraints_are_the_points_velocities(
+def test_workspace_constraints_limit_point_velocities(
     x: float, y: float, heading: float, vx: float, vy: float, omega: float
 ) -> None:
     """Checked against the distance that tip and pivot really go in a microsecond."""
@@ -156,7 +156,7 @@ def test_workspace_constraints_are_the_points_velocities(
     assert index == len(rules)
 
 
-def test_no_load_no_rules(make_arm: Callable) -> None:
+def test_no_load_gives_no_constraints(make_arm: Callable) -> None:
     assert wrench_constraints(Twist(1, 1, 1), make_arm(), 0.0) == []
     one = wrench_constraints(Twist(1, 0, 1), make_arm(fx=-3.0), 0.5)
     assert one == [Constraint(1.0, 0.0, 0.0, 0.5)]

@@ -48,13 +48,13 @@ def way(rig: Callable) -> Way:
 
 
 @pytest.mark.parametrize("delay", [0.0, 10.0, 30.0, 39.9])
-def test_a_short_way_is_nothing(delay: float, way: Way) -> None:
+def test_short_echo_delay_is_ignored(delay: float, way: Way) -> None:
     way.delay = delay
     assert way.run(100)[0] is None
 
 
 @pytest.mark.parametrize("delay", [60.0, 100.0, 250.0])
-def test_a_long_way_stops_at_once_and_latches(delay: float, way: Way) -> None:
+def test_long_echo_delay_stops_at_once_and_latches(delay: float, way: Way) -> None:
     """Row 37: within 100 ms after the echo lags by 50."""
     way.delay = delay
     seen = [way.step() for _ in range(30)]
@@ -66,7 +66,7 @@ def test_a_long_way_stops_at_once_and_latches(delay: float, way: Way) -> None:
     assert "come into force" in seen[latched[0]].interventions[0].text
 
 
-def test_a_way_that_grows_slowly_is_seen_at_50_ms(way: Way) -> None:
+def test_slowly_growing_echo_delay_is_detected_at_50_ms(way: Way) -> None:
     way.slow = 10.0
     when, decision = way.run(700)
     assert when is not None
@@ -74,7 +74,7 @@ def test_a_way_that_grows_slowly_is_seen_at_50_ms(way: Way) -> None:
     assert 40.0 <= way.delay <= 52.0
 
 
-def test_one_hiccup_only_stops(way: Way) -> None:
+def test_single_delay_spike_only_stops(way: Way) -> None:
     way.delay = 80.0
     stopped = sum(way.step().twist == ZERO for _ in range(4))
     way.delay = 5.0
@@ -84,7 +84,7 @@ def test_one_hiccup_only_stops(way: Way) -> None:
     assert seen[-1].twist != ZERO
 
 
-def test_a_loop_that_stood_still_sent_nothing_to_be_late(way: Way) -> None:
+def test_stalled_loop_does_not_count_as_echo_delay(way: Way) -> None:
     way.rig.now = after(way.rig.now, 0.5)
     decisions = [way.step() for _ in range(5)]
     codes = {i.code for d in decisions for i in d.interventions}
@@ -105,7 +105,7 @@ def test_the_checks_can_be_switched_off(rig: Callable) -> None:
 
 
 @pytest.mark.parametrize("who", ["", "other-2"])
-def test_an_arm_that_obeys_another_latches(who: str, way: Way) -> None:
+def test_arm_obeying_another_commander_latches(who: str, way: Way) -> None:
     r = way.rig
     echo = Echo(who, 5, Instant(r.now), own=False)
     decision = r.step(arm=r.fresh_arm(-r.period, echo=echo))
@@ -115,7 +115,7 @@ def test_an_arm_that_obeys_another_latches(who: str, way: Way) -> None:
     assert Check.COMMANDER in ALWAYS_ON
 
 
-def test_after_a_new_grant_nothing_is_late_before_the_first_command(rig: Callable) -> None:
+def test_new_grant_restarts_the_echo_check(rig: Callable) -> None:
     r = rig()
     for _ in range(50):
         r.step(ZERO)
@@ -127,7 +127,7 @@ def test_after_a_new_grant_nothing_is_late_before_the_first_command(rig: Callabl
         assert (Check.ECHO_LATE in codes) == (k > 4)
 
 
-def test_commands_of_others_are_told_and_stop_nothing(rig: Callable, codes: Callable) -> None:
+def test_foreign_commands_are_reported_and_do_not_stop(rig: Callable, codes: Callable) -> None:
     r = rig()
     decision = r.step(rivalled=True)
     assert codes(decision) == ["rival_commands"]

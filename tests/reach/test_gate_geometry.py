@@ -20,7 +20,7 @@ T0 = Instant(5_000_000_000)
 PERIOD_S = 0.01
 
 
-def test_several_limits_leave_the_nearest_velocity_that_keeps_them_all() -> None:
+def test_several_limits_leave_the_nearest_allowed_velocity() -> None:
     """A point is the nearest of a convex region if what is missing is a sum of active normals."""
     rng = np.random.default_rng(7)
     corners = 0
@@ -49,7 +49,7 @@ def test_several_limits_leave_the_nearest_velocity_that_keeps_them_all() -> None
     assert corners > 100, "corners of two limits must be met, too"
 
 
-def test_a_border_counts_from_as_far_as_the_slowest_chain_needs(
+def test_border_distance_allows_for_the_slowest_chain(
     make_arm: Callable, settings: SafetySettings
 ) -> None:
     """At 5 cm/s, with states a second old and commands that live 0.1 s, from 15 cm on."""
@@ -79,7 +79,7 @@ def frozen(gate: SafetyGate, wanted: Twist, make: tuple[Callable, Callable], **p
 
 
 @pytest.mark.parametrize(("speed", "watched"), [(0.002, True), (math.nextafter(0.002, 0), False)])
-def test_from_two_millimetres_a_second_on_it_is_watched(
+def test_motion_check_starts_at_two_millimetres_per_second(
     speed: float,
     watched: bool,
     settings: SafetySettings,

@@ -22,7 +22,7 @@ SLOWLY = Twist(0.001, 0.0, 0.0)
 """So slow that one cycle's acceleration reaches it."""
 
 
-def test_a_healthy_command_passes_as_it_is(rig: Callable) -> None:
+def test_healthy_command_passes_unchanged(rig: Callable) -> None:
     decision = rig().step()
     assert decision.twist == SLOWLY
     assert decision.interventions == ()
@@ -45,7 +45,7 @@ def test_a_healthy_command_passes_as_it_is(rig: Callable) -> None:
         (math.inf, False),
     ],
 )
-def test_a_late_loop_does_not_move(
+def test_late_loop_does_not_move(
     late: float, moves: bool, rig: Callable, codes: Callable, passes: Callable
 ) -> None:
     decision = rig().step(lateness=late)
@@ -55,7 +55,7 @@ def test_a_late_loop_does_not_move(
 
 
 @pytest.mark.parametrize(("passed", "moves"), [(60 * MS, True), (60 * MS + 1, False)])
-def test_a_gap_between_cycles_counts_as_late(
+def test_gap_between_cycles_counts_as_late(
     passed: int, moves: bool, rig: Callable, passes: Callable
 ) -> None:
     r = rig()
@@ -66,9 +66,7 @@ def test_a_gap_between_cycles_counts_as_late(
 
 
 @pytest.mark.parametrize(("passed", "moves"), [(0, True), (-1, False), (-(10**9), False)])
-def test_time_that_goes_back_stops(
-    passed: int, moves: bool, rig: Callable, passes: Callable
-) -> None:
+def test_backward_time_stops(passed: int, moves: bool, rig: Callable, passes: Callable) -> None:
     for off in ((), (Check.CLOCK_BACKWARDS,)):
         r = rig(Check.ACCELERATION, *off)
         now = Instant(r.now + passed)
@@ -82,7 +80,7 @@ def test_time_that_goes_back_stops(
 
 @pytest.mark.parametrize("index", range(3))
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_command_that_is_not_finite_latches(index: int, value: float, rig: Callable) -> None:
+def test_non_finite_command_latches(index: int, value: float, rig: Callable) -> None:
     parts = [0.001, 0.001, 0.001]
     parts[index] = value
     r = rig()
@@ -92,7 +90,7 @@ def test_a_command_that_is_not_finite_latches(index: int, value: float, rig: Cal
     assert r.step().twist == ZERO, "it stays so"
 
 
-def test_what_overflows_on_the_way_latches(rig: Callable, codes: Callable) -> None:
+def test_overflow_in_the_gate_latches(rig: Callable, codes: Callable) -> None:
     """With the speed limit off, a slanted border takes a huge number beyond the range."""
     slanted = Region(((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)))
     off = (Check.SPEED, Check.TURN_RATE, Check.ACCELERATION)
@@ -115,7 +113,7 @@ def test_what_overflows_on_the_way_latches(rig: Callable, codes: Callable) -> No
         (None, None, "no command"),
     ],
 )
-def test_a_strategy_that_fails_latches(
+def test_failing_strategy_latches(
     wanted: Twist | None, failure: str | None, words: str, rig: Callable
 ) -> None:
     r = rig()
@@ -141,7 +139,7 @@ def test_a_strategy_that_fails_latches(
         ("", False, Check.ARM_MODE),
     ],
 )
-def test_the_arms_mode_decides(
+def test_arm_mode_decides(
     mode: str, moves: bool, held: Check | None, rig: Callable, passes: Callable
 ) -> None:
     r = rig()
@@ -172,7 +170,7 @@ LIMITS = ("v_max", "omega_max", "f_max", "m_max")
         (math.inf, False),
     ],
 )
-def test_the_arm_must_confirm_every_limit(
+def test_arm_must_confirm_every_limit(
     name: str, factor: float, confirmed: bool, rig: Callable
 ) -> None:
     r = rig(armed=False)
@@ -185,14 +183,14 @@ def test_the_arm_must_confirm_every_limit(
     assert r.request(arm=r.fresh_arm(**{name: factor * getattr(r.arm, name)})) == set()
 
 
-def test_the_refusal_names_both_values(rig: Callable) -> None:
+def test_limit_refusal_names_both_values(rig: Callable) -> None:
     r = rig(armed=False)
     arm = r.fresh_arm(v_max=0.5, omega_max=1.0)
     (refusal,) = r.gate.arm(T0, r.touch, arm, T0)
     assert "v_max is 0.5 m/s, 0.0608 asked; omega_max is 1 rad/s, 0.1 asked" in refusal.text
 
 
-def test_a_limit_may_be_off_by_a_thousandth_at_most(rig: Callable) -> None:
+def test_limit_may_differ_by_at_most_a_thousandth(rig: Callable) -> None:
     for has, confirmed in ((1001.0, True), (999.0, True), (1001.01, False), (998.99, False)):
         r = rig(armed=False, arm_f_max=1000.0)
         assert (r.request(arm=r.fresh_arm(f_max=has)) == set()) == confirmed
@@ -205,11 +203,11 @@ def test_a_limit_may_be_off_by_a_thousandth_at_most(rig: Callable) -> None:
         ({"passed": -20_000_000}, "went back by 0.020 s"),
     ],
 )
-def test_the_loops_faults_are_told_in_figures(how: dict, words: str, rig: Callable) -> None:
+def test_loop_faults_are_reported_with_values(how: dict, words: str, rig: Callable) -> None:
     assert words in rig().step(**how).interventions[0].text
 
 
-def test_interventions_have_words(rig: Callable) -> None:
+def test_every_intervention_has_a_description(rig: Callable) -> None:
     r = rig()
     for decision in (
         r.step(lateness=1.0),

@@ -34,7 +34,7 @@ def speed(twist: Twist) -> float:
     ("factor", "limited"),
     [(0.0, False), (0.5, False), (1 - 1e-9, False), (1 + 1e-9, True), (1.01, True), (1e9, True)],
 )
-def test_speed(
+def test_speed_is_limited(
     angle: float, factor: float, limited: bool, send: Callable[..., Decision], codes: Callable
 ) -> None:
     v = SPEED * factor
@@ -53,7 +53,7 @@ def test_speed(
     ("factor", "limited"),
     [(0.0, False), (1.0, False), (1 + 1e-9, True), (1.01, True), (1e9, True)],
 )
-def test_turn_rate(
+def test_turn_rate_is_limited(
     sign: float, factor: float, limited: bool, send: Callable[..., Decision], codes: Callable
 ) -> None:
     wanted = Twist(0.02, 0.01, sign * TURN * factor)
@@ -66,14 +66,14 @@ def test_turn_rate(
     assert off.twist == wanted
 
 
-def test_exactly_at_the_limits_nothing_is_said(send: Callable[..., Decision]) -> None:
+def test_command_at_the_limits_is_no_intervention(send: Callable[..., Decision]) -> None:
     for wanted in (Twist(SPEED, 0.0, TURN), Twist(0.0, -SPEED, -TURN)):
         decision = send(wanted, Check.WORKSPACE)
         assert decision.twist == wanted
         assert decision.interventions == ()
 
 
-def test_within_speed_keeps_the_path() -> None:
+def test_speed_scaling_keeps_the_path() -> None:
     twist = Twist(0.3, 0.4, 2.0)
     assert within_speed(twist, 0.5, 2.0) is twist
     assert within_speed(twist, 0.25, 9.0) == Twist(0.15, 0.2, 1.0)
@@ -125,14 +125,14 @@ def test_acceleration_is_bounded_each_cycle(send: Callable[..., Decision], codes
         (Twist(0.6, 0.0, 0.0), Twist(0.3, 0.0, 0.0), Twist(0.4, 0.0, 0.0)),
     ],
 )
-def test_within_acceleration(wanted: Twist, last: Twist, expected: Twist) -> None:
+def test_acceleration_scaling_keeps_the_bound(wanted: Twist, last: Twist, expected: Twist) -> None:
     found = within_acceleration(wanted, last, 0.1, 0.2)
     assert (found.vx, found.vy, found.omega) == pytest.approx(
         (expected.vx, expected.vy, expected.omega)
     )
 
 
-def test_acceleration_is_bounded_last_and_never_against_another_limit(
+def test_acceleration_bound_never_violates_another_limit(
     make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
 ) -> None:
     """A load from one state to the next: it brakes on its way, then slides off from standing."""
@@ -152,7 +152,7 @@ def test_acceleration_is_bounded_last_and_never_against_another_limit(
     assert slid[-1] == pytest.approx((0.0, 0.03), abs=1e-9)
 
 
-def test_a_stop_is_not_delayed(
+def test_stop_is_not_delayed_by_acceleration_bound(
     make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
 ) -> None:
     gate = make_gate(settings)
@@ -165,7 +165,7 @@ def test_a_stop_is_not_delayed(
     assert decision.interventions == ()
 
 
-def test_a_long_cycle_does_not_allow_a_leap(
+def test_long_cycle_does_not_allow_a_jump(
     make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
 ) -> None:
     """60 ms is the longest cycle that counts: 0.05 m/s² · 0.06 s, late loop or not."""
@@ -190,7 +190,7 @@ def test_a_long_cycle_does_not_allow_a_leap(
     [(0.0, True), (0.005, True), (0.01 - 1e-9, True), (0.01 + 1e-9, False), (0.3, False)],
 )
 @pytest.mark.parametrize("bearing", [0.0, 2.0])
-def test_near_the_goal_it_is_slower(
+def test_gate_slows_near_the_goal(
     distance: float, near: bool, bearing: float, send: Callable[..., Decision], codes: Callable
 ) -> None:
     """Half of the greatest speeds within 1 cm of the tip, whatever the strategy wants."""
@@ -209,7 +209,7 @@ def test_near_the_goal_it_is_slower(
     assert send(wanted, Check.SLOW_DOWN, **pose).twist == wanted
 
 
-def test_the_circle_of_slow_motion_is_open(send: Callable[..., Decision], codes: Callable) -> None:
+def test_slow_zone_excludes_its_border(send: Callable[..., Decision], codes: Callable) -> None:
     """At exactly its radius nothing is slowed, just inside it is."""
     goal = Goal(0.3, 0.0, 0.0075, 40.0)
     radius = 0.3 - (0.05 + L)

@@ -25,7 +25,7 @@ def loaded(r: Any, part: float, wanted: Twist = AHEAD, **how: Any) -> Any:
 
 
 @pytest.mark.parametrize(("part", "held"), [(1.499, False), (1.5, True), (2.999, True)])
-def test_an_overload_of_two_states_latches(part: float, held: bool, rig: Callable) -> None:
+def test_overload_in_two_states_latches(part: float, held: bool, rig: Callable) -> None:
     r = rig(*OFF)
     assert loaded(r, part).held is None, "an impact is over with the next state"
     assert loaded(r, 0.5).held is None
@@ -46,7 +46,7 @@ def test_three_times_the_limit_latches_at_once(values: dict, rig: Callable) -> N
     assert "300% of its limit" in decision.interventions[0].text
 
 
-def test_one_state_seen_twice_is_one(rig: Callable) -> None:
+def test_repeated_state_counts_once(rig: Callable) -> None:
     r = rig(*OFF)
     arm = r.fresh_arm(-r.period, fx=-23.0)
     assert r.step(arm=arm).held is None
@@ -61,7 +61,7 @@ def passing(r: Any, times: int, every: int) -> int | None:
     return None
 
 
-def test_passes_of_the_limit_again_and_again_latch(rig: Callable) -> None:
+def test_repeated_overloads_latch(rig: Callable) -> None:
     r = rig(*OFF, overload_passes=5.0)
     when = passing(r, 10, 20)
     assert when == 80
@@ -76,7 +76,7 @@ def test_passes_of_the_limit_again_and_again_latch(rig: Callable) -> None:
     assert loaded(r, 1.0).held is None, "after arming it counts anew"
 
 
-def test_a_load_that_trembles_about_its_limit_passes_it_once(rig: Callable) -> None:
+def test_load_jittering_about_its_limit_counts_once(rig: Callable) -> None:
     r = rig(*OFF, overload_passes=2.0)
     for k in range(100):
         assert loaded(r, 1.0 if k % 2 else 0.81).held is None
@@ -84,7 +84,7 @@ def test_a_load_that_trembles_about_its_limit_passes_it_once(rig: Callable) -> N
     assert loaded(r, 1.0).held is Check.OVERLOAD_REPEATED
 
 
-def test_what_is_felt_counts_with_its_own_uncertainty(make_touch: Callable) -> None:
+def test_felt_force_includes_its_uncertainty(make_touch: Callable) -> None:
     assert felt(make_touch()) == 0.0
     assert felt(make_touch(total_force=3.0, normal_force_bound=0.5)) == 3.5
     for unknown in (math.nan, math.inf, -1.0):
@@ -108,7 +108,7 @@ def feeling(r: Any, force: float, wanted: Twist = AHEAD, **values: Any) -> Any:
 @pytest.mark.parametrize(
     ("force", "left"), [(16.0, 1.0), (17.0, 0.75), (18.0, 0.5), (20.0, 0.0), (39.9, 0.0)]
 )
-def test_force_on_the_skin_slows_and_stops_while_the_wrist_feels_nothing(
+def test_skin_force_slows_and_stops_without_wrist_force(
     force: float, left: float, wanted: Twist, rig: Callable, codes: Callable
 ) -> None:
     r = rig(*SKIN)
@@ -123,7 +123,7 @@ def test_force_on_the_skin_slows_and_stops_while_the_wrist_feels_nothing(
     assert feeling(rig(*SKIN, Check.SKIN_FORCE), force, wanted).twist == wanted
 
 
-def test_back_is_along_the_finger(rig: Callable) -> None:
+def test_retreat_is_along_the_finger(rig: Callable) -> None:
     r = rig(*SKIN)
     c, s = math.cos(0.7), math.sin(0.7)
     for sign, passes in ((-1.0, True), (1.0, False)):
@@ -134,7 +134,7 @@ def test_back_is_along_the_finger(rig: Callable) -> None:
 
 
 @pytest.mark.parametrize(("force", "bound"), [(40.0, 0.0), (30.0, 10.0), (20.0, math.nan)])
-def test_twice_the_limit_on_the_skin_latches(force: float, bound: float, rig: Callable) -> None:
+def test_twice_the_skin_limit_latches(force: float, bound: float, rig: Callable) -> None:
     assert SKIN_LATCH == 2.0
     assert feeling(rig(*SKIN), force - 0.1, normal_force_bound=bound).held is None
     r = rig(*SKIN)
@@ -161,7 +161,7 @@ def touching(r: Any, force: float, side: Side, wanted: Twist, **values: Any) -> 
     return feeling(r, force, wanted, peak_side=side, peak_x=x, peak_y=y, **values)
 
 
-def test_the_approach_is_slowed_by_touch(rig: Callable, codes: Callable) -> None:
+def test_approach_is_slowed_by_touch(rig: Callable, codes: Callable) -> None:
     """6 N slow it, 15 stop it, foreseen 10 ms ahead; what moves away is free."""
     for force, most in ((6.0, 0.045), (9.0, 0.0608 * 6 / 9), (12.0, 0.0608 / 3), (15.0, 0.0)):
         r = rig(*RISING)
@@ -183,7 +183,7 @@ def test_the_approach_is_slowed_by_touch(rig: Callable, codes: Callable) -> None
         (Side.TIP, Twist(0.04, 0.0, 0.0), Twist(-0.02, 0.03, 0.09)),
     ],
 )
-def test_it_is_slowed_into_the_side_that_touches(
+def test_motion_into_the_touching_side_is_slowed(
     side: Side, into: Twist, along: Twist, rig: Callable
 ) -> None:
     for heading in (0.0, 0.8):
@@ -199,7 +199,7 @@ def test_it_is_slowed_into_the_side_that_touches(
             assert (size < 1e-9) == stops
 
 
-def test_a_force_that_rises_is_foreseen(rig: Callable) -> None:
+def test_rising_force_is_extrapolated(rig: Callable) -> None:
     r = rig(*RISING)
     touching(r, 0.0, Side.TIP, AHEAD)
     jumped = touching(r, 7.0, Side.TIP, AHEAD).twist.vx
@@ -217,7 +217,7 @@ def test_a_force_that_rises_is_foreseen(rig: Callable) -> None:
     assert touching(old, 4.0, Side.TIP, AHEAD).twist.vx == 0.04, "too long ago for a rate"
 
 
-def test_without_any_touch_the_wrist_alone_is_judged(rig: Callable) -> None:
+def test_without_touch_only_the_wrist_counts(rig: Callable) -> None:
     r = rig(*OFF, Check.FEATURES_STALE, Check.FEATURES_LOST, Check.FEATURES_SPARSE, armed=False)
     assert r.request(touch=None) == set()
     assert r.step(AHEAD, touch=None).twist == AHEAD

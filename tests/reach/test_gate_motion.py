@@ -70,7 +70,7 @@ OFF = (Check.ACCELERATION, Check.WORKSPACE)
 @pytest.mark.parametrize(
     "wanted", [AHEAD, Twist(-0.03, 0.02, 0.0), Twist(0.0, -0.04, 0.1), Twist(0.02, 0.0, -0.1)]
 )
-def test_an_arm_that_moves_otherwise_latches_within_150_ms_and_10_mm(
+def test_deviating_arm_latches_within_150_ms_and_10_mm(
     does: Callable, code: Check, wanted: Twist, rig: Callable
 ) -> None:
     plant = Plant(rig(*OFF), does)
@@ -87,7 +87,7 @@ MOTION = (Check.ARM_SPEED, Check.ARM_TRACKING, Check.ARM_PATH, Check.ARM_FROZEN)
 
 
 @pytest.mark.parametrize("part", [0.0, 0.2, 0.6, 1.0])
-def test_it_may_lag_behind_when_a_load_holds_it(part: float, rig: Callable) -> None:
+def test_arm_may_lag_under_load(part: float, rig: Callable) -> None:
     def does(told: Twist) -> Twist:
         return Twist(part * told.vx, part * told.vy, part * told.omega)
 
@@ -97,7 +97,7 @@ def test_it_may_lag_behind_when_a_load_holds_it(part: float, rig: Callable) -> N
 
 
 @pytest.mark.parametrize("late", [0.0, 0.01, 0.03, 0.05])
-def test_commands_may_act_as_late_as_they_hold(late: float, rig: Callable) -> None:
+def test_commands_may_act_until_they_expire(late: float, rig: Callable) -> None:
     queue = [ZERO] * round(late / 0.01)
 
     def does(told: Twist) -> Twist:
@@ -113,7 +113,7 @@ def test_commands_may_act_as_late_as_they_hold(late: float, rig: Callable) -> No
 
 @pytest.mark.parametrize("noise", [0.0, 2e-5])
 @pytest.mark.parametrize("wanted", [AHEAD, Twist(0.0, 0.004, 0.0), Twist(0.0, 0.0, -0.1)])
-def test_a_dead_pose_latches_within_half_a_second_even_if_it_is_noisy(
+def test_dead_noisy_pose_latches_within_half_a_second(
     noise: float, wanted: Twist, rig: Callable
 ) -> None:
     plant = Plant(rig(*OFF), lambda _: ZERO)
@@ -124,7 +124,7 @@ def test_a_dead_pose_latches_within_half_a_second_even_if_it_is_noisy(
     assert decision.held is Check.ARM_FROZEN
 
 
-def test_a_jammed_arm_may_tremble(rig: Callable) -> None:
+def test_jammed_arm_may_tremble(rig: Callable) -> None:
     """Its load explains that it stays; a twist far below what was told does not contradict it."""
     for wanted, load, twist in (
         (Twist(0.0, 0.0, 0.1), {"mz": -2.0}, Twist(0.0, 0.0, 0.004)),
@@ -138,7 +138,7 @@ def test_a_jammed_arm_may_tremble(rig: Callable) -> None:
         assert lying.run(100, wanted)[1].held is Check.ARM_FROZEN
 
 
-def test_half_the_way_that_nothing_holds_back_latches(rig: Callable) -> None:
+def test_unloaded_arm_moving_half_the_way_latches(rig: Callable) -> None:
     plant = Plant(rig(*OFF), lambda t: Twist(0.4 * t.vx, 0.4 * t.vy, t.omega))
     when, decision = plant.run(60)
     assert when is not None
@@ -150,17 +150,17 @@ def test_half_the_way_that_nothing_holds_back_latches(rig: Callable) -> None:
     assert slow.run(60, Twist(0.008, 0.0, 0.0))[1].held is Check.ARM_PATH
 
 
-def test_a_slow_command_says_little(rig: Callable) -> None:
+def test_slow_command_gives_no_verdict(rig: Callable) -> None:
     assert Plant(rig(*OFF), lambda _: ZERO).run(100, Twist(0.0019, 0.0, 0.0))[0] is None
 
 
-def test_noise_in_free_motion_latches_nothing(rig: Callable) -> None:
+def test_noise_in_free_motion_does_not_latch(rig: Callable) -> None:
     plant = Plant(rig(*OFF), lambda t: t)
     plant.noise = 2e-5
     assert plant.run(300, Twist(0.03, 0.01, 0.05))[0] is None
 
 
-def test_an_arm_at_its_limit_of_force_may_be_pushed_off_its_way(rig: Callable) -> None:
+def test_arm_at_its_force_limit_may_be_pushed_aside(rig: Callable) -> None:
     def pushed(told: Twist) -> Twist:
         return Twist(0.5 * told.vx, 0.03 if told.vx else 0.0, told.omega)
 
@@ -170,7 +170,7 @@ def test_an_arm_at_its_limit_of_force_may_be_pushed_off_its_way(rig: Callable) -
         assert (plant.run(40)[0] is not None) == held, load
 
 
-def test_speed_is_judged_by_the_twist_and_by_the_pose(rig: Callable) -> None:
+def test_speed_is_checked_by_twist_and_pose(rig: Callable) -> None:
     for field in ("vx", "vy"):
         twist = replace(ZERO, **{field: -0.0608 * TOO_FAST * 1.01})
         r = rig(*OFF)
@@ -190,7 +190,7 @@ def test_speed_is_judged_by_the_twist_and_by_the_pose(rig: Callable) -> None:
         assert when <= 5
 
 
-def test_a_pose_that_is_taken_anew_is_not_motion(rig: Callable) -> None:
+def test_reset_pose_is_not_motion(rig: Callable) -> None:
     """As after a reset of a simulated world: nothing is said of the way before it."""
     for jump in ({"x": 0.1}, {"heading": 0.5}):
         r = rig(*OFF)
@@ -203,7 +203,7 @@ def test_a_pose_that_is_taken_anew_is_not_motion(rig: Callable) -> None:
     assert r.step(ZERO, arm=r.fresh_arm(-r.period, x=-0.16)).held is not None
 
 
-def test_states_with_gaps_or_from_before_begin_anew(settings: Any, make_arm: Callable) -> None:
+def test_gaps_or_old_states_restart_the_motion_check(settings: Any, make_arm: Callable) -> None:
     watch = MotionWatch(settings)
     t0 = Instant(5_000_000_000)
     watch.told(AHEAD, t0)
@@ -217,7 +217,7 @@ def test_states_with_gaps_or_from_before_begin_anew(settings: Any, make_arm: Cal
     assert watch.judge(make_arm(after(t0, 0.21), x=-0.19)) == ()
 
 
-def test_what_was_told_is_known_for_long_and_forgotten_when_time_goes_back(
+def test_command_history_is_kept_and_cleared_on_backward_time(
     settings: Any, make_arm: Callable
 ) -> None:
     watch = MotionWatch(settings)
@@ -236,7 +236,7 @@ def test_what_was_told_is_known_for_long_and_forgotten_when_time_goes_back(
     assert watch.first_after(t0) is None
 
 
-def test_a_command_that_nothing_followed_died(settings: Any, make_arm: Callable) -> None:
+def test_command_without_successor_expired(settings: Any, make_arm: Callable) -> None:
     """The loop stood still: the arm went on for the command's life, and no further."""
     for went, right in ((0.06, True), (0.17, False)):
         watch = MotionWatch(settings)
@@ -253,7 +253,7 @@ def test_a_command_that_nothing_followed_died(settings: Any, make_arm: Callable)
         assert (seen == ()) == right
 
 
-def test_the_constants_stand_apart() -> None:
+def test_thresholds_are_well_separated() -> None:
     """What is asked of the arm is above what simulated arms do in every set, with room."""
     assert OFF_THE_WAY >= 1.5 * 0.0006
     assert 0 < DEAD < 0.5

@@ -59,7 +59,7 @@ def place(which: str, side: str, depth: float) -> tuple[dict, tuple[float, float
         (-0.05, 0.0),
     ],
 )
-def test_workspace(
+def test_workspace_is_enforced(
     which: str,
     side: str,
     depth: float,
@@ -80,7 +80,7 @@ def test_workspace(
     assert send(outward, Check.WORKSPACE, **pose).twist == outward
 
 
-def test_turning_may_not_swing_the_tip_out(send: Callable[..., Decision]) -> None:
+def test_turning_cannot_swing_the_tip_out(send: Callable[..., Decision]) -> None:
     pose, _ = place("tip", "left", 0.0)
     heading = pose["heading"]
     assert send(Twist(0.0, 0.0, 0.1), **pose).twist == ZERO
@@ -93,7 +93,7 @@ def test_turning_may_not_swing_the_tip_out(send: Callable[..., Decision]) -> Non
     assert turned.omega * L * math.cos(heading) == pytest.approx(0.005)
 
 
-def test_in_a_corner_both_borders_hold(send: Callable[..., Decision]) -> None:
+def test_both_borders_hold_in_a_corner(send: Callable[..., Decision]) -> None:
     xs, ys = 0.378, 0.255
     heading = 0.2
     pose = {"x": xs - L * math.cos(heading), "y": ys - L * math.sin(heading), "heading": heading}
@@ -103,7 +103,7 @@ def test_in_a_corner_both_borders_hold(send: Callable[..., Decision]) -> None:
     assert (slid.vx, slid.vy) == pytest.approx((0.0, -0.04), abs=1e-12)
 
 
-def test_it_comes_to_rest_before_the_border(
+def test_arm_comes_to_rest_before_the_border(
     make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
 ) -> None:
     """State 37 ms old, commands kept for the whole of their life: it stays inside."""
@@ -122,7 +122,7 @@ def test_it_comes_to_rest_before_the_border(
     assert xs[-1] + L == pytest.approx(0.378, abs=1e-4)
 
 
-def test_workspace_and_wrench_together(send: Callable[..., Decision]) -> None:
+def test_workspace_and_wrench_limits_combine(send: Callable[..., Decision]) -> None:
     """Neither may undo the other: at a border with something pressing, little is left."""
     pose, _ = place("tip", "left", 0.0)
     pressed = {**pose, "fx": -10.0, "fy": 15.0}

@@ -37,13 +37,13 @@ LOADS = [
 
 
 @pytest.mark.parametrize(("part", "left"), LOADS)
-def test_what_is_left_of_the_approach(part: float, left: float) -> None:
+def test_approach_scale_falls_with_load(part: float, left: float) -> None:
     assert approach_left(part, 0.8) == pytest.approx(left, abs=1e-9)
 
 
 @pytest.mark.parametrize("direction", [0.0, 1.0, 2.5, -1.7])
 @pytest.mark.parametrize(("part", "left"), LOADS)
-def test_force_slows_stops_and_lets_retreat(
+def test_force_slows_stops_and_allows_retreat(
     part: float, left: float, direction: float, send: Callable[..., Decision], codes: Callable
 ) -> None:
     c, s = math.cos(direction), math.sin(direction)
@@ -66,7 +66,7 @@ def test_force_slows_stops_and_lets_retreat(
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("part", "left"), LOADS)
-def test_torque_slows_stops_and_lets_turn_back(
+def test_torque_slows_stops_and_allows_turning_back(
     part: float, left: float, sign: float, send: Callable[..., Decision], codes: Callable
 ) -> None:
     twisted = {"mz": -4.5 * part * sign, **INSIDE}
@@ -78,7 +78,7 @@ def test_torque_slows_stops_and_lets_turn_back(
     assert send(Twist(0.0, 0.0, 0.1 * sign), Check.WRENCH, **twisted).twist.omega == 0.1 * sign
 
 
-def test_a_force_at_the_tip_also_holds_the_turning(send: Callable[..., Decision]) -> None:
+def test_tip_force_also_limits_turning(send: Callable[..., Decision]) -> None:
     """15 N sideways at the tip are 2.4 N·m: far from the torque limit, but turning adds to them."""
     pressed = {"fy": -15.0, "mz": -15.0 * L, **INSIDE}
     assert send(Twist(0.0, 0.0, 0.1), **pressed).twist == ZERO
@@ -88,13 +88,13 @@ def test_a_force_at_the_tip_also_holds_the_turning(send: Callable[..., Decision]
     assert (kept.vx, kept.vy, kept.omega) == pytest.approx((0.03, 0.0, 0.0), abs=1e-12)
 
 
-def test_the_greater_part_counts(make_arm: Callable, settings: SafetySettings) -> None:
+def test_larger_load_fraction_counts(make_arm: Callable, settings: SafetySettings) -> None:
     assert load(make_arm(fx=9.0, fy=12.0), settings) == pytest.approx(1.0)
     assert load(make_arm(fx=3.0, mz=-2.25), settings) == pytest.approx(0.5)
     assert load(make_arm(), settings) == 0.0
 
 
-def test_the_inward_motion_ends_with_the_sample_that_shows_the_limit(
+def test_inward_motion_ends_with_the_sample_at_the_limit(
     make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
 ) -> None:
     """No filter and no delay: the very step that sees 15 N sends no inward motion (row 25)."""

@@ -25,7 +25,7 @@ HOME = Pose(-0.2, 0.0, 0.0)
         ((-0.167, 0.1, 0.0), True),
     ],
 )
-def test_the_way_home_leads_out_of_the_cupboard_first(
+def test_homing_leaves_the_cupboard_first(
     pose: tuple[float, float, float], backs_out: bool, make_arm: Callable
 ) -> None:
     x, y, heading = pose
@@ -50,7 +50,7 @@ def test_the_way_home_leads_out_of_the_cupboard_first(
         ((-0.2, 0.0, math.tau), True),
     ],
 )
-def test_home_is_a_pose_with_a_tolerance(
+def test_home_has_a_tolerance(
     pose: tuple[float, float, float], there: bool, make_arm: Callable
 ) -> None:
     x, y, heading = pose

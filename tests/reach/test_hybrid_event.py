@@ -64,7 +64,7 @@ def event(make_arm: Callable, make_touch: Callable) -> Callable[..., Driven]:
     ("name", "measure", "threshold"),
     [("hardware", "peak_force", 5.0), ("authors_sim", "total_force", 1.5)],
 )
-def test_event_burrows_above_its_force_and_else_goes_straight(
+def test_event_strategy_burrows_above_its_force_threshold(
     name: str, measure: str, threshold: float, event: Callable[..., Driven]
 ) -> None:
     run = event(name)
@@ -79,7 +79,7 @@ def test_event_burrows_above_its_force_and_else_goes_straight(
 
 
 @pytest.mark.parametrize(("name", "after_s"), [("hardware", 2.0), ("authors_sim", 2.0833)])
-def test_light_extended_tip_contact_excavates(
+def test_sustained_light_tip_contact_excavates(
     name: str, after_s: float, event: Callable[..., Driven]
 ) -> None:
     run = event(name)
@@ -110,7 +110,7 @@ def test_only_light_contact_counts_as_pushing(
 
 
 @pytest.mark.parametrize(("name", "gap_s"), [("hardware", 0.1), ("authors_sim", 0.025)])
-def test_short_gaps_in_a_push_are_overlooked(
+def test_short_gaps_in_a_push_are_bridged(
     name: str, gap_s: float, event: Callable[..., Driven]
 ) -> None:
     for steps, kept in ((math.ceil(gap_s / 0.01) - 1, True), (math.ceil(gap_s / 0.01), False)):
@@ -124,7 +124,7 @@ def test_short_gaps_in_a_push_are_overlooked(
         assert (begun < whole + 0.02) == kept, (steps, begun)
 
 
-def test_a_stall_under_load_excavates(event: Callable[..., Driven]) -> None:
+def test_stall_under_load_excavates(event: Callable[..., Driven]) -> None:
     """Standing still: v_max·(t − t_prog) ≥ 0 from t = t_prog on."""
     run = event("hardware")
     assert run.until(10.0, peak_force=10.0) == pytest.approx(3.0, abs=0.0101)
@@ -133,14 +133,14 @@ def test_a_stall_under_load_excavates(event: Callable[..., Driven]) -> None:
     assert run.until(10.0, total_force=7.5) == pytest.approx(3.125, abs=0.0101)
 
 
-def test_neither_a_stall_nor_a_load_alone_excavates(event: Callable[..., Driven]) -> None:
+def test_stall_or_load_alone_does_not_excavate(event: Callable[..., Driven]) -> None:
     assert event("hardware").until(10.0, peak_force=math.nextafter(10.0, 0)) is None
     run = event("hardware")
     for k in range(1000):  # at v_max the lag never grows
         assert not run.step(x=-0.2 + 0.045 * 0.01 * k, peak_force=20.0).startswith("excavate")
 
 
-def test_progress_lags_by_its_time_wherever_it_is_lost(event: Callable[..., Driven]) -> None:
+def test_progress_window_applies_wherever_progress_is_lost(event: Callable[..., Driven]) -> None:
     """Half speed: d is reduced by v/2·t ≤ v·(t − 3) from t = 6 s on."""
     run = event("hardware")
     for k in range(1000):
@@ -150,7 +150,7 @@ def test_progress_lags_by_its_time_wherever_it_is_lost(event: Callable[..., Driv
 
 
 @pytest.mark.parametrize(("name", "again"), [("hardware", 3.0), ("authors_sim", 3.125 - 0.4)])
-def test_progress_counts_anew_after_an_excavation(
+def test_progress_restarts_after_an_excavation(
     name: str, again: float, event: Callable[..., Driven]
 ) -> None:
     """It ends 2 cm behind where it began: a head start only where progress counts from the end."""
@@ -165,7 +165,7 @@ def test_progress_counts_anew_after_an_excavation(
     assert second - (begun + 5.0) == pytest.approx(again, abs=0.02)
 
 
-def test_a_push_counts_anew_after_an_excavation(event: Callable[..., Driven]) -> None:
+def test_push_restarts_after_an_excavation(event: Callable[..., Driven]) -> None:
     run = event("hardware")
     first = run.until(5.0, tip_force=1.0)
     while run.step(tip_force=1.0).startswith("excavate"):
@@ -176,7 +176,7 @@ def test_a_push_counts_anew_after_an_excavation(event: Callable[..., Driven]) ->
     assert second - first == pytest.approx(5.0 + 2.0, abs=0.03)
 
 
-def test_no_excavation_that_cannot_be_finished_in_the_simulator(
+def test_simulator_set_starts_no_excavation_it_cannot_finish(
     event: Callable[..., Driven],
 ) -> None:
     for remaining, begins in ((5.0, True), (4.99, False)):
@@ -197,7 +197,7 @@ def test_no_excavation_that_cannot_be_finished_in_the_simulator(
         (Side.TIP, -0.003, "cw"),
     ],
 )
-def test_hardware_excavates_by_the_side_of_the_peak(
+def test_hardware_set_excavates_by_the_side_of_the_peak(
     side: Side, peak_y: float, direction: str, event: Callable[..., Driven]
 ) -> None:
     for seed in range(20):
@@ -207,7 +207,7 @@ def test_hardware_excavates_by_the_side_of_the_peak(
 
 
 @pytest.mark.parametrize("name", ["hardware", "authors_sim"])
-def test_a_peak_on_no_side_leaves_the_direction_to_chance(
+def test_peak_without_side_gives_a_random_direction(
     name: str, event: Callable[..., Driven]
 ) -> None:
     seen = []
@@ -218,7 +218,7 @@ def test_a_peak_on_no_side_leaves_the_direction_to_chance(
     assert 15 < seen.count("excavate_ccw") < 45
 
 
-def test_the_simulator_compares_across_the_cupboard_and_obeys_in_three_of_four(
+def test_simulator_set_follows_its_comparison_in_three_of_four(
     make_arm: Callable, make_touch: Callable
 ) -> None:
     """Heading 30° left: a contact on the finger's left side may lie to the right of the tip."""
@@ -236,7 +236,7 @@ def test_the_simulator_compares_across_the_cupboard_and_obeys_in_three_of_four(
     assert followed / 400 == pytest.approx(0.75, abs=0.06)
 
 
-def test_invalid_touch_is_never_no_contact(event: Callable[..., Driven]) -> None:
+def test_invalid_touch_never_counts_as_no_contact(event: Callable[..., Driven]) -> None:
     run = event("hardware")
     assert run.step(valid=False) == "waiting"
     assert run.twist == ZERO
@@ -259,7 +259,7 @@ def test_invalid_touch_neither_triggers_nor_counts(event: Callable[..., Driven])
     assert begun == pytest.approx(3.0, abs=0.03), "the time without knowledge is left out"
 
 
-def test_start_forgets_the_reach_before(event: Callable[..., Driven]) -> None:
+def test_start_clears_the_previous_reach(event: Callable[..., Driven]) -> None:
     run = event("hardware")
     run.until(4.0, peak_force=20.0)
     assert run.strategy.activity.startswith("excavate")

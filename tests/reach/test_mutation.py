@@ -39,11 +39,11 @@ def changes() -> set[tuple[str, str]]:
         ("a is None", "a is not None"),
     ],
 )
-def test_each_kind_of_change_is_made(change: tuple[str, str]) -> None:
+def test_every_mutation_kind_is_applied(change: tuple[str, str]) -> None:
     assert change in changes()
 
 
-def test_every_mutant_is_a_program_that_differs() -> None:
+def test_every_mutant_is_a_different_program() -> None:
     made = mutation.mutants("x.py", SOURCE)
     original = ast.unparse(ast.parse(SOURCE))
     assert len({m.source for m in made}) == len(made)
@@ -54,7 +54,7 @@ def test_every_mutant_is_a_program_that_differs() -> None:
     assert ("3", "4") not in changes(), "module constants are left alone"
 
 
-def test_a_noticed_mutant_is_killed_and_another_survives(tmp_path: Path) -> None:
+def test_detected_mutant_is_killed_and_another_survives(tmp_path: Path) -> None:
     test = tmp_path / "test_it.py"
     test.write_text(
         "from reachd.gate.limits import approach_left\n"

@@ -64,14 +64,14 @@ TABLES = {
 
 
 @pytest.mark.parametrize(("name", "key"), [(n, k) for n, t in TABLES.items() for k in t])
-def test_values_are_those_of_the_source(name: str, key: str) -> None:
+def test_parameter_values_match_their_source(name: str, key: str) -> None:
     holder: object = SETS[name]
     for part in key.split("."):
         holder = getattr(holder, part)
     assert holder == pytest.approx(TABLES[name][key], rel=1e-8)
 
 
-def test_the_two_sets_take_the_readings_that_scene_and_paper_give() -> None:
+def test_both_sets_use_values_of_scene_and_paper() -> None:
     choices = {
         "commanded_point": ("tip", "pivot"),
         "slow_for": ("every", "straight"),
@@ -87,14 +87,14 @@ def test_the_two_sets_take_the_readings_that_scene_and_paper_give() -> None:
         assert (getattr(HARDWARE, name), getattr(AUTHORS_SIM, name)) == (hardware, authors), name
 
 
-def test_the_simulators_motors_reach_their_limit_before_its_gate_slows_them() -> None:
+def test_simulator_motors_saturate_before_the_gate_slows_them() -> None:
     gate = AUTHORS_SIM.safety
     assert gate.force * gate.soft_fraction == pytest.approx(math.hypot(10.0, 10.0))
     assert gate.torque * gate.soft_fraction == pytest.approx(1.5)
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_zero_is_sent_before_a_real_arm_would_have_to_stop(name: str) -> None:
+def test_zero_is_sent_before_a_real_arm_must_stop(name: str) -> None:
     gate = SETS[name].safety
     assert gate.command_expiry < 0.1
     assert (gate.features_age, gate.arm_age, gate.features_latch) == (0.2, 0.05, 1.0)
@@ -200,7 +200,7 @@ def out_of_range() -> list[tuple[str, object]]:
     return cases
 
 
-def test_every_setting_refuses_what_is_out_of_its_range() -> None:
+def test_every_setting_refuses_values_out_of_range() -> None:
     cases = out_of_range()
     assert len(cases) > 150
     for name, value in cases:
@@ -208,7 +208,7 @@ def test_every_setting_refuses_what_is_out_of_its_range() -> None:
             parameters("hardware", {name: value})
 
 
-def test_regions_tell_inside_from_outside() -> None:
+def test_region_membership_is_correct() -> None:
     shelf = box(-0.1, 0.4, -0.3, 0.2)
     assert shelf.depth(0.0, 0.0) == pytest.approx(0.1)
     assert shelf.depth(0.4, 0.0) == pytest.approx(0.0)
@@ -251,7 +251,7 @@ def test_targets_become_goals() -> None:
         (0.3, 0.0, {"time_limit": math.inf}, "time limit"),
     ],
 )
-def test_an_unreachable_goal_is_refused(x: float, y: float, more: dict, words: str) -> None:
+def test_unreachable_goal_is_refused(x: float, y: float, more: dict, words: str) -> None:
     make: Callable = make_goal
     with pytest.raises(ConfigError, match=words):
         make(x, y, HARDWARE, **more)

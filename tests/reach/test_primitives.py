@@ -36,7 +36,7 @@ def goal_at(x: float, y: float) -> Goal:
     return Goal(x, y, 0.0075, 40.0)
 
 
-def test_aim_is_the_direction_from_the_tip(make_arm: Callable) -> None:
+def test_aim_is_the_direction_from_tip_to_goal(make_arm: Callable) -> None:
     found = aim(make_arm(x=0.1, y=0.05, heading=math.pi / 2), goal_at(0.4, 0.208 + 0.4), L)
     assert (found.tip_x, found.tip_y) == pytest.approx((0.1, 0.208))
     assert found.distance == pytest.approx(0.5)
@@ -44,7 +44,7 @@ def test_aim_is_the_direction_from_the_tip(make_arm: Callable) -> None:
     assert found.angle == pytest.approx(math.atan2(4, 3))
 
 
-def test_at_the_goal_nothing_is_asked_for(make_arm: Callable) -> None:
+def test_zero_twist_at_the_goal(make_arm: Callable) -> None:
     here = aim(make_arm(x=0.2, y=0.0, heading=0.0), goal_at(0.2 + L, 0.0), L)
     assert here.distance == 0.0
     for p in (HARDWARE, AUTHORS_SIM):
@@ -52,7 +52,7 @@ def test_at_the_goal_nothing_is_asked_for(make_arm: Callable) -> None:
         assert burrow(here, 0.0, 0.3, p).vx == 0.0
 
 
-def test_straight_line_is_equations_1_and_2() -> None:
+def test_straight_line_follows_equations_1_and_2() -> None:
     ahead = Aim(0.0, 0.0, 0.3, 0.6, 0.8, math.atan2(0.8, 0.6))
     twist = straight(ahead, 0.0, AUTHORS_SIM)
     assert (twist.vx, twist.vy, twist.omega) == pytest.approx((0.03, 0.04, 0.35))
@@ -200,7 +200,7 @@ def test_burrow_golden_trajectory(name: str, fly: Callable) -> None:
     assert np.ptp(flown["pivot"][:, 1]) > 0.01, "it does burrow"
 
 
-def test_growth_is_equation_6() -> None:
+def test_growth_follows_equation_6() -> None:
     assert growth(0.0, 2.0) == 0.5
     assert growth(1.0, 2.0) == 1.0
     assert growth(0.5, 4.0) == pytest.approx(2.5 / 4)
@@ -209,7 +209,7 @@ def test_growth_is_equation_6() -> None:
 
 @pytest.mark.parametrize("ccw", [True, False])
 @pytest.mark.parametrize("name", ["hardware", "authors_sim"])
-def test_excavate_by_hand_at_a_third(name: str, ccw: bool) -> None:
+def test_excavation_at_a_third_matches_hand_calculation(name: str, ccw: bool) -> None:
     """t_frac = 1/3: the arc is at a quarter, K = 2/3, ω = −K ω_max sin 120°."""
     p = parameters(name)
     sign = 1.0 if ccw else -1.0
@@ -228,7 +228,7 @@ def test_excavate_by_hand_at_a_third(name: str, ccw: bool) -> None:
 
 @pytest.mark.parametrize("s", [1.0, 2.0, 3.5])
 @pytest.mark.parametrize("ccw", [True, False])
-def test_excavate_ends_where_the_integrals_say(s: float, ccw: bool) -> None:
+def test_excavation_ends_where_the_integrals_say(s: float, ccw: bool) -> None:
     """∫K v (−cos, sin)(3π/2 τ) and ∫−K ω sin 2πτ in closed form, tip velocity at the heading."""
     p = parameters("authors_sim", {"spiral_growth": s})
     heading, duration = 0.4, p.excavate_duration
@@ -248,7 +248,7 @@ def test_excavate_ends_where_the_integrals_say(s: float, ccw: bool) -> None:
     assert found == pytest.approx([forward, right, turn], abs=1e-9)
 
 
-def test_excavate_tip_speed_grows_as_the_paper_says() -> None:
+def test_excavation_tip_speed_grows_as_in_the_paper() -> None:
     """From v_max/s to v_max, whatever the turn rate, for the tip."""
     for tau in np.linspace(0.0, 1.0, 21):
         twist = excavate(float(tau), 0.0, HARDWARE, ccw=True)
@@ -302,7 +302,7 @@ def test_cw_mirrors_ccw(fraction: float, heading: float, name: str) -> None:
 @given(
     st.floats(-0.5, 0.4), st.floats(-0.5, 0.5), ANGLES, st.floats(0.0, 60.0), FRACTIONS, st.data()
 )
-def test_every_primitive_stays_within_its_sets_limits(
+def test_every_primitive_stays_within_its_limits(
     x: float, y: float, heading: float, elapsed: float, fraction: float, data: st.DataObject
 ) -> None:
     p = parameters(data.draw(st.sampled_from(["hardware", "authors_sim"])))

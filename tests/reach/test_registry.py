@@ -44,7 +44,7 @@ def load(spec: str) -> Strategy:
     return load_strategy(spec, HARDWARE, np.random.default_rng(0))
 
 
-def test_the_five_are_built_in() -> None:
+def test_five_strategies_are_built_in() -> None:
     names = ("straight", "burrow", "excavate", "hybrid_clock", "hybrid_event")
     assert available()[:5] == names
     for name in names:
@@ -52,14 +52,14 @@ def test_the_five_are_built_in() -> None:
 
 
 @pytest.mark.parametrize("spec", ["sraight", "", ":", "reachd:", ":Straight", "no such"])
-def test_an_unknown_strategy_lists_what_exists(spec: str) -> None:
+def test_unknown_strategy_lists_available_ones(spec: str) -> None:
     with pytest.raises(StrategyError) as error:
         load(spec)
     for word in (repr(spec), "straight", "burrow", "hybrid_event", "module:Class"):
         assert word in str(error.value)
 
 
-def test_the_documents_example_runs(
+def test_example_of_the_documentation_runs(
     module: Callable[[str, str], None], fly: Callable, make_touch: Callable, make_arm: Callable
 ) -> None:
     code = re.search(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.S)
@@ -81,7 +81,7 @@ def test_the_documents_example_runs(
     assert ask(strategy, invalid, make_arm(NOW), GOAL, NOW).activity == "wiggle"
 
 
-def test_a_package_offers_strategies_by_entry_point(
+def test_package_provides_strategies_by_entry_point(
     module: Callable[[str, str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module(
@@ -119,7 +119,7 @@ def test_a_package_offers_strategies_by_entry_point(
         ),
     ],
 )
-def test_a_broken_plug_in_is_named(
+def test_broken_plugin_is_named(
     text: str, words: list[str], module: Callable[[str, str], None]
 ) -> None:
     module("broken", text)
@@ -129,7 +129,7 @@ def test_a_broken_plug_in_is_named(
         assert word in str(error.value)
 
 
-def test_a_missing_module_is_named() -> None:
+def test_missing_module_is_named() -> None:
     with pytest.raises(StrategyError, match="no_such_module"):
         load("no_such_module:Mine")
 
@@ -166,7 +166,7 @@ class Bad:
         (Bad(Twist(0.0, 0.0, 0.0), KeyError("no word")), "KeyError"),
     ],
 )
-def test_whatever_a_strategy_does_is_a_failure_in_words(
+def test_any_strategy_failure_is_described(
     bad: Any, words: str, make_touch: Callable, make_arm: Callable
 ) -> None:
     answer = ask(bad, make_touch(), make_arm(), GOAL, NOW)
@@ -175,13 +175,13 @@ def test_whatever_a_strategy_does_is_a_failure_in_words(
     assert words in answer.failure
 
 
-def test_a_strategy_that_cannot_start_says_why() -> None:
+def test_strategy_that_cannot_start_says_why() -> None:
     bad: Any = Bad(ValueError("no"))
     assert begin(bad, GOAL, NOW) == "ValueError: no"
     assert begin(load("burrow"), GOAL, NOW) is None
 
 
-def test_numbers_of_numpy_become_plain_ones(make_touch: Callable, make_arm: Callable) -> None:
+def test_numpy_numbers_become_plain_ones(make_touch: Callable, make_arm: Callable) -> None:
     bad: Any = Bad(Twist(np.float32(0.25), np.float64(0.5), 1))
     answer = ask(bad, make_touch(), make_arm(), GOAL, NOW)
     assert answer.twist == Twist(0.25, 0.5, 1.0)

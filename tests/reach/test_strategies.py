@@ -36,7 +36,7 @@ def starts(activity: np.ndarray) -> list[int]:
 
 
 @pytest.mark.parametrize("name", ["straight", "burrow"])
-def test_primitives_in_isolation_go_on_without_end(name: str, fly: Callable) -> None:
+def test_isolated_primitives_continue_indefinitely(name: str, fly: Callable) -> None:
     flown = fly(load_strategy(name, AUTHORS_SIM, rng()), FAR, 20.0)
     assert set(flown["activity"]) == {name}
 
@@ -44,7 +44,7 @@ def test_primitives_in_isolation_go_on_without_end(name: str, fly: Callable) -> 
 @pytest.mark.parametrize(
     ("name", "between"), [("excavate", "straight"), ("hybrid_clock", "burrow")]
 )
-def test_one_excavation_a_trial_in_the_authors_simulator(
+def test_simulator_set_allows_one_excavation_per_trial(
     name: str, between: str, fly: Callable
 ) -> None:
     """5 s, 5 s, 20 s and ≥ 5 s remaining: it begins after 5 s and the second never comes."""
@@ -60,14 +60,14 @@ def test_one_excavation_a_trial_in_the_authors_simulator(
     assert strategy.take_events() == ()
 
 
-def test_excavations_go_on_at_intervals_on_hardware(fly: Callable) -> None:
+def test_hardware_set_repeats_excavations_at_intervals(fly: Callable) -> None:
     """No exception is made for the time that remains; the interval counts from the end."""
     strategy = load_strategy("excavate", HARDWARE, rng())
     flown = fly(strategy, replace(FAR, time_limit=40.0), 36.1)
     assert starts(flown["activity"]) == [501, 1502, 2503, 3504]
 
 
-def test_the_clocks_direction_is_even_and_seeded(fly: Callable) -> None:
+def test_clock_strategy_direction_is_even_and_seeded(fly: Callable) -> None:
     short = parameters("authors_sim", {"excavate_duration": 0.02, "trigger_interval": 0.02})
     goal = replace(FAR, time_limit=1e6)
 
@@ -83,14 +83,14 @@ def test_the_clocks_direction_is_even_and_seeded(fly: Callable) -> None:
     assert 0.42 < drawn.count("ccw") / len(drawn) < 0.58
 
 
-def test_events_nobody_takes_are_bounded(fly: Callable) -> None:
+def test_unread_events_are_bounded(fly: Callable) -> None:
     short = parameters("hardware", {"excavate_duration": 0.02, "trigger_interval": 0.02})
     strategy: Any = load_strategy("excavate", short, rng())
     fly(strategy, FAR, 10.0)
     assert len(strategy.take_events()) == MAX_EVENTS
 
 
-def test_an_excavation_turns_by_its_frozen_or_its_current_heading(
+def test_excavation_uses_frozen_or_current_heading(
     make_arm: Callable, make_touch: Callable
 ) -> None:
     def second(name: str) -> tuple[float, float]:
@@ -110,9 +110,7 @@ def test_an_excavation_turns_by_its_frozen_or_its_current_heading(
 
 @pytest.mark.parametrize("name", ["peak_force", "peak_x", "peak_y", "total_force", "tip_force"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_numbers_that_are_not_finite_are_not_used(
-    name: str, value: float, make_touch: Callable
-) -> None:
+def test_non_finite_inputs_are_not_used(name: str, value: float, make_touch: Callable) -> None:
     assert usable(make_touch(T0))
     assert not usable(make_touch(T0, **{name: value}))
     assert not usable(make_touch(T0, valid=False))
@@ -124,7 +122,7 @@ def test_numbers_that_are_not_finite_are_not_used(
     st.sampled_from([HARDWARE, AUTHORS_SIM]),
     st.integers(0, 1000),
 )
-def test_any_strategy_is_a_function_of_seed_and_inputs(
+def test_strategy_is_a_function_of_seed_and_inputs(
     make_touch: Callable, name: str, p: Any, seed: int
 ) -> None:
     def run() -> list[object]:
@@ -157,7 +155,7 @@ class Undecided(ReachingStrategy):
         return None
 
 
-def test_to_choose_nothing_without_an_excavation_is_an_error(
+def test_choosing_nothing_without_an_excavation_is_an_error(
     make_arm: Callable, make_touch: Callable
 ) -> None:
     strategy = Undecided(HARDWARE, rng())

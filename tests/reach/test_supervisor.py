@@ -104,7 +104,7 @@ class Bench:
         return self.x + 0.158 * math.cos(self.heading), self.y + 0.158 * math.sin(self.heading)
 
 
-def test_a_whole_trial() -> None:
+def test_complete_trial_from_homing_to_success() -> None:
     bench = Bench(home=HOME, pose=(-0.25, 0.05, 0.1))
     bench.cycle()
     bench.go()
@@ -130,7 +130,7 @@ def test_a_whole_trial() -> None:
     assert bench.outcome.success, "and it is ready for another"
 
 
-def test_without_a_home_it_starts_and_stays_where_it_is() -> None:
+def test_without_home_trial_starts_and_ends_in_place() -> None:
     bench = Bench(pose=(-0.21, 0.02, 0.05))
     bench.go()
     bench.cycle()
@@ -142,7 +142,7 @@ def test_without_a_home_it_starts_and_stays_where_it_is() -> None:
     assert bench.x == there
 
 
-def test_it_resets_by_itself_if_told_to() -> None:
+def test_trial_resets_automatically_when_configured() -> None:
     bench = Bench(home=HOME, auto_reset=True)
     bench.go()
     bench.run(60.0, State.RESETTING)
@@ -151,7 +151,7 @@ def test_it_resets_by_itself_if_told_to() -> None:
     assert bench.x == pytest.approx(-0.2, abs=0.0021)
 
 
-def test_an_unreachable_target_ends_at_its_time_with_the_reason() -> None:
+def test_unreachable_target_times_out_with_the_reason() -> None:
     """Row 36: zero at t_tot, and says so."""
     bench = Bench()
     bench.stuck = True
@@ -168,7 +168,7 @@ def test_an_unreachable_target_ends_at_its_time_with_the_reason() -> None:
 
 
 @pytest.mark.parametrize(("distance", "reached"), [(0.0074, True), (0.0076, False)])
-def test_success_is_the_tip_in_the_circle(distance: float, reached: bool) -> None:
+def test_success_requires_the_tip_in_the_circle(distance: float, reached: bool) -> None:
     bench = Bench(pose=(-0.058 - distance, 0.03, 0.0))
     bench.stuck = True
     bench.go(0.1, 0.03)
@@ -177,7 +177,7 @@ def test_success_is_the_tip_in_the_circle(distance: float, reached: bool) -> Non
 
 
 @pytest.mark.parametrize(("p", "reached"), [(HARDWARE, True), (AUTHORS_SIM, False)])
-def test_success_during_an_excavation(p: Parameters, reached: bool) -> None:
+def test_success_counts_during_an_excavation(p: Parameters, reached: bool) -> None:
     """Not tested in the authors' simulator; the paper makes no exception."""
     bench = Bench("excavate", replace(p, trigger_interval=0.1))
     bench.stuck = True
@@ -217,7 +217,7 @@ def test_stop_ends_each_state() -> None:
     assert (bench.supervisor.state, bench.twist) == (State.RESETTING, ZERO)
 
 
-def test_requests_out_of_turn_are_refused_in_words() -> None:
+def test_out_of_order_requests_are_refused_with_a_reason() -> None:
     bench = Bench()
     assert "idle" in str(bench.supervisor.request_reset(bench.now))
     bench.go()
@@ -227,7 +227,7 @@ def test_requests_out_of_turn_are_refused_in_words() -> None:
     assert "reaching" in str(bench.supervisor.request_reset(bench.now))
 
 
-def test_a_latch_ends_the_reach_with_its_reason() -> None:
+def test_latch_ends_the_reach_with_its_reason() -> None:
     bench = Bench(auto_reset=True, home=HOME, pose=(-0.23, 0.0, 0.0))
     bench.go()
     bench.run(5.0, State.REACHING)
@@ -248,7 +248,7 @@ def test_a_latch_ends_the_reach_with_its_reason() -> None:
     bench.run(20.0, State.IDLE)
 
 
-def test_a_latch_while_homing_ends_it() -> None:
+def test_latch_ends_homing() -> None:
     bench = Bench(home=Pose(-0.3, 0.1, 0.0))
     bench.go()
     bench.run(0.3)
@@ -288,7 +288,7 @@ class Failing:
         (Failing(None, at_start=True), "cannot start", "strategy_failed"),
     ],
 )
-def test_a_failing_strategy_stops_the_arm_and_latches(
+def test_failing_strategy_stops_the_arm_and_latches(
     strategy: Strategy, words: str, code: str
 ) -> None:
     """Row 18."""
@@ -303,7 +303,7 @@ def test_a_failing_strategy_stops_the_arm_and_latches(
     assert bench.outcome.interventions[code] == 1
 
 
-def test_the_outcome_tells_forces_excavations_and_interventions() -> None:
+def test_outcome_reports_forces_excavations_and_interventions() -> None:
     p = parameters("hardware", {"trigger_interval": 1.0, "excavate_duration": 1.0})
     bench = Bench("hybrid_clock", p)
     bench.go(time_limit=4.5)
@@ -330,7 +330,7 @@ def test_the_outcome_tells_forces_excavations_and_interventions() -> None:
     assert bench.supervisor.status(bench.now).outcome is outcome
 
 
-def test_a_missing_input_holds_the_arm_and_its_time_goes_on() -> None:
+def test_missing_input_holds_the_arm_while_time_runs() -> None:
     bench = Bench()
     assert bench.supervisor.step(None, None, T0).wanted == ZERO
     bench.go(time_limit=1.0)
@@ -344,7 +344,7 @@ def test_a_missing_input_holds_the_arm_and_its_time_goes_on() -> None:
     assert bench.outcome.reason is Reason.TIMEOUT
 
 
-def test_interventions_are_told_when_they_set_in() -> None:
+def test_interventions_are_reported_when_they_begin() -> None:
     bench = Bench()
     bench.go()
     told = [i.code for _ in range(30) for i in bench.cycle()]
@@ -359,7 +359,7 @@ def test_interventions_are_told_when_they_set_in() -> None:
     assert onsets.counts == {"arm_stale": 2, "loop_late": 1}
 
 
-def test_homing_gives_up_in_time() -> None:
+def test_homing_times_out() -> None:
     for resetting in (False, True):
         bench = Bench(home=Pose(-0.3, 0.0, 0.0))
         if resetting:

@@ -69,7 +69,7 @@ def bench() -> Bench:
     return made
 
 
-def test_nothing_moves_and_no_goal_is_taken_before_it_is_armed(bench: Bench) -> None:
+def test_disarmed_loop_neither_moves_nor_accepts_goals(bench: Bench) -> None:
     assert bench.step().decision.held is Check.NOT_ARMED
     refusal = bench.controller.reach(make_goal(0.05, 0.0, HARDWARE), bench.now)
     assert refusal is not None
@@ -77,7 +77,7 @@ def test_nothing_moves_and_no_goal_is_taken_before_it_is_armed(bench: Bench) -> 
     assert bench.step().decision.twist == ZERO
 
 
-def test_a_reach_from_arming_to_its_outcome(bench: Bench) -> None:
+def test_reach_runs_from_arming_to_outcome(bench: Bench) -> None:
     assert bench.arm() == ()
     goal = make_goal(0.05, 0.0, HARDWARE)
     assert bench.controller.reach(goal, bench.now) is None
@@ -90,7 +90,7 @@ def test_a_reach_from_arming_to_its_outcome(bench: Bench) -> None:
     assert outcome.distance <= goal.radius
 
 
-def test_limits_that_are_not_confirmed_yet_do_not_spoil_the_request(bench: Bench) -> None:
+def test_unconfirmed_limits_do_not_cancel_the_arm_request(bench: Bench) -> None:
     bench.limits = replace(bench.limits, v_max=0.5)
     bench.step()
     acted = bench.now
@@ -100,14 +100,14 @@ def test_limits_that_are_not_confirmed_yet_do_not_spoil_the_request(bench: Bench
     assert bench.controller.arm(requested, acted, requested, free_air=True) == ()
 
 
-def test_limits_that_stay_unconfirmed_are_named(bench: Bench) -> None:
+def test_persistently_unconfirmed_limits_are_named(bench: Bench) -> None:
     bench.limits = replace(bench.limits, f_max=100.0)
     bench.step()
     [why] = bench.arm()
     assert "f_max is 100 N, 10.6066 asked" in why
 
 
-def test_what_fails_between_an_operator_s_act_and_the_arming_is_not_cleared(bench: Bench) -> None:
+def test_fault_between_request_and_arming_is_not_cleared(bench: Bench) -> None:
     acted = bench.now
     bench.duplicate = True
     bench.step()
@@ -119,14 +119,14 @@ def test_what_fails_between_an_operator_s_act_and_the_arming_is_not_cleared(benc
     assert bench.arm() == ()
 
 
-def test_a_bias_of_the_force_sensor_refuses(bench: Bench) -> None:
+def test_force_sensor_bias_refuses_arming(bench: Bench) -> None:
     bench.force = 1.2
     bench.step()
     [why] = bench.arm()
     assert "1.20 N" in why
 
 
-def test_a_second_publisher_ends_a_reach_and_latches(bench: Bench) -> None:
+def test_second_publisher_ends_the_reach_and_latches(bench: Bench) -> None:
     bench.arm()
     bench.controller.reach(make_goal(0.3, 0.0, HARDWARE), bench.now)
     for _ in range(30):
@@ -141,7 +141,7 @@ def test_a_second_publisher_ends_a_reach_and_latches(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(("lateness", "held"), [(0.9, None), (1.1, Check.NOT_ARMED)])
-def test_a_loop_that_stood_still_for_long_does_not_move_off_by_itself(
+def test_long_stalled_loop_does_not_resume_motion(
     bench: Bench, lateness: float, held: Check | None
 ) -> None:
     bench.arm()
@@ -155,7 +155,7 @@ def test_a_loop_that_stood_still_for_long_does_not_move_off_by_itself(
     assert (cycle.decision.twist == ZERO) == (held is not None)
 
 
-def test_ages_are_those_of_the_capture(bench: Bench) -> None:
+def test_ages_are_measured_from_capture(bench: Bench) -> None:
     old = after(bench.now, -0.03)
     touch = Touch(old, bench.now, True, 0.0, Side.NONE, 0.0, 0.0, 0.0, 0.0)
     cycle = bench.controller.cycle(Inputs(touch, None), bench.now, 0.0)

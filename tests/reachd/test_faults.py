@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
+from support.waiting import wait_until
 from tactile_core.bus.messages import codec
 from tactile_core.bus.topics import REACH_EVENT
 
@@ -25,7 +26,7 @@ def stopped(lab: Any) -> bool:
     return len(last) == 10 and all(h.still for h in last)
 
 
-def test_an_arm_whose_state_freezes_latches_the_gate(lab: Any, wait_until: Until) -> None:
+def test_frozen_arm_state_latches_the_gate(lab: Any) -> None:
     """Stamps and sequence go on, values do not: the arm moves, and nobody could see it."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--no-log")
@@ -41,7 +42,7 @@ def test_an_arm_whose_state_freezes_latches_the_gate(lab: Any, wait_until: Until
 
 
 @pytest.mark.parametrize("hours", [1, -1])
-def test_a_step_of_the_system_clock_changes_nothing(
+def test_system_clock_step_changes_nothing(
     hours: int, lab: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Row 17: the processes' wall clocks step while the arm moves; only they, not the machine's."""
@@ -75,7 +76,7 @@ def test_a_step_of_the_system_clock_changes_nothing(
 
 
 @pytest.mark.parametrize("side", ["board", "arm"])
-def test_a_network_that_falls_silent_stops_the_arm(side: str, lab: Any, wait_until: Until) -> None:
+def test_silent_network_stops_the_arm(side: str, lab: Any) -> None:
     """Row 19: nobody's session ends and every liveliness token stands; age alone tells."""
     arm = lab.arm
     wire = lab.wire(lab.reachd_at if side == "board" else lab.arm_at)
@@ -95,7 +96,7 @@ def test_a_network_that_falls_silent_stops_the_arm(side: str, lab: Any, wait_unt
     wait_until(lambda: not arm.moving or all(h.still for h in arm.heard[-3:]))
 
 
-def test_a_short_silence_of_the_network_is_outlived(lab: Any, wait_until: Until) -> None:
+def test_short_network_silence_is_survived(lab: Any) -> None:
     """What comes late, all at once, is old: it is not acted on before it is new again."""
     arm = lab.arm
     wire = lab.wire(lab.reachd_at)
@@ -112,7 +113,7 @@ def test_a_short_silence_of_the_network_is_outlived(lab: Any, wait_until: Until)
     assert program.wait() == 1
 
 
-def test_a_load_at_the_limit_stops_motion_against_it(lab: Any, wait_until: Until) -> None:
+def test_load_at_the_limit_stops_motion_against_it(lab: Any) -> None:
     """Row 25, judged on the arm's own state: the features see nothing."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--no-log")
@@ -131,7 +132,7 @@ def test_a_load_at_the_limit_stops_motion_against_it(lab: Any, wait_until: Until
     assert program.wait() == 1
 
 
-def test_a_target_that_is_not_reached_in_time_ends_in_zero(lab: Any) -> None:
+def test_timed_out_target_ends_in_zero(lab: Any) -> None:
     """Row 36."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--no-log", "--time-limit", "1.5")
@@ -142,7 +143,7 @@ def test_a_target_that_is_not_reached_in_time_ends_in_zero(lab: Any) -> None:
     assert arm.travelled > 0.01
 
 
-def test_a_second_reachd_elsewhere_on_the_bus_is_refused(lab: Any, wait_until: Until) -> None:
+def test_second_reachd_on_the_bus_is_refused(lab: Any) -> None:
     """Row 35 where no lock is shared, as between two machines."""
     arm, _ = lab.arm, lab.board()
     first = lab.reachd("--serve", "--strategy", "straight", "--no-log")
@@ -159,7 +160,7 @@ def test_a_second_reachd_elsewhere_on_the_bus_is_refused(lab: Any, wait_until: U
     assert all(h.still for h in arm.heard)
 
 
-def test_a_second_reachd_that_sees_only_the_arm_is_refused(lab: Any, wait_until: Until) -> None:
+def test_second_reachd_seeing_only_the_arm_is_refused(lab: Any) -> None:
     """Row 35 by the arm itself: no lock is shared, and no link but that to the arm."""
     arm, _ = lab.arm, lab.board()
     lab.reachd("--serve", "--strategy", "straight", "--no-log")
@@ -179,7 +180,7 @@ def test_a_second_reachd_that_sees_only_the_arm_is_refused(lab: Any, wait_until:
     assert lab.ask("status")["armed"] is True
 
 
-def test_the_arm_is_ours_again_after_its_driver_started_anew(lab: Any, wait_until: Until) -> None:
+def test_restarted_arm_driver_is_claimed_again(lab: Any) -> None:
     """Row 45: latched meanwhile; whoever stopped commanding for long has to ask anew, too."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd("--serve", "--strategy", "straight", "--no-log")
@@ -199,9 +200,7 @@ def test_the_arm_is_ours_again_after_its_driver_started_anew(lab: Any, wait_unti
 
 
 @pytest.mark.parametrize("delay", [0.25, 0.07])
-def test_commands_that_are_delayed_on_the_way_latch(
-    delay: float, lab: Any, wait_until: Until
-) -> None:
+def test_commands_delayed_in_transit_latch(delay: float, lab: Any) -> None:
     """Row 37: states come undelayed; the arm drops what is too old, and reachd sees it."""
     arm, _ = lab.arm, lab.board()
     wire = lab.wire(lab.arm_at)
@@ -217,7 +216,7 @@ def test_commands_that_are_delayed_on_the_way_latch(
 
 
 @pytest.mark.parametrize("how", ["backwards", "sideways", "fast"])
-def test_an_arm_that_moves_otherwise_than_it_is_told_latches(how: str, lab: Any) -> None:
+def test_arm_deviating_from_commands_latches(how: str, lab: Any) -> None:
     """Row 38."""
     arm, _ = lab.arm, lab.board()
     arm.does = {
@@ -233,7 +232,7 @@ def test_an_arm_that_moves_otherwise_than_it_is_told_latches(how: str, lab: Any)
     assert arm.travelled < 0.03, "what it goes in 150 ms, and what a busy machine adds"
 
 
-def test_what_an_operator_must_know_is_said(lab: Any, wait_until: Until) -> None:
+def test_operator_messages_are_shown(lab: Any) -> None:
     """Checks that are off and limits beyond the caps: at the start, in the status, in the log."""
     _, _ = lab.arm, lab.board()
     config = lab.folder / "reach.toml"

@@ -13,7 +13,7 @@ import pytest
 from reachd.lock import ArmLock, LockError, runtime_folder
 
 
-def test_the_second_is_refused_by_the_name_of_the_first(tmp_path: Path) -> None:
+def test_second_process_is_refused_naming_the_first(tmp_path: Path) -> None:
     first, second = ArmLock("arm", tmp_path), ArmLock("arm", tmp_path)
     first.acquire("left")
     with pytest.raises(LockError, match=rf"process {os.getpid()}, user .+, reach 'left'"):
@@ -23,7 +23,7 @@ def test_the_second_is_refused_by_the_name_of_the_first(tmp_path: Path) -> None:
     second.acquire("right")
 
 
-def test_the_lock_of_a_killed_holder_is_free(tmp_path: Path) -> None:
+def test_lock_of_a_killed_holder_is_free(tmp_path: Path) -> None:
     script = (
         "import sys, time; from pathlib import Path; from reachd.lock import ArmLock\n"
         "ArmLock('arm', Path(sys.argv[1])).acquire('a'); print('held', flush=True); time.sleep(60)"
@@ -39,7 +39,7 @@ def test_the_lock_of_a_killed_holder_is_free(tmp_path: Path) -> None:
     ArmLock("arm", tmp_path).acquire("b")
 
 
-def test_a_link_that_someone_laid_is_not_followed(tmp_path: Path) -> None:
+def test_planted_symlink_is_not_followed(tmp_path: Path) -> None:
     lock = ArmLock("arm", tmp_path)
     victim = tmp_path / "victim"
     victim.write_text("precious")
@@ -49,7 +49,7 @@ def test_a_link_that_someone_laid_is_not_followed(tmp_path: Path) -> None:
     assert victim.read_text() == "precious"
 
 
-def test_a_holder_s_note_that_is_garbage_does_not_hide_the_refusal(tmp_path: Path) -> None:
+def test_garbled_holder_note_does_not_hide_the_refusal(tmp_path: Path) -> None:
     first = ArmLock("arm", tmp_path)
     first.acquire("a")
     first.note.write_bytes(b"\xff{")
@@ -57,13 +57,13 @@ def test_a_holder_s_note_that_is_garbage_does_not_hide_the_refusal(tmp_path: Pat
         ArmLock("arm", tmp_path).acquire("b")
 
 
-def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+def test_unwritable_folder_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(LockError, match="TACTILE_RUNTIME_DIR"):
         ArmLock("arm", tmp_path / "file").acquire("a")
 
 
-def test_every_user_has_a_folder_unless_another_is_named(
+def test_lock_folder_is_per_user_by_default(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("TACTILE_RUNTIME_DIR", raising=False)
@@ -73,7 +73,7 @@ def test_every_user_has_a_folder_unless_another_is_named(
     assert ArmLock("arm").path.parent == tmp_path
 
 
-def test_a_file_that_lies_under_the_name_of_a_lock_keeps_its_contents(tmp_path: Path) -> None:
+def test_file_with_the_name_of_a_lock_keeps_its_contents(tmp_path: Path) -> None:
     lock = ArmLock("arm", tmp_path)
     lock.path.write_text("precious")
     lock.note.symlink_to(tmp_path / "victim")
@@ -84,7 +84,7 @@ def test_a_file_that_lies_under_the_name_of_a_lock_keeps_its_contents(tmp_path: 
     lock.release()
 
 
-def test_a_second_name_of_another_file_is_not_taken_for_a_lock(tmp_path: Path) -> None:
+def test_hard_link_is_not_accepted_as_a_lock(tmp_path: Path) -> None:
     victim = tmp_path / "victim"
     victim.write_text("precious")
     lock = ArmLock("arm", tmp_path)
@@ -97,7 +97,7 @@ def test_a_second_name_of_another_file_is_not_taken_for_a_lock(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("kind", ["fifo", "folder"])
-def test_what_is_not_a_plain_file_is_refused_without_waiting(tmp_path: Path, kind: str) -> None:
+def test_special_file_is_refused_without_waiting(tmp_path: Path, kind: str) -> None:
     lock = ArmLock("arm", tmp_path)
     if kind == "fifo":
         os.mkfifo(lock.path)
@@ -108,7 +108,7 @@ def test_what_is_not_a_plain_file_is_refused_without_waiting(tmp_path: Path, kin
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs a second user")
-def test_the_lock_of_another_user_is_refused_and_its_holder_named(tmp_path: Path) -> None:
+def test_lock_of_another_user_is_refused_naming_its_holder(tmp_path: Path) -> None:
     lock = ArmLock("arm", tmp_path)
     script = (
         "import fcntl, os, sys, time; os.setuid(65534)\n"
@@ -131,7 +131,7 @@ def test_the_lock_of_another_user_is_refused_and_its_holder_named(tmp_path: Path
     assert "\x1b" not in str(caught.value)
 
 
-def test_what_a_holder_says_of_itself_reaches_no_terminal_raw(tmp_path: Path) -> None:
+def test_holder_text_is_escaped_for_the_terminal(tmp_path: Path) -> None:
     first = ArmLock("arm", tmp_path)
     first.acquire("x\x1b[2J" + "y" * 500)
     with pytest.raises(LockError) as caught:

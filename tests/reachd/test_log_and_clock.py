@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from reachd.inputs import FEATURES, Input, make_arm_state, make_touch
+from support.waiting import wait_until
 from tactile_core.bus.messages import MSG, codec, header
 from tactile_core.bus.services import ServiceError
 from tactile_core.bus.streams import ATTACHMENT, BusSample
@@ -23,7 +24,7 @@ NEAR = ("--strategy", "straight", "--target", "0.04,0.0", "--seed", "1")
 Until = Callable[..., None]
 
 
-def test_a_stamp_that_no_log_can_hold_does_not_end_the_log(lab: Any, wait_until: Until) -> None:
+def test_unrepresentable_stamp_does_not_end_the_log(lab: Any) -> None:
     lab.arm, lab.board()
     program = lab.reachd("--serve", "--log", "trial.mcap")
     wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
@@ -43,7 +44,7 @@ def test_a_stamp_that_no_log_can_hold_does_not_end_the_log(lab: Any, wait_until:
     assert info(lab.folder / "trial.mcap").whole
 
 
-def test_no_reach_begins_without_the_log_that_was_asked_for(lab: Any, wait_until: Until) -> None:
+def test_no_reach_starts_without_the_requested_log(lab: Any) -> None:
     arm, _ = lab.arm, lab.board()
     program = lab.reachd("--serve", "--strategy", "straight", "--log", "logs")
     wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
@@ -64,7 +65,7 @@ def test_no_reach_begins_without_the_log_that_was_asked_for(lab: Any, wait_until
 @pytest.mark.parametrize(
     ("wall_s", "says"), [(-86_400 + 3600, "1969-12-31"), (2**31 + 86_400, "2038-01-20")]
 )
-def test_it_reaches_whatever_the_system_clock_says(
+def test_reach_runs_at_any_system_time(
     wall_s: int, says: str, lab: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (lab.folder / "sitecustomize.py").write_text(
@@ -87,7 +88,7 @@ def test_it_reaches_whatever_the_system_clock_says(
 
 @pytest.mark.parametrize("topic", [FEATURES, ARM_STATE], ids=["features", "arm"])
 @pytest.mark.parametrize("remote", [False, True])
-def test_inputs_outlive_any_bytes_and_stamps(topic: Any, remote: bool) -> None:
+def test_inputs_survive_any_bytes_and_stamps(topic: Any, remote: bool) -> None:
     """Fifty thousand damaged messages, each by a publisher that is heard for the first time."""
     rng = random.Random(42)
     make: Any = make_touch if topic is FEATURES else make_arm_state

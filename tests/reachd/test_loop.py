@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +15,7 @@ from reachd.interfaces import ZERO, Twist
 from reachd.strategies import load_strategy
 from reachd.strategies.parameters import HARDWARE
 from reachd.trial import Supervisor
+from support.waiting import wait_until
 from tactile_core.types import NS_PER_S, Instant, after
 
 START = Instant(7 * NS_PER_S)
@@ -48,14 +48,7 @@ class Rig:
         return b""
 
 
-def until(done: Callable[[], object]) -> None:
-    end = time.monotonic() + 60.0
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.002)
-
-
-def test_deadlines_are_absolute_so_lateness_does_not_add_up() -> None:
+def test_deadlines_are_absolute_so_lateness_does_not_accumulate() -> None:
     schedule = Schedule(0.01, START)
     assert schedule.deadline == at(0.01)
     assert schedule.begin(at(0.013)) == pytest.approx(0.003)
@@ -65,18 +58,18 @@ def test_deadlines_are_absolute_so_lateness_does_not_add_up() -> None:
     assert schedule.missed == 0
 
 
-def test_deadlines_that_were_missed_are_skipped_and_counted() -> None:
+def test_missed_deadlines_are_skipped_and_counted() -> None:
     schedule = Schedule(0.01, START)
     assert schedule.begin(at(0.055)) == pytest.approx(0.045)
     assert schedule.missed == 4  # of .02, .03, .04, .05
     assert schedule.deadline == at(0.06)
 
 
-def test_a_cycle_that_begins_early_is_not_late() -> None:
+def test_early_cycle_is_not_late() -> None:
     assert Schedule(0.01, START).begin(at(0.0099)) == 0.0
 
 
-def test_lateness_is_summed_up() -> None:
+def test_lateness_is_summarised() -> None:
     lateness = Lateness()
     assert lateness.summary() == {}
     for n in range(1000):
@@ -87,29 +80,29 @@ def test_lateness_is_summed_up() -> None:
     assert found["max"] == pytest.approx(0.000999)
 
 
-def test_disarmed_it_sends_zero_every_cycle_and_zero_at_the_end() -> None:
+def test_disarmed_loop_sends_zero_every_cycle_and_at_the_end() -> None:
     rig = Rig()
     rig.loop.start()
-    until(lambda: len(rig.cycles) > 10)
+    wait_until(lambda: len(rig.cycles) > 10)
     assert rig.loop.stop(10.0)
     assert len(rig.sent) == len(rig.cycles) + LAST_ZEROS
     assert set(rig.sent) == {ZERO}
     assert not rig.failures
 
 
-def test_what_fails_in_the_loop_ends_it_loudly_with_zero_last() -> None:
+def test_failure_in_the_loop_ends_it_loudly_with_zero_last() -> None:
     def broken(now: Instant) -> Inputs:
         raise OSError("no more")
 
     rig = Rig(broken)
     rig.loop.start()
-    until(lambda: rig.failures)
-    until(lambda: len(rig.sent) == LAST_ZEROS)
+    wait_until(lambda: rig.failures)
+    wait_until(lambda: len(rig.sent) == LAST_ZEROS)
     assert isinstance(rig.failures[0], OSError)
     assert set(rig.sent) == {ZERO}
 
 
-def test_requests_are_served_by_the_loop_s_thread_between_cycles() -> None:
+def test_requests_are_served_by_the_loop_thread_between_cycles() -> None:
     rig = Rig()
     rig.loop.start()
     served = rig.loop.call(lambda now: threading.current_thread().name)
@@ -125,14 +118,14 @@ def _refuse(now: Instant) -> None:
     raise ValueError("not that")
 
 
-def test_requests_that_nobody_serves_do_not_pile_up() -> None:
+def test_unserved_requests_do_not_accumulate() -> None:
     rig = Rig()
     futures = [rig.loop.call(lambda now: None) for _ in range(40)]
     with pytest.raises(ValueError, match="waiting already"):
         futures[-1].result(0.0)
 
 
-def test_a_loop_that_is_stuck_is_stopped_from_outside() -> None:
+def test_stuck_loop_is_stopped_from_outside() -> None:
     release = threading.Event()
 
     def stuck(now: Instant) -> Inputs:
@@ -144,10 +137,10 @@ def test_a_loop_that_is_stuck_is_stopped_from_outside() -> None:
     assert not rig.loop.stop(0.05)
     assert rig.sent == [ZERO] * LAST_ZEROS
     release.set()
-    until(lambda: len(rig.sent) > LAST_ZEROS)
+    wait_until(lambda: len(rig.sent) > LAST_ZEROS)
 
 
-def test_an_end_without_a_beginning_is_none() -> None:
+def test_stopping_before_starting_does_nothing() -> None:
     rig: Any = Rig()
     assert rig.loop.stop(0.0)
     assert rig.sent == []

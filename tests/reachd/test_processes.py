@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from support.waiting import wait_until
 from tactile_core.bus.messages import codec
 from tactile_core.bus.services import ServiceError, declare_service
 from tactile_core.bus.streams import declare_publisher
@@ -30,9 +31,7 @@ def stopped(lab: Any) -> bool:
     return len(last) == 10 and all(h.still for h in last)
 
 
-def test_a_reach_from_start_to_outcome_and_one_file_that_holds_it(
-    lab: Any, hardware_limits: ArmLimits
-) -> None:
+def test_complete_reach_is_held_in_one_log_file(lab: Any, hardware_limits: ArmLimits) -> None:
     arm, _ = lab.arm, lab.board()
     asked: list[object] = []
     key = service_key("board0", "geometry")
@@ -73,9 +72,7 @@ def test_a_reach_from_start_to_outcome_and_one_file_that_holds_it(
     assert "parameters.json" in log.attachments
 
 
-def test_silent_features_stop_the_arm_and_lost_ones_end_the_reach(
-    lab: Any, wait_until: Until
-) -> None:
+def test_silent_features_stop_the_arm_and_lost_features_end_the_reach(lab: Any) -> None:
     """Rows 4, 13, 14 and 19: a stopped, then a killed, tactiled."""
     _, board = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--no-log")
@@ -90,7 +87,7 @@ def test_silent_features_stop_the_arm_and_lost_ones_end_the_reach(
     lab.told_to_stand()
 
 
-def test_a_short_silence_only_pauses_the_reach(lab: Any, wait_until: Until) -> None:
+def test_short_silence_only_pauses_the_reach(lab: Any) -> None:
     arm, board = lab.arm, lab.board()
     config = lab.folder / "reach.toml"
     config.write_text("[parameters.safety]\nfeatures_latch = 30.0\n")
@@ -104,7 +101,7 @@ def test_a_short_silence_only_pauses_the_reach(lab: Any, wait_until: Until) -> N
     assert program.wait() == 1
 
 
-def test_an_arm_without_state_is_not_moved_and_ends_the_reach(lab: Any, wait_until: Until) -> None:
+def test_lost_arm_state_stops_motion_and_ends_the_reach(lab: Any) -> None:
     """Row 24, and the latch after a second."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--no-log")
@@ -116,9 +113,7 @@ def test_an_arm_without_state_is_not_moved_and_ends_the_reach(lab: Any, wait_unt
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_told_to_end_it_stops_the_arm_first_and_closes_its_log(
-    lab: Any, number: signal.Signals, wait_until: Until
-) -> None:
+def test_sigterm_stops_arm_before_closing_log(lab: Any, number: signal.Signals) -> None:
     """Row 34."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--log", "trial.mcap")
@@ -131,9 +126,7 @@ def test_told_to_end_it_stops_the_arm_first_and_closes_its_log(
     wait_until(lambda: not arm.moving)
 
 
-def test_killed_its_arm_stops_its_log_recovers_and_the_next_one_starts(
-    lab: Any, wait_until: Until
-) -> None:
+def test_kill_9_stops_the_arm_and_a_new_reachd_starts(lab: Any) -> None:
     """Rows 15 and 29: nothing of it stays in the way."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--log", "trial.mcap")
@@ -148,7 +141,7 @@ def test_killed_its_arm_stops_its_log_recovers_and_the_next_one_starts(
     assert again.wait() == 0, again.said
 
 
-def test_stopped_and_continued_it_does_not_move_off_by_itself(lab: Any, wait_until: Until) -> None:
+def test_sigstop_and_sigcont_do_not_resume_motion(lab: Any) -> None:
     """Row 14 for reachd itself: the arm stops without it, and waits for an operator."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--no-log")
@@ -165,7 +158,7 @@ def test_stopped_and_continued_it_does_not_move_off_by_itself(lab: Any, wait_unt
     assert sum(not h.still for h in arm.heard[count:]) <= 1
 
 
-def test_served_over_the_bus(lab: Any, wait_until: Until) -> None:
+def test_goals_are_served_over_the_bus(lab: Any) -> None:
     """Goals, refusals, rows 22, 26 and 35, in the life of one daemon."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd("--serve", "--strategy", "straight", "--no-log")
@@ -222,7 +215,7 @@ def test_served_over_the_bus(lab: Any, wait_until: Until) -> None:
     lab.told_to_stand()
 
 
-def test_without_features_or_arm_nothing_begins(lab: Any) -> None:
+def test_without_features_or_arm_no_reach_starts(lab: Any) -> None:
     """Row 23 as well: a replay is nobody."""
     lab.board(prefix="replay")
     program = lab.reachd(*NEAR, "--no-log", "--wait", "1")
@@ -233,7 +226,7 @@ def test_without_features_or_arm_nothing_begins(lab: Any) -> None:
     assert "Traceback" not in program.said
 
 
-def test_a_board_of_another_machine_must_be_named(lab: Any) -> None:
+def test_remote_board_must_be_named(lab: Any) -> None:
     arm, _ = lab.arm, lab.board(ahead=500.0)
     program = lab.reachd(*NEAR, "--no-log", "--wait", "3")
     assert program.wait() == 3
@@ -245,7 +238,7 @@ def test_a_board_of_another_machine_must_be_named(lab: Any) -> None:
 
 
 @pytest.mark.parametrize("trouble", ["limits", "bias", "fault", "broken log"])
-def test_an_arm_that_is_not_fit_is_not_armed(lab: Any, trouble: str) -> None:
+def test_unfit_arm_is_not_armed(lab: Any, trouble: str) -> None:
     """Rows 26, 27 and 28: refused before anything moves."""
     arm, _ = lab.arm, lab.board()
     arm.deaf_to_limits = trouble == "limits"
@@ -265,7 +258,7 @@ def test_an_arm_that_is_not_fit_is_not_armed(lab: Any, trouble: str) -> None:
     assert all(h.still for h in arm.heard)
 
 
-def test_a_strategy_that_fails_or_hangs_ends_in_standing_still(lab: Any, wait_until: Until) -> None:
+def test_failing_or_hanging_strategy_stops_the_arm(lab: Any) -> None:
     """Row 18, and a strategy that never returns."""
     (lab.folder / "own.py").write_text(
         "import time\n"
@@ -300,7 +293,7 @@ def test_a_strategy_that_fails_or_hangs_ends_in_standing_still(lab: Any, wait_un
     wait_until(lambda: arm.heard[-1].still)  # it may still be on its way when the process is gone
 
 
-def test_forged_bytes_never_take_the_daemon_down(lab: Any, wait_until: Until) -> None:
+def test_forged_bytes_never_crash_the_daemon(lab: Any) -> None:
     """Row 22: what is no message, or too large, is counted and not acted on."""
     lab.arm, lab.board()
     program = lab.reachd("--serve", "--no-log")

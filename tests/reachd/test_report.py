@@ -33,7 +33,7 @@ OUTCOME = Outcome(
 NEVER = Outcome(False, Reason.HELD, "why", math.nan, math.inf, 0.0, 0.0, 0.0, (), {})
 
 
-def test_the_last_line_says_what_matters() -> None:
+def test_last_line_summarises_the_outcome() -> None:
     assert last_line(OUTCOME) == (
         "REACHED: 7.4 mm from the target, 12.30 s, peak force 6.2 N, excavations "
         "3 (2 ccw, 1 cw; 1 by stall, 2 by push), interventions acceleration 5, wrench 2"
@@ -41,13 +41,13 @@ def test_the_last_line_says_what_matters() -> None:
     assert last_line(NEVER).startswith("NOT REACHED (held): unknown distance from the target")
 
 
-def test_the_table_ends_in_the_last_line() -> None:
+def test_table_ends_with_the_last_line() -> None:
     file = io.StringIO()
     show(Console(file=file, width=60), OUTCOME, GOAL, ABOUT)
     assert file.getvalue().splitlines()[-1] == last_line(OUTCOME)
 
 
-def test_json_is_json_whatever_the_numbers() -> None:
+def test_report_is_valid_json_for_any_numbers() -> None:
     found = json.loads(as_json(OUTCOME, GOAL, ABOUT))
     assert found["goal"] == {"x": 0.358, "y": 0.03, "radius": 0.0075, "time_limit": 40.0}
     assert (found["success"], found["reason"], found["seed"]) == (True, "reached", 7)

@@ -27,7 +27,7 @@ def write(folder: Path, text: str) -> str:
     return str(path)
 
 
-def test_a_target_is_all_that_is_needed() -> None:
+def test_target_alone_is_enough() -> None:
     s = settings("--target", "0.358,0.03")
     assert s.goal is not None
     assert (s.goal.x, s.goal.y, s.goal.radius, s.goal.time_limit) == (0.358, 0.03, 0.0075, 40.0)
@@ -38,18 +38,18 @@ def test_a_target_is_all_that_is_needed() -> None:
     assert s.bus.role == "reachd"
 
 
-def test_without_a_target_it_serves() -> None:
+def test_without_target_reachd_serves() -> None:
     assert settings().serve
     assert settings("--target", "0.3,0", "--serve").serve
     assert "--target" in refusal("--once")
 
 
-def test_a_seed_that_nobody_gave_is_drawn_anew() -> None:
+def test_missing_seed_is_drawn_at_random() -> None:
     assert settings("--serve").seed != settings("--serve").seed
     assert settings("--seed", "7").seed == 7
 
 
-def test_the_file_says_it_all_and_flags_win(tmp_path: Path) -> None:
+def test_file_sets_everything_and_flags_override(tmp_path: Path) -> None:
     path = write(
         tmp_path,
         """
@@ -99,7 +99,9 @@ def test_the_file_says_it_all_and_flags_win(tmp_path: Path) -> None:
         ("[inputs]\nboard_clock = 'both'", 2, "remote, same"),
     ],
 )
-def test_a_wrong_file_is_refused_by_line(tmp_path: Path, text: str, line: int, words: str) -> None:
+def test_wrong_file_is_refused_with_its_line(
+    tmp_path: Path, text: str, line: int, words: str
+) -> None:
     path = write(tmp_path, text)
     said = refusal("--config", path)
     assert words in said
@@ -125,7 +127,7 @@ def test_a_wrong_file_is_refused_by_line(tmp_path: Path, text: str, line: int, w
         (("--arm", "*"), "letters"),
     ],
 )
-def test_wrong_flags_are_refused_with_what_is_allowed(flags: tuple[str, ...], words: str) -> None:
+def test_wrong_flags_are_refused_with_allowed_values(flags: tuple[str, ...], words: str) -> None:
     assert words in refusal(*flags)
 
 
@@ -140,7 +142,7 @@ def test_times_and_sizes_are_finite_and_above_zero(
     assert f"{value!r} given; allowed" in capsys.readouterr().err
 
 
-def test_an_unknown_strategy_lists_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_strategy_lists_available_strategies(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--strategy", "tunnel", "--target", "0.3,0"]) == 2
     said = capsys.readouterr().err
     assert "'tunnel'" in said
@@ -149,7 +151,7 @@ def test_an_unknown_strategy_lists_what_there_is(capsys: pytest.CaptureFixture[s
     )
 
 
-def test_a_strategy_of_one_s_own_is_found_in_the_working_folder(
+def test_own_strategy_is_found_in_the_working_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "reachd_test_own.py").write_text(

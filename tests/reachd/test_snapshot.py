@@ -49,13 +49,13 @@ def touch_input(*, remote: bool = False) -> Input[Any]:
     return Input(FEATURES, make_touch, TAKEOVER, remote=remote)
 
 
-def test_one_publisher_in_order_is_accepted() -> None:
+def test_single_ordered_publisher_is_accepted() -> None:
     pin = SourcePin(TAKEOVER)
     assert [pin.judge(sample(n), at(n * 0.01)) for n in (1, 2, 5)] == [Verdict.ACCEPTED] * 3
     assert not pin.duplicated(at(0.05))
 
 
-def test_a_second_publisher_is_refused_and_told_of_for_a_while() -> None:
+def test_second_publisher_is_refused_and_reported_for_a_while() -> None:
     pin = SourcePin(TAKEOVER)
     pin.judge(sample(1), at(0.0))
     assert pin.judge(sample(9, B), at(0.01)) is Verdict.DUPLICATE
@@ -66,13 +66,13 @@ def test_a_second_publisher_is_refused_and_told_of_for_a_while() -> None:
 
 
 @pytest.mark.parametrize(("silent", "verdict"), [(0.199, "DUPLICATE"), (0.2, "ACCEPTED")])
-def test_a_restart_is_heeded_once_the_first_was_silent(silent: float, verdict: str) -> None:
+def test_restarted_publisher_is_accepted_after_silence(silent: float, verdict: str) -> None:
     pin = SourcePin(TAKEOVER)
     pin.judge(sample(100), at(0.0))
     assert pin.judge(sample(1, B), at(silent)).name == verdict
 
 
-def test_when_the_first_publisher_comes_back_both_are_in_doubt() -> None:
+def test_returning_first_publisher_puts_both_in_doubt() -> None:
     pin = SourcePin(TAKEOVER)
     pin.judge(sample(100), at(0.0))
     pin.judge(sample(1, B), at(0.3))
@@ -80,7 +80,7 @@ def test_when_the_first_publisher_comes_back_both_are_in_doubt() -> None:
     assert pin.duplicated(at(0.31))
 
 
-def test_a_forger_with_the_same_id_is_told_by_the_order() -> None:
+def test_forger_with_the_same_id_is_detected_by_order() -> None:
     pin = SourcePin(TAKEOVER)
     pin.judge(sample(10), at(0.0))
     assert pin.judge(sample(900, data=b"forged"), at(0.001)) is Verdict.ACCEPTED
@@ -90,7 +90,7 @@ def test_a_forger_with_the_same_id_is_told_by_the_order() -> None:
     assert again.judge(sample(10, data=b"forged"), at(0.001)) is Verdict.DUPLICATE
 
 
-def test_a_number_forged_under_the_first_one_s_name_locks_nobody_out() -> None:
+def test_forged_sequence_number_does_not_lock_out_the_publisher() -> None:
     """It is told, and once what it set has grown old the first publisher is heard again."""
     pin = SourcePin(TAKEOVER)
     pin.judge(sample(10), at(0.0))
@@ -106,14 +106,14 @@ def test_a_number_forged_under_the_first_one_s_name_locks_nobody_out() -> None:
     assert pin.judge(last, at(2.0)) is Verdict.REPEATED, "the very same, however late"
 
 
-def test_the_same_sample_over_two_links_is_used_once() -> None:
+def test_sample_arriving_over_two_links_is_used_once() -> None:
     pin = SourcePin(TAKEOVER)
     pin.judge(sample(10), at(0.0))
     assert pin.judge(sample(10), at(0.001)) is Verdict.REPEATED
     assert not pin.duplicated(at(0.001))
 
 
-def test_who_does_not_say_who_it_is_is_never_believed() -> None:
+def test_anonymous_publisher_is_never_trusted() -> None:
     pin = SourcePin(TAKEOVER)
     assert pin.judge(sample(None, None), at(0.0)) is Verdict.ANONYMOUS
     pin.judge(sample(1), at(0.01))
@@ -121,7 +121,7 @@ def test_who_does_not_say_who_it_is_is_never_believed() -> None:
     assert pin.duplicated(at(0.02))
 
 
-def test_features_become_touch_with_the_sender_s_own_stamp() -> None:
+def test_features_keep_the_stamp_of_the_sender() -> None:
     source = touch_input()
     source.take(sample(1, data=encoded(at(0.5))), at(0.51))
     touch: Any = source.value
@@ -132,7 +132,7 @@ def test_features_become_touch_with_the_sender_s_own_stamp() -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00\x01", b"x" * 300])
-def test_garbage_leaves_the_last_value_which_grows_old(data: bytes) -> None:
+def test_garbage_keeps_the_last_value_which_ages(data: bytes) -> None:
     source = touch_input()
     source.take(sample(1, data=encoded(at(0.0))), at(0.0))
     before = source.value
@@ -141,7 +141,7 @@ def test_garbage_leaves_the_last_value_which_grows_old(data: bytes) -> None:
     assert source.counters["malformed"] == 1
 
 
-def test_a_side_that_does_not_exist_is_no_touch() -> None:
+def test_unknown_side_is_not_a_touch() -> None:
     source = touch_input()
     source.take(sample(1, data=encoded(at(0.0), peak_side=77)), at(0.0))
     assert source.value is None
@@ -157,7 +157,7 @@ def test_arbitrary_bytes_never_raise(received: list[tuple[bytes, int]]) -> None:
     assert sum(source.counters.values()) == len(received)
 
 
-def test_another_machine_s_clock_is_read_by_the_quickest_message() -> None:
+def test_remote_clock_is_mapped_by_the_fastest_message() -> None:
     clock, apart = RemoteClock(), 3_600 * NS_PER_S
     assert clock.here(at(0.0) - apart, at(0.005)) == at(0.005)
     # 2 ms quicker: the first was 2 ms old when it came, which was not to be known.
@@ -166,7 +166,7 @@ def test_another_machine_s_clock_is_read_by_the_quickest_message() -> None:
     assert (at(0.5) - late) / NS_PER_S == pytest.approx(0.297, abs=1e-3)
 
 
-def test_a_queue_that_fills_up_on_the_way_shows_as_age() -> None:
+def test_growing_queue_shows_as_age() -> None:
     """Row 21: data that come ever later, without a gap."""
     source = touch_input(remote=True)
     for n in range(200):
@@ -176,7 +176,7 @@ def test_a_queue_that_fills_up_on_the_way_shows_as_age() -> None:
     assert (touch.received - touch.captured) / NS_PER_S == pytest.approx(0.199, abs=0.005)
 
 
-def test_clocks_that_drift_apart_do_not_look_like_age() -> None:
+def test_clock_drift_does_not_show_as_age() -> None:
     clock = RemoteClock()
     for n in range(1000):
         sent = n * 1.0
@@ -184,7 +184,7 @@ def test_clocks_that_drift_apart_do_not_look_like_age() -> None:
     assert at(sent + 0.001) == here
 
 
-def test_a_restarted_remote_sender_is_mapped_anew() -> None:
+def test_restarted_remote_sender_is_mapped_again() -> None:
     source = touch_input(remote=True)
     source.take(sample(1, data=encoded(at(0.0))), at(0.0))
     source.take(sample(1, B, data=encoded(at(-1000.0))), at(1.0))

@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any
 
 
-def test_the_control_loop_feeds_the_watchdog_and_a_stopped_one_does_not(
-    lab: Any, tmp_path: Path
-) -> None:
+def test_control_loop_feeds_the_watchdog_only_while_running(lab: Any, tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         manager.settimeout(60)

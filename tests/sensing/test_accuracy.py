@@ -23,7 +23,7 @@ def turned():
 
 
 @pytest.mark.parametrize("percent", [0, 25, 50])
-def test_a_turn_in_the_earths_field_leaves_no_false_force(turned, percent):
+def test_turning_in_the_earth_field_leaves_no_false_force(turned, percent):
     assert turned[f"rotation_uncompensated_systematic_n_{percent}"] > 0.1
     assert turned[f"rotation_consensus_rms_n_{percent}"] <= 0.04  # aim 0.05, noise and all
     assert turned[f"rotation_consensus_systematic_n_{percent}"] <= 0.01
@@ -36,7 +36,7 @@ def test_contact_forces_keep_their_size_while_turning(turned, percent):
     assert turned[f"rotation_contact_true_bias_pct_{percent}"] <= 3.0
 
 
-def test_consensus_leaves_no_more_than_ransac_on_the_same_surfaces():
+def test_consensus_residual_is_no_larger_than_ransac():
     figures = bench_consensus(surfaces=2, repeats=1)
     for percent in (0, 25, 45):
         assert figures[f"consensus_residual_ratio_{percent}"] <= 1.0
@@ -46,14 +46,14 @@ def test_consensus_leaves_no_more_than_ransac_on_the_same_surfaces():
         )
 
 
-def test_the_pipeline_benchmark_gives_its_figures():
+def test_pipeline_benchmark_reports_its_figures():
     figures = bench_pipeline(cycles=50)
     assert set(figures) == {"pipeline_ms_p50", "pipeline_ms_p99"}
     assert 0 < figures["pipeline_ms_p50"] <= figures["pipeline_ms_p99"]
 
 
 @pytest.mark.parametrize("method", ["off", "consensus"])
-def test_a_recorded_board_follows_its_load_cell(method):
+def test_recorded_board_follows_its_load_cell(method):
     """Nominal figures alone, no calibration: the summed normal force tracks 0–34 N."""
     folder = RECORDINGS / "normal_force_20250401_014340"
     with gzip.open(folder / "sensor.csv.gz") as stream:

@@ -29,7 +29,7 @@ def measured(board):
     return dataclasses.replace(plain, arrays=arrays, provenance='rig "3" \\ µ\n2nd line')
 
 
-def test_a_file_gives_back_the_very_numbers_saved(measured, tmp_path):
+def test_calibration_file_round_trips_exactly(measured, tmp_path):
     path = tmp_path / "board.cal.toml"
     calibration.save(measured, path)
     back = calibration.load(path)
@@ -47,14 +47,14 @@ def test_a_file_gives_back_the_very_numbers_saved(measured, tmp_path):
         assert (a.geometry.name, a.geometry.side) == (b.geometry.name, b.geometry.side)
 
 
-def test_uncoupled_taxels_cost_no_coupling_lines(board):
+def test_uncoupled_taxels_write_no_coupling_lines(board):
     text = calibration.saves(board())
     assert "coupling_n_per_ut = [  #" in text
     assert len(text) < 20_000
     assert calibration.loads(text).hash == board().hash
 
 
-def test_the_hash_changes_with_any_number(measured):
+def test_hash_changes_with_any_number(measured):
     array = measured.arrays[1]
     nudged = array.newton_per_ut.copy()
     nudged[3, 7] = np.nextafter(nudged[3, 7], 1)
@@ -88,7 +88,7 @@ def test_the_hash_changes_with_any_number(measured):
         ("serial_number = ", "serial_number = [", ["bad.cal.toml:"]),
     ],
 )
-def test_a_bad_file_is_refused_with_file_key_given_and_allowed(board, tmp_path, old, new, words):
+def test_bad_file_is_refused_with_key_value_and_allowed_values(board, tmp_path, old, new, words):
     path = tmp_path / "bad.cal.toml"
     path.write_text(calibration.saves(board()).replace(old, new, 1))
     with pytest.raises(CalibrationError) as caught:
@@ -99,7 +99,7 @@ def test_a_bad_file_is_refused_with_file_key_given_and_allowed(board, tmp_path, 
         assert word in message
 
 
-def test_a_rotation_that_is_none_is_refused(board):
+def test_invalid_rotation_is_refused(board):
     text = calibration.saves(board()).replace("[1.0, 0.0, 0.0, ", "[1.1, 0.0, 0.0, ", 1)
     with pytest.raises(CalibrationError, match="orthonormal"):
         calibration.loads(text)
@@ -133,7 +133,7 @@ def test_missing_unreadable_and_binary_files_are_named(tmp_path):
         calibration.load(binary)
 
 
-def test_a_failed_save_leaves_the_old_file(measured, tmp_path):
+def test_failed_save_keeps_the_old_file(measured, tmp_path):
     target = tmp_path / "kept.cal.toml"
     target.mkdir()
     with pytest.raises(CalibrationError, match="cannot be written"):
@@ -141,7 +141,7 @@ def test_a_failed_save_leaves_the_old_file(measured, tmp_path):
     assert target.is_dir()
 
 
-def test_another_boards_calibration_is_refused_with_both_numbers(measured):
+def test_calibration_of_another_board_is_refused_with_both_serial_numbers(measured):
     measured.require_board("0011223344556677")
     with pytest.raises(CalibrationMismatch) as caught:
         measured.require_board("ffeeddccbbaa9988", "finger.cal.toml")
@@ -149,7 +149,7 @@ def test_another_boards_calibration_is_refused_with_both_numbers(measured):
         assert word in str(caught.value)
 
 
-def test_nominal_figures_say_so_and_have_the_published_sensitivity():
+def test_nominal_values_are_marked_and_have_the_published_sensitivity():
     skin = nominal("anyskin", "A1")
     assert skin.nominal
     assert "nominal" in skin.provenance
@@ -175,7 +175,7 @@ def test_anyskin_controllers_of_any_size():
         nominal("anyskin", "A", 21)
 
 
-def test_boards_of_one_controller_are_arrays_whose_places_nobody_knows():
+def test_boards_of_one_controller_are_arrays_without_poses():
     skin = nominal("anyskin", "A", 10).geometry
     assert [(a.name, a.taxels, a.posed) for a in skin.arrays] == [
         ("skin0", 5, False),
@@ -192,7 +192,7 @@ def test_boards_of_one_controller_are_arrays_whose_places_nobody_knows():
             nominal("anyskin", "A", 10, wrong)
 
 
-def test_whether_arrays_are_posed_goes_through_the_file():
+def test_posed_flag_round_trips_through_the_file():
     skin = nominal("anyskin", "A", 10)
     text = calibration.saves(skin)
     assert "format_version = 3" in text

@@ -70,7 +70,7 @@ def test_slopes_are_per_metre(board, stream):
     np.testing.assert_allclose(plane[2, 0, 1:], [300.0, -200.0], atol=0.01)
 
 
-def test_an_uncovered_half_is_enough(scene):
+def test_uncovered_half_is_enough_for_the_fit(scene):
     s = scene()
     cycle = s.go(pressed=range(8))
     assert cycle.ambient.valid.all()
@@ -78,7 +78,7 @@ def test_an_uncovered_half_is_enough(scene):
     np.testing.assert_allclose(cycle.force, s.force, atol=0.35)
 
 
-def test_a_covered_array_is_marked_in_the_same_cycle_and_follows_the_others(scene):
+def test_covered_array_is_marked_at_once_and_follows_the_others(scene):
     s = scene()
     s.go(cycles=5)
     cycle = s.go(pressed=LEFT)
@@ -97,7 +97,7 @@ def test_a_covered_array_is_marked_in_the_same_cycle_and_follows_the_others(scen
     assert cycle.features.reasons == ()
 
 
-def test_a_covered_board_holds_the_last_plane_says_so_and_gives_up_in_time(scene):
+def test_covered_board_holds_the_last_plane_for_a_limited_time(scene):
     s = scene(hold_s=0.5)
     s.go(cycles=5)
     before = s.go().ambient.plane
@@ -117,13 +117,13 @@ def test_a_covered_board_holds_the_last_plane_says_so_and_gives_up_in_time(scene
     assert s.go().features.valid
 
 
-def test_hold_can_be_forbidden(scene):
+def test_hold_can_be_disabled(scene):
     s = scene(hold_s=0.0)
     s.go()
     assert not s.go(pressed=EVERY).features.valid
 
 
-def test_covered_from_the_start_there_is_nothing_to_hold(scene):
+def test_board_covered_from_the_start_has_nothing_to_hold(scene):
     cycle = scene().go(pressed=EVERY)
     assert not cycle.features.valid
     assert np.isinf(cycle.ambient.age).all()
@@ -141,26 +141,26 @@ def test_five_taxels_hold_through_any_contact_for_some_seconds(lone):
     assert cycle.features.valid
     assert cycle.features.codes == ("compensation_held:skin",)
     np.testing.assert_allclose(cycle.force, s.force, atol=0.3)
-    later = s.go(pressed=range(5), cycles=6000)
+    later = s.go(pressed=range(5), cycles=1600)  # doubted after some 14 s
     assert later.features.codes == ("compensation_held:skin", "uncertain:skin")
     assert not later.features.valid
     assert later.features.normal_force_bound > cycle.features.normal_force_bound
 
 
-def test_a_period_holds_and_ages_between_fits(scene):
+def test_plane_is_held_and_ages_between_fits(scene):
     s = scene(compensation_rate_hz=5.0)
     ages = [s.go().ambient.age[0] for _ in range(45)]
     np.testing.assert_allclose(ages, [(k % 20) * 0.01 for k in range(45)])
 
 
-def test_between_fits_a_lost_support_still_shows_in_the_same_cycle(scene):
+def test_lost_support_between_fits_shows_in_the_same_cycle(scene):
     s = scene(compensation_rate_hz=2.0)
     assert s.go(cycles=3).ambient.valid.all()
     assert s.go(pressed=LEFT).ambient.valid.tolist() == [False, True, True]
     assert not s.go(ambient=LATER).ambient.valid.any()  # turned away from what is held
 
 
-def test_off_removes_nothing(scene):
+def test_disabled_compensation_removes_nothing(scene):
     s = scene(method="off")
     cycle = s.go()
     assert cycle.ambient.method == "off"
@@ -191,7 +191,7 @@ def test_ransac_finds_the_plane_at_its_period_and_is_repeatable(scene):
     )
 
 
-def test_ransac_marks_a_plane_that_is_no_longer_borne_out(scene):
+def test_ransac_marks_an_unsupported_plane(scene):
     s = scene(method="ransac")
     s.go(cycles=2)
     cycle = s.go(pressed=LEFT)
@@ -199,7 +199,7 @@ def test_ransac_marks_a_plane_that_is_no_longer_borne_out(scene):
     assert cycle.features.codes == ("compensation_held:left",)
 
 
-def test_a_reset_forgets_the_planes(scene):
+def test_reset_clears_the_planes(scene):
     s = scene()
     s.go(cycles=3)
     s.flow.pipeline.reset()

@@ -73,7 +73,7 @@ def press(rng, fitter, field, share):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 0.45])
-def test_a_plane_is_recovered_under_contact(fitter, share):
+def test_plane_is_recovered_under_contact(fitter, share):
     """Exactly, but for what crosstalk leaves after two passes, and for the shrinkage of slopes that
     the free taxels can hardly tell: both well below one sample's noise of 5 µT.
     """
@@ -93,7 +93,7 @@ def test_a_plane_is_recovered_under_contact(fitter, share):
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.1, 0.25, 0.45]))
-def test_an_added_uniform_field_comes_out_and_changes_nothing_else(seed, share):
+def test_added_uniform_field_is_removed_exactly(seed, share):
     fitter = FITTER
     rng = np.random.default_rng(seed)
     field = fitter.noise(rng)
@@ -124,14 +124,14 @@ def added_plane(seed, share):
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.1]))
-def test_an_added_plane_comes_out_to_within_the_noise(seed, share):
+def test_added_plane_is_removed_to_within_the_noise(seed, share):
     """Of two samples, 5 µT rms each; the largest of 16,000 draws was 4.2 µT rms on one array."""
     plain, moved, away = added_plane(seed, share)
     assert np.sqrt((away**2).mean(axis=(1, 2))).max() < 10.0
     np.testing.assert_array_equal(moved.valid, plain.valid)
 
 
-def test_an_added_plane_mostly_comes_out_to_a_fraction_of_the_noise():
+def test_added_plane_is_mostly_removed_to_a_fraction_of_the_noise():
     draws = [added_plane(seed, share) for share in (0.0, 0.1) for seed in range(200)]
     assert np.sqrt(np.mean([away**2 for *_, away in draws])) < 0.2
     same = [np.array_equal(moved.support, plain.support) for plain, moved, _ in draws]
@@ -140,7 +140,7 @@ def test_an_added_plane_mostly_comes_out_to_a_fraction_of_the_noise():
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_turning_the_axes_turns_the_fit(seed):
+def test_fit_rotates_with_the_axes(seed):
     """On an uncoupled board nothing prefers one axis of ee to another."""
     fitter = FITTER_UNCOUPLED
     rng = np.random.default_rng(seed)
@@ -182,7 +182,7 @@ def test_forces_do_not_change_with_a_uniform_field(board, field_of):
     np.testing.assert_allclose(forces[0], forces[1], atol=1e-7)
 
 
-def test_half_of_an_array_in_one_patch(fitter):
+def test_fit_holds_with_half_an_array_in_one_patch(fitter):
     """Two of four rows pressed: the slope across them cannot be told, the field still can."""
     rng = np.random.default_rng(6)
     theta = np.zeros((3, 3, 3))
@@ -199,7 +199,7 @@ def test_half_of_an_array_in_one_patch(fitter):
     assert np.mean(worst) < 10.0  # two sigma of one sample, at the worst taxel
 
 
-def test_an_array_under_a_uniform_press_is_told_from_the_ambient_field(board):
+def test_uniform_press_is_distinguished_from_the_ambient_field(board):
     """All of an array agrees on 100 µT more; the rest of the board does not."""
     fitter = Fitter(board())
     rng = np.random.default_rng(9)
@@ -216,7 +216,7 @@ def test_an_array_under_a_uniform_press_is_told_from_the_ambient_field(board):
     ).valid.tolist() == [True, False, False]
 
 
-def test_pressure_that_falls_off_evenly_is_no_ambient_field(board):
+def test_linear_pressure_is_not_ambient_field(board):
     fitter = Fitter(board())
     rng = np.random.default_rng(9)
     field = fitter.noise(rng)
@@ -224,7 +224,7 @@ def test_pressure_that_falls_off_evenly_is_no_ambient_field(board):
     assert fitter.fit(field).valid.tolist() == [False, True, True]
 
 
-def test_no_support_is_said(board):
+def test_missing_support_is_reported(board):
     fitter = Fitter(board())
     rng = np.random.default_rng(2)
     field = rng.uniform(-500, 500, fitter.shape)
@@ -235,7 +235,7 @@ def test_no_support_is_said(board):
     assert np.isfinite(fit.theta).all()
 
 
-def test_masked_taxels_have_no_say(board):
+def test_masked_taxels_are_ignored(board):
     fitter = Fitter(board())
     rng = np.random.default_rng(4)
     field = fitter.noise(rng)
@@ -248,7 +248,7 @@ def test_masked_taxels_have_no_say(board):
     assert b.valid.all()
 
 
-def test_an_array_without_healthy_taxels_is_invalid_and_harms_no_other(fitter):
+def test_array_without_healthy_taxels_is_invalid_alone(fitter):
     rng = np.random.default_rng(4)
     field = fitter.noise(rng)
     healthy = fitter.layout.real.copy()
@@ -259,7 +259,7 @@ def test_an_array_without_healthy_taxels_is_invalid_and_harms_no_other(fitter):
     assert np.isfinite(fit.theta).all()
 
 
-def test_few_taxels_get_a_constant_and_keep_the_contacts_energy():
+def test_few_taxels_get_a_constant_fit():
     """A plane on five taxels takes 46 % of a contact's energy; this fit must take next to none."""
     fitter = Fitter(nominal("anyskin", "A"))
     rng = np.random.default_rng(5)
@@ -282,7 +282,7 @@ def test_few_taxels_get_a_constant_and_keep_the_contacts_energy():
     assert 0.97 < np.mean(kept) < 1.03
 
 
-def test_candidates_are_the_same_every_time_and_propose_planes():
+def test_candidates_are_deterministic_planes():
     layout = Layout(nominal("finger", "A").geometry)
     design = layout.design[0].T
     operators, uses = design_candidates(design)

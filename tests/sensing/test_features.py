@@ -43,7 +43,7 @@ def presses(**newton):
     return force
 
 
-def test_nothing_touched():
+def test_untouched_board_has_no_contact():
     features = Feel()()
     assert features.peak_force == 0.0
     assert features.peak_side is Side.NONE
@@ -52,7 +52,7 @@ def test_nothing_touched():
     assert (features.wrench == 0).all()
 
 
-def test_the_wrench_of_a_known_press():
+def test_wrench_of_a_known_press_is_exact():
     """2 N straight onto a taxel of the left side, 0.5 N of drag towards the wrist."""
     taxel = 12
     force = np.zeros((80, 3))
@@ -73,7 +73,7 @@ def test_the_wrench_of_a_known_press():
     np.testing.assert_allclose(patch.force, in_ee, atol=1e-12)
 
 
-def test_a_press_between_taxels_is_found_between_them():
+def test_press_between_taxels_is_located_between_them():
     features = Feel()(presses(t9=1.0, t10=1.0))
     np.testing.assert_allclose(features.peak_position, (POSITION[9] + POSITION[10]) / 2)
     features = Feel()(presses(t9=3.0, t10=1.0))
@@ -103,7 +103,7 @@ def test_touching_arrays_are_not_one_patch():
 
 @settings(max_examples=50, deadline=None)
 @given(st.sets(st.integers(0, 79), max_size=40))
-def test_clusters_match_a_plain_search(members):
+def test_clusters_match_brute_force_search(members):
     adjacency = Adjacency(GEOMETRY)
     left, expected = set(members), set()
     while left:
@@ -128,7 +128,7 @@ def test_neighbours_on_grid_and_cross():
     assert sorted(cross.neighbours[0]) == [0, 1, 2, 3, 4]
 
 
-def test_contact_has_hysteresis_and_noise_does_not_touch():
+def test_contact_has_hysteresis_against_noise():
     feel = Feel()
     assert feel(presses(t5=0.25)).taxels_in_contact == 0  # once above the threshold may be noise
     assert feel(presses(t5=0.0)).taxels_in_contact == 0
@@ -149,7 +149,7 @@ def test_no_false_contact_in_many_hours_of_noise(board, stream):
         assert cycle.features.taxels_in_contact == 0
 
 
-def test_the_least_contact_is_a_tenth_of_a_newton():
+def test_smallest_contact_is_a_tenth_of_a_newton():
     feel = Feel()
     feel.extractor.set_noise(np.full(80, 1e-6))
     assert feel(presses(t5=0.14)).taxels_in_contact == 1
@@ -160,7 +160,7 @@ def test_the_least_contact_is_a_tenth_of_a_newton():
     assert feel(presses(t5=0.09)).taxels_in_contact == 0
 
 
-def test_a_masked_taxel_is_left_out_and_ends_no_contact_of_others():
+def test_masked_taxel_is_excluded_without_ending_contacts():
     force = presses(t5=1.0, t6=2.0)
     force[6] = np.nan
     features = Feel()(force, masked=1)
@@ -188,7 +188,7 @@ def test_features_are_finite_and_add_up(seed, masked):
         assert features.peak_force == max(p.peak_force for p in features.patches)
 
 
-def test_time_in_light_contact_at_the_tip():
+def test_light_tip_contact_time_is_measured():
     feel = Feel()
     light = presses(t70=2.0)
     assert feel(light).tip_contact_time == 0.0
@@ -213,14 +213,14 @@ def test_one_lost_cycle_is_bridged_two_are_not():
     assert feel(light).tip_contact_time == 0.0
 
 
-def test_light_limits_are_the_users():
+def test_light_contact_limits_are_configurable():
     feel = Feel(tip_light_n=(1.0, 3.0))
     feel(presses(t70=2.0))
     assert feel(presses(t70=2.0)).tip_contact_time > 0
     assert feel(presses(t70=3.1)).tip_contact_time == 0
 
 
-def test_the_tips_time_survives_a_lost_tip_block_in_the_pipeline(board, stream, field_of):
+def test_tip_contact_time_survives_a_lost_tip_block(board, stream, field_of):
     calibration = board()
     flow = stream(BoardPipeline(calibration, PipelineSettings(frozen_after_s=None)))
     force = np.zeros((48, 3))
@@ -235,7 +235,7 @@ def test_the_tips_time_survives_a_lost_tip_block_in_the_pipeline(board, stream, 
     assert whole.features.tip_contact_time == pytest.approx(0.11)
 
 
-def test_a_patch_bears_what_lies_below_the_threshold_round_it():
+def test_patch_includes_subthreshold_force_around_it():
     features = Feel()(presses(t9=2.0, t8=0.05, t10=0.05, t30=0.05))  # t30 is far away
     assert features.taxels_in_contact == 1
     assert features.normal_force == pytest.approx(2.1)
@@ -243,12 +243,12 @@ def test_a_patch_bears_what_lies_below_the_threshold_round_it():
     np.testing.assert_allclose(features.patches[0].centroid, POSITION[9])
 
 
-def test_a_pulled_neighbour_takes_nothing_from_a_patch():
+def test_pulled_neighbour_does_not_reduce_a_patch():
     features = Feel()(presses(t9=2.0, t10=-0.5, t8=-0.1))
     assert features.normal_force == pytest.approx(1.9)
 
 
-def test_masked_taxels_round_a_patch_are_left_out():
+def test_masked_taxels_around_a_patch_are_excluded():
     force = presses(t9=2.0)
     force[10] = np.nan
     assert Feel()(force, masked=1).normal_force == pytest.approx(2.0)

@@ -108,7 +108,7 @@ def honest(cycles: list[Cycle], newton: float) -> float:
 
 
 @pytest.mark.parametrize("newton", [1.0, 3.0, 10.0])
-def test_a_press_on_a_calibrated_board_reads_what_it_is(newton):
+def test_press_on_a_calibrated_board_reads_true_force(newton):
     board = Board(3)
     axes, centre = ARRAY.rotation[0], ARRAY.position[0]
     load = axes @ np.array([0.1 * newton, 0.0, -newton])
@@ -144,7 +144,7 @@ def test_bounds_hold_while_the_board_turns_under_a_press(chips):
         assert all(c.features.valid for c in cycles)
 
 
-def test_every_taxel_has_its_bound_and_it_grows_while_nothing_shows_the_field():
+def test_taxel_bounds_grow_while_the_field_is_unobserved():
     board = Board(5)
     load = np.zeros((5, 3))
     load[:, 2] = -2.0
@@ -160,7 +160,7 @@ def test_every_taxel_has_its_bound_and_it_grows_while_nothing_shows_the_field():
     assert not cycles[-1].features.valid
 
 
-def test_a_uniform_field_that_leaps_is_no_contact_and_passes():
+def test_jump_of_a_uniform_field_is_not_a_contact():
     owner = Owner()
     leap = in_chips(np.tile([1200.0, -800.0, 1400.0], (5, 1)))
     on = owner.play(lambda t: REST + leap * min(1.0, t / 0.2), 1.5)
@@ -177,7 +177,7 @@ def test_a_uniform_field_that_leaps_is_no_contact_and_passes():
 
 
 @pytest.mark.parametrize("gain", [1.2, 0.8, 0.6])
-def test_a_change_of_gain_is_seen_at_once_and_taken_up(gain):
+def test_gain_change_is_detected_at_once_and_adopted(gain):
     owner = Owner()
     cycles = owner.play(lambda _: REST * gain, 3.0)
     assert cycles[0].features.codes[0] == "gain_changed"
@@ -185,7 +185,7 @@ def test_a_change_of_gain_is_seen_at_once_and_taken_up(gain):
     assert cycles[-1].features.valid
 
 
-def test_another_skin_is_never_a_contact_and_is_taken_up():
+def test_exchanged_skin_is_never_a_contact_and_is_adopted():
     owner = Owner(hz=40.0)
     bare = owner.play(lambda _: BARE, 2.0)
     assert codes(bare) >= {"skin_off:skin"}
@@ -198,7 +198,7 @@ def test_another_skin_is_never_a_contact_and_is_taken_up():
     assert press[-1].features.normal_force == pytest.approx(3.0, abs=0.3)
 
 
-def test_a_magnet_that_comes_loose_leaves_its_taxel_masked():
+def test_loose_magnet_leaves_its_taxel_masked():
     owner = Owner(hz=40.0)
     lost = REST.copy()
     lost[2] = 20, 10, 30
@@ -209,7 +209,7 @@ def test_a_magnet_that_comes_loose_leaves_its_taxel_masked():
     assert np.isfinite(cycles[-1].force[[0, 1, 3, 4]]).all()
 
 
-def test_warming_is_no_contact_and_its_doubt_is_said():
+def test_warming_is_not_a_contact_and_widens_the_bound():
     owner = Owner(hz=20.0)
 
     def warmer(t):
@@ -230,7 +230,7 @@ def test_warming_is_no_contact_and_its_doubt_is_said():
     assert after[-1].features.valid
 
 
-def test_a_tare_under_load_is_refused_unless_it_is_forced():
+def test_tare_under_load_is_refused_unless_forced():
     owner = Owner()
     load = REST + pressed({2: 4.0})
     owner.play(lambda _: load, 1.0)
@@ -246,7 +246,7 @@ def test_a_tare_under_load_is_refused_unless_it_is_forced():
     assert after[-1].features.normal_force < 0.2
 
 
-def test_a_board_that_may_be_another_has_no_rest_until_it_is_tared():
+def test_possibly_exchanged_board_has_no_rest_field_until_tared():
     owner = Owner()
     owner.pipeline.forget_rest(REPLUGGED)
     cycles = owner.play(lambda _: OTHER_SKIN, 1.5)
@@ -255,7 +255,7 @@ def test_a_board_that_may_be_another_has_no_rest_until_it_is_tared():
     assert cycles[-1].features.valid
 
 
-def test_what_a_skin_has_not_recovered_fades_and_is_not_a_contact_for_good():
+def test_unrecovered_skin_strain_fades_and_is_not_a_lasting_contact():
     owner = Owner(hz=25.0)
     owner.play(lambda _: REST + pressed({0: 8.0, 1: 15.0, 2: 3.0, 3: 6.0, 4: 4.0}), 4.0)
     left = pressed({0: 0.3, 1: 0.7, 2: 0.2, 3: 0.3, 4: 0.2})  # 4 % of the peak
@@ -273,7 +273,7 @@ def test_what_a_skin_has_not_recovered_fades_and_is_not_a_contact_for_good():
         ("loose=skin:2@2s", "magnet_lost:skin"),
     ],
 )
-def test_the_simulator_plays_what_befalls_a_skin(spec, code):
+def test_simulator_plays_skin_events(spec, code):
     rng = np.random.default_rng(4)
     skin = SkinModel(anyskin(), anyskin_parameters(), rng)
     board = Sampler(
@@ -297,7 +297,7 @@ def test_the_simulator_plays_what_befalls_a_skin(spec, code):
 @pytest.mark.parametrize(
     "spec", ["gain=fast@2s", "gain=1.5", "leap=-1@2s", "newskin@2s+1s", "loose=skin:9@1s"]
 )
-def test_changes_that_cannot_be_are_refused(spec):
+def test_impossible_skin_events_are_refused(spec):
     skin = SkinModel(anyskin(), anyskin_parameters(), np.random.default_rng(1))
     with pytest.raises(ValueError, match=r"allowed|taxels 0 to 4"):
         Sampler(skin, Environment(), (), FaultPlan.parse(spec))

@@ -18,7 +18,7 @@ def flow(board, stream):
 FIELD = np.zeros((48, 3))
 
 
-def test_a_cycle_comes_out_with_the_last_of_its_blocks(flow):
+def test_cycle_is_complete_with_its_last_block(flow):
     assert flow.pipeline.feed(flow.block(2, FIELD)) == []
     assert flow.pipeline.feed(flow.block(0, FIELD)) == []
     (cycle,) = flow.pipeline.feed(flow.block(1, FIELD))
@@ -27,14 +27,14 @@ def test_a_cycle_comes_out_with_the_last_of_its_blocks(flow):
     assert cycle.features.valid
 
 
-def test_instants_of_a_cycle_are_the_first_captured_and_the_last_received(flow):
+def test_cycle_has_first_captured_and_last_received_instant(flow):
     blocks = [flow.block(a, FIELD) for a in range(3)]
     blocks[1] = dataclasses.replace(blocks[1], captured=-5, received=7_000_000, uncertainty=0.5)
     (cycle,) = [c for block in blocks for c in flow.pipeline.feed(block)]
     assert (cycle.captured, cycle.received, cycle.uncertainty) == (-5, 7_000_000, 0.5)
 
 
-def test_the_next_sequence_ends_an_incomplete_cycle(flow):
+def test_next_sequence_ends_an_incomplete_cycle(flow):
     assert flow.cycle(FIELD, without=(1,)) == []
     incomplete, whole = flow.cycle(FIELD)
     assert (incomplete.sequence, whole.sequence) == (0, 1)
@@ -64,7 +64,7 @@ def test_duplicates_and_late_blocks_are_counted_and_ignored(flow):
     assert flow.pipeline.counters.late_blocks == 2
 
 
-def test_gaps_are_counted_exactly_and_the_wrap_is_no_gap(flow):
+def test_gaps_are_counted_exactly_across_the_wrap(flow):
     flow.sequence = 2**32 - 2
     for _ in range(4):
         flow.cycle(FIELD)
@@ -76,7 +76,7 @@ def test_gaps_are_counted_exactly_and_the_wrap_is_no_gap(flow):
     assert flow.pipeline.counters.lost_cycles == 7
 
 
-def test_every_cycle_sent_is_out_or_lost(flow):
+def test_every_cycle_is_delivered_or_counted_lost(flow):
     rng = np.random.default_rng(4)
     sent, fed, out = 400, 0, []
     for _ in range(sent):
@@ -93,7 +93,7 @@ def test_every_cycle_sent_is_out_or_lost(flow):
     assert [c.sequence for c in out] == sorted({c.sequence for c in out})
 
 
-def test_a_board_that_begins_anew_is_taken_up(flow):
+def test_restarted_board_is_followed(flow):
     flow.sequence = 5000
     flow.cycle(FIELD)
     flow.sequence = 0
@@ -103,7 +103,7 @@ def test_a_board_that_begins_anew_is_taken_up(flow):
     assert flow.pipeline.counters.lost_cycles == 0
 
 
-def test_a_reboot_nobody_told_of_is_taken_up_after_a_few_blocks(flow):
+def test_unannounced_reboot_is_followed_after_a_few_blocks(flow):
     flow.sequence = 5000
     flow.cycle(FIELD)
     flow.sequence = 0
@@ -165,7 +165,7 @@ def test_the_same_blocks_give_the_same_cycles_to_the_bit(board, stream):
         {"release_ratio": 0.0},
     ],
 )
-def test_settings_that_cannot_be_used_are_refused_by_name(wrong):
+def test_unusable_settings_are_refused_by_name(wrong):
     (name,) = wrong
     with pytest.raises(ValueError, match=name):
         PipelineSettings(**wrong)

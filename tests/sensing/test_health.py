@@ -23,7 +23,7 @@ def noise():
 
 
 @pytest.mark.parametrize("bit", [TaxelHealth.SATURATED, TaxelHealth.STALE, TaxelHealth.READ_FAILED])
-def test_what_the_board_flags_is_masked_in_the_same_cycle(flow, noise, bit):
+def test_flagged_taxels_are_masked_in_the_same_cycle(flow, noise, bit):
     status = np.zeros(48, np.uint8)
     status[20] = bit
     field = noise()
@@ -50,7 +50,7 @@ def test_impossible_readings_are_masked_at_once(flow, noise, value):
 
 
 @pytest.mark.parametrize("temperature", [-998.1, 451.8, float("nan")])
-def test_an_impossible_temperature_condemns_the_array(flow, noise, temperature):
+def test_impossible_temperature_masks_the_array(flow, noise, temperature):
     block = flow.block(0, noise())
     flow.pipeline.feed(dataclasses.replace(block, temperature_c=np.array([temperature])))
     flow.pipeline.feed(flow.block(1, noise()))
@@ -60,7 +60,7 @@ def test_an_impossible_temperature_condemns_the_array(flow, noise, temperature):
     assert "taxels_masked:left" in cycle.features.codes
 
 
-def test_a_frozen_taxel_is_unhealthy_within_a_second_and_recovers(flow, noise):
+def test_frozen_taxel_is_unhealthy_within_a_second_and_recovers(flow, noise):
     stuck = np.array([3.0, 4.0, 5.0])
     flagged = None
     for k in range(100):
@@ -77,7 +77,7 @@ def test_a_frozen_taxel_is_unhealthy_within_a_second_and_recovers(flow, noise):
     assert flow.one(noise()).health[7] == 0
 
 
-def test_at_low_rates_two_equal_readings_do_not_condemn(flow, noise):
+def test_two_equal_readings_at_low_rate_do_not_mask(flow, noise):
     field = noise()
     for _ in range(3):
         flow.sequence += 99  # one reading a second
@@ -98,7 +98,7 @@ def test_too_many_masked_taxels_make_features_invalid(flow, noise):
     assert features.taxels_masked == 5
 
 
-def test_a_masked_taxel_in_contact_is_not_shown_as_zero_force(flow, noise, board, field_of):
+def test_masked_taxel_in_contact_does_not_read_zero_force(flow, noise, board, field_of):
     force = np.zeros((48, 3))
     force[33, 2] = -2.0
     pressed = field_of(board(coupling=0.02), force)

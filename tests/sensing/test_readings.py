@@ -102,7 +102,7 @@ ALIKE = {"zero": 0, "minus one": -1, "zero less the offset of 19 bits": -16384}
     [lambda k: k % 3 > 0, lambda k: k % 37 == 0, lambda k: k % 50 < 2],
     ids=["two of three", "single", "bursts"],
 )
-def test_failed_reads_are_masked_in_every_frame(count, which, when) -> None:
+def test_failed_reads_are_masked_in_each_frame(count, which, when) -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
         if k >= STEADY and when(k):
             counts[which] = count
@@ -122,7 +122,7 @@ def test_failed_reads_are_masked_in_every_frame(count, which, when) -> None:
 
 
 @pytest.mark.parametrize("count", [0, -1])
-def test_a_chip_that_never_answers_is_named_from_the_start(count) -> None:
+def test_chip_that_never_answers_is_named_from_the_start(count) -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
         counts[2], temperature[2] = count, 0.0
 
@@ -131,7 +131,7 @@ def test_a_chip_that_never_answers_is_named_from_the_start(count) -> None:
     assert last.features.codes == ("chip_masked:skin",)
 
 
-def test_a_chip_that_comes_alive_is_told_and_taken_in() -> None:
+def test_chip_that_comes_alive_is_reported_and_used() -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
         if k < 300:
             counts[2], temperature[2] = 0, 0.0
@@ -145,7 +145,7 @@ def test_a_chip_that_comes_alive_is_told_and_taken_in() -> None:
     assert cycles[-1].features.peak_force == pytest.approx(800 / UT_PER_N, rel=0.1)
 
 
-def test_a_chip_that_comes_alive_under_a_press_waits_for_its_end() -> None:
+def test_chip_that_comes_alive_under_a_press_waits_for_release() -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
         if k < 300:
             counts[2], temperature[2] = 0, 0.0
@@ -160,7 +160,7 @@ def test_a_chip_that_comes_alive_under_a_press_waits_for_its_end() -> None:
 
 
 @pytest.mark.parametrize(("rest_z", "by"), [(7000.0, 2000.0), (-7000.0, -1500.0), (7500.0, 3500.0)])
-def test_a_wrap_is_undone_where_continuity_proves_it(rest_z, by) -> None:
+def test_wrap_is_undone_when_continuity_proves_it(rest_z, by) -> None:
     rest = REST.copy()
     rest[2, 2] = rest_z
     flat = list(Five(rest=REST).run(400, ramp(2, by)))
@@ -175,7 +175,7 @@ def test_a_wrap_is_undone_where_continuity_proves_it(rest_z, by) -> None:
     assert abs(over[-1].force[2, 2]) > 0.9 * abs(by) / UT_PER_N
 
 
-def test_a_wrap_that_may_be_another_is_no_force_and_not_valid() -> None:
+def test_ambiguous_wrap_is_masked_and_invalid() -> None:
     rest = REST.copy()
     rest[2, 2] = 7000.0
     press = np.array([0.05, 0.05, 1.0, 0.05, 0.05])[:, None] * [0, 0, 5500.0]
@@ -189,7 +189,7 @@ def test_a_wrap_that_may_be_another_is_no_force_and_not_valid() -> None:
 
 
 @pytest.mark.parametrize("end", [-32768, 32767])
-def test_an_axis_at_its_rail_is_saturated_and_hides_no_press(end) -> None:
+def test_axis_at_its_rail_is_saturated_and_hides_no_press(end) -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
         if k >= 200:
             counts[3, 1] = end
@@ -201,7 +201,7 @@ def test_an_axis_at_its_rail_is_saturated_and_hides_no_press(end) -> None:
         assert no_force(cycle)
 
 
-def test_garbage_of_one_chip_is_masked_while_it_lasts() -> None:
+def test_garbage_of_a_chip_is_masked_while_it_lasts() -> None:
     garbage = np.random.default_rng(4)
 
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
@@ -214,7 +214,7 @@ def test_garbage_of_one_chip_is_masked_while_it_lasts() -> None:
         assert no_force(cycle)
 
 
-def test_all_chips_that_jump_at_once_beyond_any_contact_are_masked() -> None:
+def test_simultaneous_jump_of_all_chips_is_masked() -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
         if k in (200, 201, 250):
             counts += np.array([30000, -28000, 25000])
@@ -225,7 +225,7 @@ def test_all_chips_that_jump_at_once_beyond_any_contact_are_masked() -> None:
             assert bool(cycle.fault.all()) == (k in (200, 201, 250))
 
 
-def test_a_level_that_stays_is_taken_but_not_its_rest() -> None:
+def test_lasting_level_is_accepted_without_its_rest_field() -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
         if k >= 200:
             counts[1] += np.array([30000, -28000, 25000])
@@ -238,7 +238,7 @@ def test_a_level_that_stays_is_taken_but_not_its_rest() -> None:
     assert not cycles[-1].fault.any()  # another rest, taken while still
 
 
-def test_two_chips_with_the_same_bits_are_both_masked() -> None:
+def test_chips_with_identical_bits_are_both_masked() -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
         counts[4] = counts[1]
 
@@ -247,7 +247,7 @@ def test_two_chips_with_the_same_bits_are_both_masked() -> None:
             assert np.flatnonzero(cycle.fault == Fault.SAME_BITS).tolist() == [1, 4]
 
 
-def test_a_chip_that_takes_on_anothers_bits_is_masked_at_once() -> None:
+def test_chip_copying_another_is_masked_at_once() -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
         if k >= 200:
             counts[0] = counts[3]
@@ -258,7 +258,7 @@ def test_a_chip_that_takes_on_anothers_bits_is_masked_at_once() -> None:
 
 
 @pytest.mark.parametrize("step", [FINE, 4 * FINE], ids=["fine", "coarser"])
-def test_copies_of_an_earlier_frame_are_not_believed(step) -> None:
+def test_copies_of_an_earlier_frame_are_masked(step) -> None:
     kept: list[tuple[NDArray[np.int64], Float]] = []
 
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
@@ -276,7 +276,7 @@ def test_copies_of_an_earlier_frame_are_not_believed(step) -> None:
 
 @pytest.mark.parametrize("which", [[2], [0, 1, 2, 3, 4]], ids=["one", "all"])
 @pytest.mark.parametrize("bits", [1, 3], ids=["one bit", "two bits"])
-def test_a_dead_chip_whose_last_bits_toggle_is_frozen(which, bits) -> None:
+def test_dead_chip_with_toggling_last_bits_is_frozen(which, bits) -> None:
     held: list[NDArray[np.int64]] = []
     toggle = np.random.default_rng(9)
 
@@ -292,7 +292,7 @@ def test_a_dead_chip_whose_last_bits_toggle_is_frozen(which, bits) -> None:
         assert np.flatnonzero(cycle.health & TaxelHealth.FROZEN).tolist() == which
 
 
-def test_a_chip_that_dithers_from_the_start_is_told_by_the_others() -> None:
+def test_chip_dithering_from_the_start_is_detected_by_comparison() -> None:
     toggle = np.random.default_rng(9)
 
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
@@ -302,7 +302,7 @@ def test_a_chip_that_dithers_from_the_start_is_told_by_the_others() -> None:
     assert last.fault.tolist() == [0, 0, 0, Fault.DITHER, 0]
 
 
-def test_an_axis_that_stops_is_seen_though_the_others_go_on() -> None:
+def test_single_stuck_axis_is_detected() -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
         if k >= 300:
             counts[1, 0] = 277
@@ -311,7 +311,7 @@ def test_an_axis_that_stops_is_seen_though_the_others_go_on() -> None:
     assert cycles[-1].fault.tolist() == [0, Fault.AXIS_STUCK, 0, 0, 0]
 
 
-def test_temperatures_out_of_reason_mask_the_chip() -> None:
+def test_implausible_temperature_masks_the_chip() -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
         if k in (200, 230):
             temperature[4] = {200: 85.0, 230: np.nan}[k]
@@ -326,7 +326,7 @@ def test_temperatures_out_of_reason_mask_the_chip() -> None:
     assert cycles[-1].fault.tolist() == [0, 0, 0, 0, Fault.TEMPERATURE_STUCK]
 
 
-def test_a_board_that_warms_up_is_never_masked() -> None:
+def test_warming_board_is_never_masked() -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
         temperature += min(30.0, 0.04 * k)
         if k == 900:
@@ -337,7 +337,7 @@ def test_a_board_that_warms_up_is_never_masked() -> None:
     assert not any(any(faults) for faults in found[:900] + found[901:])
 
 
-def test_a_temperature_that_is_no_longer_read_does_not_mask_for_good() -> None:
+def test_missing_temperature_does_not_mask_permanently() -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
         if k >= 200:
             temperature[:] = 0.0
@@ -350,7 +350,7 @@ def test_a_temperature_that_is_no_longer_read_does_not_mask_for_good() -> None:
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e38, -1e30])
 @pytest.mark.parametrize("which", [[2], [0, 1, 2, 3, 4]], ids=["one", "all"])
-def test_what_is_not_a_number_is_masked_without_a_word_of_numpy(value, which) -> None:
+def test_nan_is_masked_without_numpy_warnings(value, which) -> None:
     board = Five()
     for k, cycle in enumerate(board.run(150)):
         assert k < 60 or not cycle.fault.any()
@@ -375,14 +375,14 @@ def dead_after_200(k: int, counts: NDArray[np.int64], temperature: Float) -> Non
         counts[2], temperature[2] = 0, 0.0
 
 
-def test_one_of_five_masked_leaves_an_untouched_board_valid_and_says_so() -> None:
+def test_one_masked_of_five_leaves_an_untouched_board_valid() -> None:
     for cycle in list(Five(dead_after_200).run(300))[200:]:
         assert cycle.features.valid
         assert cycle.features.codes == ("chip_masked:skin",)
         assert "chip 2 of skin" in cycle.features.reasons[0].text
 
 
-def test_a_contact_that_a_masked_chip_of_five_may_bear_is_not_valid() -> None:
+def test_contact_possibly_on_a_masked_chip_of_five_is_invalid() -> None:
     cycles = list(Five(dead_after_200).run(400, ramp(0, 800.0, 250, 50)))
     assert cycles[240].features.valid
     for cycle in cycles[300:]:
@@ -390,15 +390,13 @@ def test_a_contact_that_a_masked_chip_of_five_may_bear_is_not_valid() -> None:
         assert "masked_contact:skin" in cycle.features.codes
 
 
-def test_a_chip_that_goes_while_it_is_pressed_is_never_no_force_and_valid() -> None:
+def test_chip_lost_under_a_press_is_never_valid_zero_force() -> None:
     cycles = list(Five(dead_after_200).run(300, ramp(2, 800.0, 130, 30)))
     assert cycles[190].features.peak_force > 5.0
     assert not any(cycle.features.valid for cycle in cycles[200:])
 
 
-def test_a_contact_beside_a_masked_taxel_of_a_large_array_is_not_valid(
-    board, field_of, stream
-) -> None:
+def test_contact_beside_a_masked_taxel_is_invalid(board, field_of, stream) -> None:
     flow = stream(BoardPipeline(board(coupling=0.02), PipelineSettings()))
     rng = np.random.default_rng(3)
     status = np.zeros(48, np.uint8)
@@ -438,7 +436,7 @@ def test_healthy_chips_are_never_masked(hz, step, noise, rest) -> None:
     assert not any(cycle.fault.any() for cycle in cycles)
 
 
-def test_a_slow_board_with_hard_presses_between_its_readings_is_believed() -> None:
+def test_slow_board_with_hard_presses_is_not_masked() -> None:
     blow = np.array([0.1, 0.3, 1.0, 0.2, 0.1])[:, None] * [900.0, -400.0, 4600.0]
     cycles = list(Five(step=COARSE, hz=14).run(300, lambda k: blow * (k > STEADY and k % 7 < 2)))
     assert not any(cycle.fault.any() for cycle in cycles)

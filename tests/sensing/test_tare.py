@@ -36,7 +36,7 @@ def unknown(board, field_of, stream):
     return lambda **settings: Bench(board(nominal=True), field_of, stream, **settings)
 
 
-def test_a_nominal_board_is_tared_at_the_start(unknown):
+def test_nominal_board_is_tared_at_start(unknown):
     bench = unknown()
     first = bench.go()
     assert bench.pipeline.taring
@@ -59,7 +59,7 @@ def test_a_nominal_board_is_tared_at_the_start(unknown):
     assert bench.go(newton={20: 2.0}).features.peak_force == pytest.approx(2.0, abs=0.25)
 
 
-def test_a_skin_that_moves_at_the_start_waits_then_gets_a_rough_rest(unknown):
+def test_moving_skin_at_start_gets_a_rough_rest_field(unknown):
     bench = unknown()
     bench.go(60, drift=3.0)
     assert bench.pipeline.taring
@@ -78,7 +78,7 @@ def test_a_skin_that_moves_at_the_start_waits_then_gets_a_rough_rest(unknown):
     assert bench.go().features.valid
 
 
-def test_a_tare_takes_off_drift_and_says_how_much(board, field_of, stream):
+def test_tare_removes_drift_and_reports_how_much(board, field_of, stream):
     bench = Bench(board(), field_of, stream, auto_tare=False)
     bench.rest[:] = 0
     bench.rest[7, 2] = 60.0  # creep after a long press: 0.6 N
@@ -90,7 +90,7 @@ def test_a_tare_takes_off_drift_and_says_how_much(board, field_of, stream):
     assert bench.go(20).features.taxels_in_contact == 0
 
 
-def test_a_tare_under_contact_is_refused_and_changes_nothing(board, field_of, stream):
+def test_tare_under_contact_is_refused_and_changes_nothing(board, field_of, stream):
     bench = Bench(board(), field_of, stream, auto_tare=False)
     bench.rest[:] = 0
     bench.go(5, {33: 2.0})
@@ -104,7 +104,7 @@ def test_a_tare_under_contact_is_refused_and_changes_nothing(board, field_of, st
     assert bench.go(newton={33: 2.0}).features.peak_force == pytest.approx(2.0, abs=0.25)
 
 
-def test_a_tare_in_motion_is_refused(board, field_of, stream):
+def test_tare_in_motion_is_refused(board, field_of, stream):
     bench = Bench(board(), field_of, stream, auto_tare=False)
     bench.rest[:] = 0
     bench.go(3)
@@ -114,7 +114,7 @@ def test_a_tare_in_motion_is_refused(board, field_of, stream):
     assert "moved by" in bench.pipeline.tare_report.message
 
 
-def test_a_taxel_sick_during_the_first_tare_stays_masked(unknown):
+def test_taxel_faulty_during_first_tare_stays_masked(unknown):
     bench = unknown()
     status = np.zeros(48, np.uint8)
     status[12] = TaxelHealth.READ_FAILED
@@ -129,7 +129,7 @@ def test_a_taxel_sick_during_the_first_tare_stays_masked(unknown):
     assert bench.go().health[12] == 0
 
 
-def test_at_low_rates_a_tare_takes_its_cycles(unknown):
+def test_tare_takes_enough_cycles_at_low_rates(unknown):
     bench = unknown()
     for _ in range(9):
         bench.flow.sequence += 9  # 10 Hz
@@ -139,7 +139,7 @@ def test_at_low_rates_a_tare_takes_its_cycles(unknown):
     assert bench.pipeline.tare_report.cycles >= 8
 
 
-def test_rest_follows_untouched_taxels_when_asked(board, field_of, stream):
+def test_rest_field_follows_untouched_taxels_when_enabled(board, field_of, stream):
     bench = Bench(board(), field_of, stream, auto_tare=False, rest_tracking_s=0.5)
     bench.rest[:] = 0
     bench.rest[7, 0] = 15.0  # 0.15 N of shear that is none
@@ -148,7 +148,7 @@ def test_rest_follows_untouched_taxels_when_asked(board, field_of, stream):
     assert abs(tail.mean()) < 0.03
 
 
-def test_a_reset_keeps_the_rest(unknown):
+def test_reset_keeps_the_rest_field(unknown):
     bench = unknown()
     bench.go(52)
     bench.pipeline.reset()
@@ -156,7 +156,7 @@ def test_a_reset_keeps_the_rest(unknown):
     assert bench.go().features.valid
 
 
-def test_chip_yaw_is_undone(stream):
+def test_chip_yaw_is_corrected(stream):
     """Chip y of the taxel mounted at −90° is the taxel's x."""
     flow = stream(BoardPipeline(nominal("anyskin", "A"), PipelineSettings(auto_tare=False)))
     field = np.zeros((5, 3))
@@ -164,7 +164,7 @@ def test_chip_yaw_is_undone(stream):
     np.testing.assert_allclose(flow.one(field).field_ut[0], [7.0, 0.0, 3.0], atol=1e-12)
 
 
-def test_temperature_drift_is_taken_off(board, stream):
+def test_temperature_drift_is_removed(board, stream):
     import dataclasses
 
     calibration = board()

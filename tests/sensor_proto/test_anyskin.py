@@ -49,13 +49,13 @@ def held(decoder: AnySkinDecoder) -> int:
     return len(decoder._buffer)
 
 
-def test_it_satisfies_the_seam() -> None:
+def test_decoder_satisfies_the_protocol() -> None:
     decoder: Decoder[bytes] = AnySkinDecoder()
     assert decoder.feed(b"") == []
 
 
 @pytest.mark.parametrize("n", range(1, 21))
-def test_any_number_of_magnetometers_is_found_from_the_middle_of_a_frame(n: int) -> None:
+def test_magnetometer_count_is_found_from_mid_frame(n: int) -> None:
     frames = stream(12, n)
     decoder = AnySkinDecoder()
     assert decoder.magnetometers is None
@@ -73,7 +73,7 @@ def test_any_number_of_magnetometers_is_found_from_the_middle_of_a_frame(n: int)
 
 
 @pytest.mark.parametrize("n", [1, 5, 20])
-def test_values_come_through_exactly(n: int) -> None:
+def test_values_are_decoded_exactly(n: int) -> None:
     rng = np.random.default_rng(4)
     sent = [
         FloatSamples(
@@ -93,7 +93,7 @@ def test_values_come_through_exactly(n: int) -> None:
 
 @given(sizes=st.lists(st.integers(1, 9000), min_size=1, max_size=4), seed=st.integers(0, 999))
 @settings(max_examples=30, deadline=None)
-def test_bursts_hold_the_same_frames_as_arrays(sizes: list[int], seed: int) -> None:
+def test_bursts_decode_to_the_same_frames_as_arrays(sizes: list[int], seed: int) -> None:
     rng = np.random.default_rng(seed)
     wire = bytearray(b"".join(stream(150, 5)))
     for at in rng.integers(0, len(wire), 12):
@@ -117,12 +117,12 @@ def test_bursts_hold_the_same_frames_as_arrays(sizes: list[int], seed: int) -> N
 
 @given(sizes=st.lists(st.integers(1, 500), min_size=1, max_size=6), n=st.sampled_from([1, 5, 20]))
 @settings(max_examples=40, deadline=None)
-def test_any_chunking_yields_the_same_frames(sizes: list[int], n: int) -> None:
+def test_chunking_does_not_change_the_frames(sizes: list[int], n: int) -> None:
     frames = stream(25, n)
     assert indices(feed_in(AnySkinDecoder(), b"".join(frames), sizes)) == list(range(25))
 
 
-def test_trailing_tells_what_came_after_each_frame() -> None:
+def test_trailing_counts_bytes_after_each_frame() -> None:
     frames = stream(10, 5)
     decoder = AnySkinDecoder()
     decoder.feed(b"".join(frames[:6]))
@@ -136,7 +136,7 @@ def test_trailing_tells_what_came_after_each_frame() -> None:
 
 
 @pytest.mark.parametrize("byte", [b for b in range(80) if b % 16 not in (2, 3, 15)])
-def test_cr_lf_at_one_place_in_every_frame(byte: int) -> None:
+def test_crlf_inside_every_frame_is_not_a_boundary(byte: int) -> None:
     """The unlucky field: the pair stands at the same place for as long as nothing moves."""
     frames = []
     for raw in stream(30, 5):
@@ -154,7 +154,7 @@ def test_cr_lf_at_one_place_in_every_frame(byte: int) -> None:
         ]
 
 
-def test_a_stream_that_holds_cr_lf_in_a_third_of_its_frames() -> None:
+def test_crlf_inside_a_third_of_the_frames_is_not_a_boundary() -> None:
     rng = np.random.default_rng(7)
     frames = []
     for raw in stream(400, 5):
@@ -184,7 +184,7 @@ def count_lost(wire: bytes, sent: int, n: int, sizes: list[int]) -> tuple[list[i
 
 @given(seed=st.integers(0, 10**6), n=st.sampled_from([1, 2, 5, 10, 20]))
 @settings(max_examples=150, deadline=None)
-def test_frames_lost_are_at_most_frames_touched_and_one(seed: int, n: int) -> None:
+def test_damage_loses_at_most_one_frame_beyond_those_touched(seed: int, n: int) -> None:
     """One fault anywhere after the lock: bytes cut out, put in, or both."""
     rng = np.random.default_rng(seed)
     frames = stream(30, n, seed)
@@ -202,7 +202,7 @@ def test_frames_lost_are_at_most_frames_touched_and_one(seed: int, n: int) -> No
 
 
 @pytest.mark.parametrize("n", [2, 5, 20])
-def test_every_second_frame_damaged_still_leaves_the_others(n: int) -> None:
+def test_every_second_frame_damaged_leaves_the_others(n: int) -> None:
     rng = np.random.default_rng(n)
     frames = stream(60, n)
     wire, touched = b"".join(frames[:10]), 0
@@ -215,7 +215,7 @@ def test_every_second_frame_damaged_still_leaves_the_others(n: int) -> None:
     assert set(got) <= set(range(60))
 
 
-def test_a_lost_line_end_costs_that_frame_only() -> None:
+def test_lost_line_end_costs_only_that_frame() -> None:
     frames = stream(30, 5)
     frames[12] = frames[12][:-2] + b"\x00\x00"
     decoder = AnySkinDecoder()
@@ -225,7 +225,7 @@ def test_a_lost_line_end_costs_that_frame_only() -> None:
     assert decoder.counters["discarded_bytes"] == 82
 
 
-def test_another_board_with_another_count_is_found_without_a_reset() -> None:
+def test_board_with_another_count_is_found_without_reset() -> None:
     decoder = AnySkinDecoder()
     decoder.feed(b"".join(stream(10, 5))[:-30])
     got = decoder.feed(b"".join(stream(40, 3)))
@@ -233,7 +233,7 @@ def test_another_board_with_another_count_is_found_without_a_reset() -> None:
     assert indices(got)[-30:] == list(range(10, 40))
 
 
-def test_reset_forgets_count_and_boundary_but_not_the_counts() -> None:
+def test_reset_clears_framing_but_keeps_the_counters() -> None:
     decoder = AnySkinDecoder()
     decoder.feed(b"".join(stream(10, 5)) + b"\x01\x02")
     decoder.reset()
@@ -243,14 +243,14 @@ def test_reset_forgets_count_and_boundary_but_not_the_counts() -> None:
     assert decoder.counters["accepted"] == 20
 
 
-def test_a_given_count_is_the_only_one_believed() -> None:
+def test_configured_count_is_the_only_one_accepted() -> None:
     wire = b"".join(stream(20, 5))
     assert AnySkinDecoder(4).feed(wire) == []
     assert len(AnySkinDecoder(5).feed(wire)) == 20
 
 
 @pytest.mark.parametrize("n", [0, 21, -1])
-def test_an_impossible_count_is_local_misuse(n: int) -> None:
+def test_impossible_count_is_refused_locally(n: int) -> None:
     with pytest.raises(ValueError, match="1 to 20"):
         AnySkinDecoder(n)
 
@@ -281,7 +281,7 @@ def with_reading(raw: bytes, chip: int, **values: float) -> bytes:
     ids=str,
 )
 @pytest.mark.parametrize("n", [1, 5])
-def test_a_failed_reading_is_flagged_and_its_frame_kept(reading: dict[str, float], n: int) -> None:
+def test_failed_reading_is_flagged_and_its_frame_kept(reading: dict[str, float], n: int) -> None:
     frames = stream(20, n)
     frames[9] = with_reading(frames[9], n - 1, **reading)
     got = feed_in(AnySkinDecoder(), b"".join(frames), [50])
@@ -293,7 +293,7 @@ def test_a_failed_reading_is_flagged_and_its_frame_kept(reading: dict[str, float
 
 @pytest.mark.parametrize("dead", [-998.1, 451.8])
 @pytest.mark.parametrize("n", [1, 5])
-def test_a_board_whose_chips_are_all_dead_is_still_framed(dead: float, n: int) -> None:
+def test_board_with_all_chips_dead_is_still_framed(dead: float, n: int) -> None:
     frames = [with_reading(f, c, t=dead, x=0.0) for f in stream(1, n) for c in range(n)]
     raw = frames[0]
     for chip in range(n):
@@ -304,7 +304,7 @@ def test_a_board_whose_chips_are_all_dead_is_still_framed(dead: float, n: int) -
     assert all((r.message.status == TaxelStatus.READ_FAILED).all() for r in got)
 
 
-def test_readings_that_stay_impossible_neither_stop_the_stream_nor_lose_frames() -> None:
+def test_impossible_readings_neither_stop_the_stream_nor_lose_frames() -> None:
     """Indeterminate values of three chips of five, for good: the boundary is doubted and kept."""
     rng = np.random.default_rng(3)
     frames = stream(60, 5)
@@ -323,7 +323,7 @@ def test_readings_that_stay_impossible_neither_stop_the_stream_nor_lose_frames()
 
 @given(chunks=st.lists(st.binary(max_size=3000), max_size=6))
 @settings(max_examples=60, deadline=None)
-def test_noise_never_raises_and_memory_stays_bounded(chunks: list[bytes]) -> None:
+def test_noise_never_raises_and_memory_is_bounded(chunks: list[bytes]) -> None:
     decoder = AnySkinDecoder()
     for chunk in chunks:
         decoder.feed(chunk)
@@ -331,7 +331,7 @@ def test_noise_never_raises_and_memory_stays_bounded(chunks: list[bytes]) -> Non
 
 
 @pytest.mark.parametrize("noise", [b"\r\n", b"\0", b"\xff", b"\r", b"\n\0\xc8\x41\r"])
-def test_floods_are_survived_and_a_stream_after_them_is_found(noise: bytes) -> None:
+def test_stream_is_found_after_floods_of_noise(noise: bytes) -> None:
     decoder = AnySkinDecoder()
     for _ in range(20):
         assert decoder.feed(noise * 1000) == []
@@ -349,7 +349,7 @@ def test_floods_are_survived_and_a_stream_after_them_is_found(noise: bytes) -> N
         (np.zeros((3, 2)), np.zeros(3)),
     ],
 )
-def test_samples_that_fit_no_board_are_local_misuse(
+def test_samples_that_fit_no_board_are_refused_locally(
     field: np.ndarray, temperature: np.ndarray
 ) -> None:
     with pytest.raises(ValueError, match="n 1 to 20"):
@@ -387,7 +387,7 @@ def spoil() -> Callable[[list[bytes], str, np.random.Generator], bytes]:
         ("noisy", 0),
     ],
 )
-def test_evil_wires(
+def test_corrupted_streams_never_yield_wrong_frames(
     kind: str, damaged: int, spoil: Callable[[list[bytes], str, np.random.Generator], bytes]
 ) -> None:
     rng = np.random.default_rng(2)

@@ -58,7 +58,7 @@ def flat(transfers: list[Frames]) -> Frames:
     return [frame for transfer in transfers for frame in transfer]
 
 
-def test_it_satisfies_the_seam() -> None:
+def test_decoder_satisfies_the_protocol() -> None:
     decoder: Decoder[list[CanFrame]] = CanDecoder()
     assert decoder.feed([]) == []
 
@@ -78,12 +78,12 @@ def test_identifiers_carry_priority_mark_type_and_board(make_samples: MakeSample
 
 
 @pytest.mark.parametrize("board", [-1, 128])
-def test_a_board_number_out_of_range_is_local_misuse(board: int) -> None:
+def test_board_number_out_of_range_is_refused_locally(board: int) -> None:
     with pytest.raises(ValueError, match="0 to 127"):
         CanEncoder(board, fd=False)
 
 
-def test_frames_have_lengths_that_the_medium_has(make_samples: MakeSamples, fd: bool) -> None:
+def test_frame_lengths_are_valid_for_the_medium(make_samples: MakeSamples, fd: bool) -> None:
     lengths = {*range(9), 12, 16, 20, 24, 32, 48, 64} if fd else set(range(1, 9))
     for taxels in range(1, 129):
         frames = CanEncoder(0, fd).encode(make_samples(1, taxels=taxels))
@@ -95,7 +95,7 @@ def test_frames_have_lengths_that_the_medium_has(make_samples: MakeSamples, fd: 
 
 @given(order=st.randoms(use_true_random=False), chunk=st.integers(1, 50))
 @settings(max_examples=40, deadline=None)
-def test_boards_and_types_interleave_at_will(
+def test_boards_and_types_may_interleave(
     make_samples: MakeSamples, order: object, chunk: int
 ) -> None:
     streams: list[Frames] = []
@@ -116,7 +116,7 @@ def test_boards_and_types_interleave_at_will(
     assert refused(decoder) == {}
 
 
-def test_any_lost_frame_drops_that_transfer_only(transfers: list[Frames]) -> None:
+def test_lost_frame_drops_only_its_transfer(transfers: list[Frames]) -> None:
     for at in range(len(transfers[2])):
         decoder = CanDecoder()
         spoilt = transfers[2][:at] + transfers[2][at + 1 :]
@@ -125,7 +125,7 @@ def test_any_lost_frame_drops_that_transfer_only(transfers: list[Frames]) -> Non
         assert refused(decoder)
 
 
-def test_any_two_frames_exchanged_drop_that_transfer_only(transfers: list[Frames]) -> None:
+def test_swapped_frames_drop_only_their_transfer(transfers: list[Frames]) -> None:
     frames = transfers[2]
     for a in range(len(frames)):
         for b in range(a + 1, len(frames)):
@@ -137,7 +137,7 @@ def test_any_two_frames_exchanged_drop_that_transfer_only(transfers: list[Frames
             assert refused(decoder)
 
 
-def test_a_repeated_frame_is_used_once_and_counted(transfers: list[Frames]) -> None:
+def test_repeated_frame_is_used_once_and_counted(transfers: list[Frames]) -> None:
     for at in range(len(transfers[2])):
         decoder = CanDecoder()
         spoilt = list(transfers[2])
@@ -147,20 +147,20 @@ def test_a_repeated_frame_is_used_once_and_counted(transfers: list[Frames]) -> N
         assert refused(decoder) == {"duplicate": 1}
 
 
-def test_a_repeated_single_frame_transfer_is_used_once() -> None:
+def test_repeated_single_frame_transfer_is_used_once() -> None:
     decoder = CanDecoder()
     (frame,) = CanEncoder(1, fd=True).encode(Start(4))
     assert len(decoder.feed([frame, frame])) == 1
     assert refused(decoder) == {"duplicate": 1}
 
 
-def test_equal_messages_one_after_another_are_all_used() -> None:
+def test_consecutive_equal_messages_are_all_used() -> None:
     decoder, encoder = CanDecoder(), CanEncoder(1, fd=True)
     got = decoder.feed([f for _ in range(100) for f in encoder.encode(Ack(1, 2, AckResult.OK))])
     assert len(got) == 100
 
 
-def test_a_whole_round_of_transfer_ids_lost_mixes_nothing(make_samples: MakeSamples) -> None:
+def test_losing_a_whole_round_of_transfer_ids_mixes_nothing(make_samples: MakeSamples) -> None:
     """The end of a transfer follows the beginning of one 32 before: all tails fit."""
     encoder = CanEncoder(1, fd=False)
     sent = [encoder.encode(make_samples(i, taxels=16)) for i in range(33)]
@@ -172,7 +172,7 @@ def test_a_whole_round_of_transfer_ids_lost_mixes_nothing(make_samples: MakeSamp
         assert refused(decoder) == {"crc": 1}
 
 
-def test_a_reset_board_begins_its_transfer_ids_anew(make_samples: MakeSamples) -> None:
+def test_reset_board_restarts_its_transfer_ids(make_samples: MakeSamples) -> None:
     before, after = CanEncoder(2, fd=False), CanEncoder(2, fd=False)
     first = before.encode(make_samples(1))
     again = after.encode(make_samples(2))
@@ -181,7 +181,7 @@ def test_a_reset_board_begins_its_transfer_ids_anew(make_samples: MakeSamples) -
     assert refused(decoder) == {"interrupted": 1}
 
 
-def test_kinds_of_frames_do_not_mix(make_samples: MakeSamples) -> None:
+def test_classic_and_fd_frames_do_not_mix(make_samples: MakeSamples) -> None:
     frames = CanEncoder(2, fd=True).encode(make_samples(1))
     odd = [frames[0], replace(frames[1], fd=False), *frames[2:]]
     decoder = CanDecoder()
@@ -218,7 +218,7 @@ def test_each_reason_has_its_counter(reason: str, frame: CanFrame) -> None:
         ("short_payload", 0x82, 3, b"\1"),
     ],
 )
-def test_header_and_identifier_must_agree(
+def test_header_and_identifier_must_match(
     reason: str, kind: int, board: int, payload: bytes, reference: SimpleNamespace
 ) -> None:
     packet = reference.packet(kind, payload, board)
@@ -228,7 +228,7 @@ def test_header_and_identifier_must_agree(
     assert refused(decoder) == {reason: 1}
 
 
-def test_length_and_bytes_must_agree(reference: SimpleNamespace) -> None:
+def test_length_and_bytes_must_match(reference: SimpleNamespace) -> None:
     packet = reference.packet(0x82, b"\1\0", 3)
     for wrong in (packet + b"\0", packet + bytes(60), packet[:2] + b"\x09\0" + packet[4:]):
         for size in (8, 64):
@@ -252,7 +252,7 @@ def test_an_endless_transfer_is_dropped(fd: bool) -> None:
     assert decoder.counters["no_start"] > 300
 
 
-def test_memory_stays_bounded_whatever_comes() -> None:
+def test_memory_is_bounded_for_any_input() -> None:
     rng = np.random.default_rng(5)
     decoder = CanDecoder()
     kinds = [int(k) for k in MessageType]
@@ -288,7 +288,7 @@ frames_at_random = st.builds(
 
 @given(st.lists(frames_at_random, max_size=30))
 @settings(max_examples=100, deadline=None)
-def test_frames_at_random_never_raise_and_are_never_accepted(frames: Frames) -> None:
+def test_random_frames_never_raise_and_are_never_accepted(frames: Frames) -> None:
     decoder = CanDecoder()
     assert decoder.feed(frames) == []
     assert decoder.counters["accepted"] == 0

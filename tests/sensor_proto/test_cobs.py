@@ -34,7 +34,7 @@ FULL = [
 
 
 @pytest.mark.parametrize(("data", "stuffed"), [(d, bytes.fromhex(s)) for d, s in BY_HAND] + FULL)
-def test_examples_worked_by_hand(data: bytes, stuffed: bytes) -> None:
+def test_encoding_matches_hand_worked_examples(data: bytes, stuffed: bytes) -> None:
     assert cobs.encode(data) == stuffed
     assert cobs.decode(stuffed) == data
 
@@ -58,7 +58,7 @@ mixed = st.lists(
 
 @given(mixed)
 @settings(max_examples=150, deadline=None)
-def test_any_data_agrees_with_the_textbook(data: bytes) -> None:
+def test_decoding_matches_the_textbook(data: bytes) -> None:
     stuffed = cobs.encode(data)
     assert 0 not in stuffed
     assert len(stuffed) <= cobs.max_encoded(len(data))
@@ -67,7 +67,7 @@ def test_any_data_agrees_with_the_textbook(data: bytes) -> None:
 
 @given(mixed)
 @settings(max_examples=60, deadline=None)
-def test_the_encoding_is_that_of_the_textbook(reference: SimpleNamespace, data: bytes) -> None:
+def test_encoding_matches_the_textbook(reference: SimpleNamespace, data: bytes) -> None:
     assert cobs.encode(data) == reference.cobs(data)
 
 

@@ -22,7 +22,7 @@ PUBLISHED = [
 
 
 @pytest.mark.parametrize(("data", "crc"), PUBLISHED)
-def test_published_values(data: bytes, crc: int) -> None:
+def test_crc_matches_published_values(data: bytes, crc: int) -> None:
     assert crc32c(data) == crc
     assert crc32c_each([data, b"x", data]).tolist()[::2] == [crc, crc]
 
@@ -30,7 +30,7 @@ def test_published_values(data: bytes, crc: int) -> None:
 @pytest.mark.parametrize(
     "size", [0, 1, 2, 3, 4, 5, 250, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 2]
 )
-def test_any_length_agrees_with_the_bitwise_program(size: int, reference: SimpleNamespace) -> None:
+def test_crc_matches_bitwise_reference_at_any_length(size: int, reference: SimpleNamespace) -> None:
     data = np.random.default_rng(size).bytes(size)
     assert crc32c(data) == reference.crc(data)
     assert crc32c(bytearray(data)) == crc32c(memoryview(data)) == crc32c(data)
@@ -38,11 +38,11 @@ def test_any_length_agrees_with_the_bitwise_program(size: int, reference: Simple
 
 @given(st.lists(st.binary(min_size=1, max_size=300), max_size=12))
 @settings(max_examples=40, deadline=None)
-def test_many_at_once_are_the_same_as_one_by_one(packets: list[bytes]) -> None:
+def test_batch_crc_equals_single_crc(packets: list[bytes]) -> None:
     assert crc32c_each(packets).tolist() == [crc32c(p) for p in packets]
 
 
-def test_equal_lengths_at_once_agree_with_the_bitwise_program(reference: SimpleNamespace) -> None:
+def test_batch_crc_of_equal_lengths_matches_bitwise_reference(reference: SimpleNamespace) -> None:
     rng = np.random.default_rng(1)
     packets = [rng.bytes(246) for _ in range(5)]
     assert crc32c_each(packets).tolist() == [reference.crc(p) for p in packets]
@@ -50,7 +50,7 @@ def test_equal_lengths_at_once_agree_with_the_bitwise_program(reference: SimpleN
 
 @given(st.binary(max_size=400))
 @settings(max_examples=40, deadline=None)
-def test_data_followed_by_its_crc_leaves_the_residue(data: bytes) -> None:
+def test_data_with_its_crc_leaves_the_residue(data: bytes) -> None:
     assert crc32c(data + crc32c(data).to_bytes(4, "little")) == RESIDUE == 0x48674BC7
 
 
@@ -59,6 +59,6 @@ def test_zeros_are_never_their_own_crc() -> None:
 
 
 @pytest.mark.parametrize("packets", [[b""], [b"a", b""], [bytes(BLOCK + 1)]])
-def test_local_misuse_is_refused(packets: list[bytes]) -> None:
+def test_misuse_is_refused_with_reason(packets: list[bytes]) -> None:
     with pytest.raises(ValueError, match="1 to"):
         crc32c_each(packets)

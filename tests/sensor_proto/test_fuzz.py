@@ -21,7 +21,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("small_blocks")
-def test_none_of_some_thousand_spoilt_frames_is_accepted_wrongly() -> None:
+def test_no_corrupted_frame_is_accepted() -> None:
     done: list[int] = []
     result = fuzz.run_fuzz(12_000, seed=3, progress=done.append)
     assert result["touched"] == sum(done) >= 12_000
@@ -36,7 +36,7 @@ def test_none_of_some_thousand_spoilt_frames_is_accepted_wrongly() -> None:
         assert totals["counters"]["crc"] > 100  # much of it gets as far as the CRC
 
 
-def test_a_seed_says_everything() -> None:
+def test_fuzz_run_is_determined_by_its_seed() -> None:
     first, second, other = (fuzz.run_fuzz(800, seed=s) for s in (1, 1, 2))
     for result in (first, second, other):
         del result["seconds"]
@@ -44,14 +44,14 @@ def test_a_seed_says_everything() -> None:
 
 
 @pytest.mark.usefixtures("small_blocks")
-def test_the_number_of_processes_changes_nothing() -> None:
+def test_result_is_independent_of_process_count() -> None:
     alone, together = (fuzz.run_fuzz(3500, seed=5, jobs=jobs) for jobs in (1, 2))
     del alone["seconds"], together["seconds"]
     assert alone == together
 
 
 @pytest.mark.usefixtures("small_blocks")
-def test_a_decoder_without_a_crc_would_be_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fuzzer_detects_a_decoder_without_crc(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(packets, "intact", lambda packets: [True] * len(packets))
     result = fuzz.run_fuzz(6000, seed=1)
     assert result["media"]["serial"]["wrong"] > 50
@@ -91,7 +91,7 @@ def test_bad_arguments_exit_with_2(words: list[str], capsys: pytest.CaptureFixtu
     assert words[0] in capsys.readouterr().err
 
 
-def test_a_missing_directory_is_named_before_the_work(
+def test_missing_directory_is_named_before_work_starts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("--out", str(tmp_path / "absent" / "fuzz.json")) == 2

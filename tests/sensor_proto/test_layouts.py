@@ -160,7 +160,7 @@ def read(layout: str, data: list[bytes]) -> list[Received]:
         "text:1xyz,lines=3",
     ],
 )
-def test_a_layout_is_written_as_it_is_read(text: str) -> None:
+def test_layout_text_round_trips(text: str) -> None:
     assert str(Layout.parse(text)) == text
 
 
@@ -185,7 +185,7 @@ def test_a_layout_is_written_as_it_is_read(text: str) -> None:
         ("int16:5xyz,scale=nan", "parted by /"),
     ],
 )
-def test_what_is_not_a_layout_is_refused_with_what_is(text: str, named: str) -> None:
+def test_invalid_layout_is_refused_with_the_expected_form(text: str, named: str) -> None:
     with pytest.raises(ValueError, match="allowed") as caught:
         Layout.parse(text)
     assert named in str(caught.value)
@@ -207,7 +207,7 @@ def test_floats_without_temperatures_end_in_lf() -> None:
     assert not samples.status.any()
 
 
-def test_integers_with_the_high_byte_first_and_a_sum() -> None:
+def test_big_endian_integers_with_checksum() -> None:
     # 10, −10, 1000 counts of 0.15, 0.15, 0.242 µT; 00+0a+ff+f6+03+e8 = 0x2ea
     frame = bytes.fromhex("aa55 000a fff6 03e8 ea")
     samples = samples_of("int16:1xyz,big,start=aa55,check=sum,end=none", frame)
@@ -224,7 +224,7 @@ def test_raw_temperatures_follow_the_datasheet() -> None:
     assert samples.field_ut.tolist() == [[10.0, -10.0, 1000.0]]
 
 
-def test_a_frame_with_everything_round_its_numbers() -> None:
+def test_frame_with_header_counter_and_checksum() -> None:
     body = bytes.fromhex("07 0000c841 0000803f 000000c0 00409643")  # counter, 25 °C, 1, −2, 300.5
     frame = b"\xaa\x55" + body + xor(body) + b"\r\n"
     samples = samples_of("floats:1txyz,start=aa55,skip=1,check=xor,end=crlf", frame)
@@ -232,14 +232,14 @@ def test_a_frame_with_everything_round_its_numbers() -> None:
     assert samples.field_ut.tolist() == [[1.0, -2.0, 300.5]]
 
 
-def test_lines_of_text() -> None:
+def test_text_lines_are_decoded() -> None:
     lines = [b"12.00\t1.00\t", b"25.10\t1.00\t-2.00\t300.50\r\n" * 3]
     (first, *_) = read("text:1txyz", lines)
     assert first.message.field_ut.tolist() == [[1.0, -2.0, 300.5]]
     assert first.message.temperature_c.tolist() == pytest.approx([25.1])
 
 
-def test_numbers_with_nothing_between_them_are_told_by_their_decimals() -> None:
+def test_numbers_without_separators_are_split_by_their_decimals() -> None:
     line = b"25.10\t1.00\t-2.00\t300.5026.20\t-7.00\t8.00\t-9000.10\r\n"
     got = read("text:2txyz", [line] * 4)[-1].message
     assert got.field_ut.tolist() == [[1.0, -2.0, 300.5], [-7.0, 8.0, pytest.approx(-9000.1)]]
@@ -254,7 +254,7 @@ def test_numbers_with_nothing_between_them_are_told_by_their_decimals() -> None:
         (b"FRAME: [S1:1.0,2.0,3.0] [S2:4.0,inf,6.0] [S3:7.0,ovf,9.0] \r\n", [1, 2]),
     ],
 )
-def test_a_chip_that_failed_in_text_is_flagged(line: bytes, failed: list[int]) -> None:
+def test_failed_chip_in_text_is_flagged(line: bytes, failed: list[int]) -> None:
     good = b"FRAME: [S1:1.0,2.0,3.0] [S2:4.0,5.0,6.0] [S3:7.0,8.0,9.0] \r\n"
     got = read("text:3xyz", [good, good, good, line, good])
     assert [np.flatnonzero(r.message.status).tolist() for r in got] == [[], [], failed, []]
@@ -280,7 +280,7 @@ LAYOUTS = [
     seed=st.integers(0, 99),
 )
 @settings(max_examples=60, deadline=None)
-def test_what_a_layout_writes_it_reads_in_any_chunks(
+def test_layout_reads_what_it_writes_at_any_chunking(
     layout: str, sizes: list[int], seed: int
 ) -> None:
     parsed = Layout.parse(layout)
@@ -307,7 +307,7 @@ def test_what_a_layout_writes_it_reads_in_any_chunks(
 
 @pytest.mark.parametrize("layout", [*LAYOUTS[:7], "floats:5xyz,end=none", "int16:5xyz,end=lf"])
 @pytest.mark.parametrize("cut", [3, 17])
-def test_two_bytes_lost_in_every_tenth_frame_shift_nothing(layout: str, cut: int) -> None:
+def test_lost_bytes_do_not_shift_later_frames(layout: str, cut: int) -> None:
     parsed = Layout.parse(layout)
     exact, chunks = [], []
     for i, r in enumerate(rows(parsed.chips, 200)):
@@ -332,7 +332,7 @@ def test_two_bytes_lost_in_every_tenth_frame_shift_nothing(layout: str, cut: int
     assert decoder.counters["discarded_bytes"] > 0
 
 
-def test_a_line_that_lost_a_piece_is_dropped_and_counted() -> None:
+def test_line_with_missing_text_is_dropped_and_counted() -> None:
     lines = [reskin(r, i) for i, r in enumerate(rows(5, 40))]
     whole = len(read("text:5xyzt", lines))
     spoilt = list(lines)
@@ -347,7 +347,7 @@ def test_a_line_that_lost_a_piece_is_dropped_and_counted() -> None:
 
 @given(chunks=st.lists(st.binary(max_size=3000), max_size=6), layout=st.sampled_from(LAYOUTS))
 @settings(max_examples=60, deadline=None)
-def test_noise_never_raises_and_memory_stays_bounded(chunks: list[bytes], layout: str) -> None:
+def test_noise_never_raises_and_memory_is_bounded(chunks: list[bytes], layout: str) -> None:
     parsed = Layout.parse(layout)
     decoder = TextDecoder(parsed) if parsed.kind == "text" else LayoutDecoder(parsed)
     watch = Survey()
@@ -383,7 +383,7 @@ def test_noise_never_raises_and_memory_stays_bounded(chunks: list[bytes], layout
         (clocked, "text:5xyzt,lead=1"),
     ],
 )
-def test_what_is_plain_is_found(write: Write, layout: str) -> None:
+def test_unambiguous_layout_is_detected(write: Write, layout: str) -> None:
     found = survey(write)
     assert found is not None
     assert str(found.layout) == layout
@@ -434,7 +434,7 @@ def test_what_is_plain_is_found(write: Write, layout: str) -> None:
          ("text:5xyz",)),
     ],
 )  # fmt: skip
-def test_what_leaves_a_doubt_is_named_with_its_declaration(
+def test_ambiguous_layout_is_named_with_its_declaration(
     write: Write, what: str, declare: tuple[str, ...]
 ) -> None:
     found = survey(write)
@@ -455,7 +455,7 @@ def test_what_leaves_a_doubt_is_named_with_its_declaration(
 
 @pytest.mark.parametrize("chips", [4, 8, 12, 16, 20])
 @pytest.mark.parametrize("largest_ut", [20.0, 50.0, 1500.0])
-def test_chips_without_temperatures_never_pass_for_fewer_with(
+def test_chips_without_temperature_are_not_mistaken_for_fewer_with(
     chips: int, largest_ut: float
 ) -> None:
     """Fields of a bare board are as small as temperatures."""
@@ -472,7 +472,7 @@ def test_chips_without_temperatures_never_pass_for_fewer_with(
 
 
 @pytest.mark.parametrize("chips", [3, 6, 12, 15])
-def test_chips_with_temperatures_are_found_whatever_their_number(chips: int) -> None:
+def test_chips_with_temperature_are_detected_for_any_count(chips: int) -> None:
     for seed in range(3):
         decoder = AnySkinDecoder()
         got = [
@@ -482,7 +482,7 @@ def test_chips_with_temperatures_are_found_whatever_their_number(chips: int) -> 
         assert len(got) == 60
 
 
-def test_temperatures_behind_the_field_are_not_taken_for_it() -> None:
+def test_temperatures_after_the_field_are_not_mistaken_for_it() -> None:
     """x of the chip right below a magnet is as small as a temperature."""
     decoder = AnySkinDecoder()
     for r in rows(5, 60, 1, 30.0):
@@ -498,18 +498,18 @@ def test_temperatures_behind_the_field_are_not_taken_for_it() -> None:
         lambda r, n: bytes(500),
     ],
 )
-def test_what_is_no_board_is_not_found(write: Write) -> None:
+def test_other_devices_are_not_detected_as_boards(write: Write) -> None:
     assert survey(write) is None
 
 
-def test_an_accelerometer_is_not_taken_for_a_skin() -> None:
+def test_accelerometer_is_not_mistaken_for_a_skin() -> None:
     found = survey(lambda r, n: b"X: %.2f Y: %.2f Z: %.2f\r\n" % (0.1, n % 3 * 0.01, 9.81))
     assert found is not None
     assert found.layout is None
     assert "too small" in found.what
 
 
-def test_a_banner_and_remarks_between_do_not_matter() -> None:
+def test_banner_and_remarks_are_ignored() -> None:
     watch = Survey()
     watch.feed(b"I2C scan complete.\r\nFound MLX candidates: 0xC 0xD \r\nInit MLX[0] status=0\r\n")
     for number, r in enumerate(rows(5, 60)):
@@ -521,7 +521,7 @@ def test_a_banner_and_remarks_between_do_not_matter() -> None:
     assert str(found.layout) == "text:5xyzt"
 
 
-def test_frames_that_lost_bytes_are_found_all_the_same() -> None:
+def test_layout_is_detected_despite_lost_bytes() -> None:
     watch = Survey()
     for number, r in enumerate(rows(5, 90)):
         frame = floats(txyz(r)) + b"\n"
@@ -531,7 +531,7 @@ def test_frames_that_lost_bytes_are_found_all_the_same() -> None:
     assert str(found.layout) == "floats:5txyz,end=lf"
 
 
-def test_a_wrong_declaration_is_told_with_the_right_one() -> None:
+def test_wrong_declaration_is_reported_with_the_right_one() -> None:
     watch = Survey(Layout.parse("floats:4xyz"))
     for r in rows(5, 60):
         watch.feed(floats(xyz(r)) + b"\r\n")

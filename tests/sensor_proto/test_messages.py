@@ -96,14 +96,14 @@ messages = st.one_of(
 
 @given(messages)
 @settings(max_examples=250, deadline=None)
-def test_every_message_survives_a_serial_line(same: Same, message: Message) -> None:
+def test_every_message_round_trips_over_serial(same: Same, message: Message) -> None:
     (received,) = SerialDecoder().feed(encode_serial(message))
     assert same(received.message, message)
 
 
 @given(messages, st.integers(0, 127), st.booleans())
 @settings(max_examples=150, deadline=None)
-def test_every_message_survives_a_can_bus(
+def test_every_message_round_trips_over_can(
     same: Same, message: Message, board: int, fd: bool
 ) -> None:
     (received,) = CanDecoder().feed(CanEncoder(board, fd).encode(message))
@@ -113,7 +113,7 @@ def test_every_message_survives_a_can_bus(
 
 @given(messages, st.binary(min_size=1, max_size=40))
 @settings(max_examples=100, deadline=None)
-def test_a_longer_known_message_is_read_by_its_length(
+def test_longer_message_of_a_known_type_is_read(
     same: Same, reference: SimpleNamespace, message: Message, more: bytes
 ) -> None:
     packet = _packet(message)
@@ -124,7 +124,7 @@ def test_a_longer_known_message_is_read_by_its_length(
 
 @given(messages, st.data())
 @settings(max_examples=100, deadline=None)
-def test_a_shortened_payload_is_refused(
+def test_shortened_payload_is_refused(
     reference: SimpleNamespace, message: Message, data: st.DataObject
 ) -> None:
     packet = _packet(message)
@@ -191,16 +191,14 @@ BAD_DESCRIPTORS = [
 
 
 @pytest.mark.parametrize("changes", BAD_DESCRIPTORS, ids=str)
-def test_a_senseless_descriptor_is_refused(
-    changes: dict[str, Any], reference: SimpleNamespace
-) -> None:
+def test_invalid_descriptor_is_refused(changes: dict[str, Any], reference: SimpleNamespace) -> None:
     decoder = SerialDecoder()
     packet = reference.packet(0x01, _descriptor_payload(**changes))
     assert decoder.feed(reference.serial(packet)) == []
     assert decoder.counters["bad_value"] == 1
 
 
-def test_descriptors_of_newer_minors_are_read(reference: SimpleNamespace) -> None:
+def test_descriptors_of_newer_minor_versions_are_read(reference: SimpleNamespace) -> None:
     payload = _descriptor_payload(stride=40, chip=77) + b"more"
     (received,) = SerialDecoder().feed(reference.serial(reference.packet(0x01, payload)))
     (array,) = received.message.arrays
@@ -208,7 +206,7 @@ def test_descriptors_of_newer_minors_are_read(reference: SimpleNamespace) -> Non
 
 
 @pytest.mark.parametrize("major", [0, 2, 255])
-def test_another_major_can_be_refused_by_name(major: int, reference: SimpleNamespace) -> None:
+def test_other_major_version_is_recognised(major: int, reference: SimpleNamespace) -> None:
     for payload in (
         _descriptor_payload(major=major, tick_hz=0, count=0, firmware=b"\xff"),
         _descriptor_payload(major=major)[:26],
@@ -219,14 +217,14 @@ def test_another_major_can_be_refused_by_name(major: int, reference: SimpleNames
         assert message.serial_number == "0" * 16
 
 
-def test_identify_of_another_major_reaches_the_board(reference: SimpleNamespace) -> None:
+def test_identify_of_other_major_version_reaches_the_board(reference: SimpleNamespace) -> None:
     packet = reference.packet(0x81, bytes([9, 0, 3, 1]) + b"newer")
     (received,) = SerialDecoder().feed(reference.serial(packet))
     assert received.message == Identify(9, 3, 1)
 
 
 @pytest.mark.parametrize("taxels", [0, 129, 255])
-def test_samples_of_no_or_too_many_taxels_are_refused(
+def test_samples_with_no_or_too_many_taxels_are_refused(
     taxels: int, reference: SimpleNamespace
 ) -> None:
     payload = bytes([0, taxels]) + bytes(10) + bytes(7 * min(taxels, 140))
@@ -250,14 +248,14 @@ def test_samples_are_read_only_little_endian_views(
     assert same(message, make_samples(3))
 
 
-def test_what_a_board_says_cannot_steer_a_terminal(reference: SimpleNamespace) -> None:
+def test_board_text_cannot_control_the_terminal(reference: SimpleNamespace) -> None:
     raw = b"\x1b[2Jok\r\n\xff"
     payload = bytes([20, len(raw)]) + bytes(4) + raw
     (received,) = SerialDecoder().feed(reference.serial(reference.packet(0x05, payload)))
     assert received.message.text == "�[2Jok���"
 
 
-def test_unknown_results_are_failures(reference: SimpleNamespace) -> None:
+def test_unknown_ack_results_are_failures(reference: SimpleNamespace) -> None:
     packet = reference.packet(0x06, bytes([0x82, 99, 1, 0]))
     (received,) = SerialDecoder().feed(reference.serial(packet))
     assert received.message == Ack(0x82, 1, AckResult.FAILED)
@@ -265,7 +263,7 @@ def test_unknown_results_are_failures(reference: SimpleNamespace) -> None:
 
 @given(st.one_of(u8, st.sampled_from(MessageType).map(int)), st.binary(max_size=300))
 @settings(max_examples=300, deadline=None)
-def test_any_payload_under_a_good_crc_is_a_message_or_counted(
+def test_payload_with_good_crc_is_decoded_or_counted(
     reference: SimpleNamespace, kind: int, payload: bytes
 ) -> None:
     decoder = SerialDecoder()
@@ -305,7 +303,7 @@ BITS = np.zeros(2, np.uint8)
     ],
     ids=lambda m: type(m).__name__,
 )
-def test_values_that_do_not_fit_are_refused_locally(message: Message) -> None:
+def test_values_out_of_range_are_refused_locally(message: Message) -> None:
     with pytest.raises(ValueError, match=r"."):
         encode_serial(message)
 
@@ -319,6 +317,6 @@ def test_values_that_do_not_fit_are_refused_locally(message: Message) -> None:
         "start",
     ],
 )
-def test_things_of_the_wrong_type_are_refused_locally(thing: Any) -> None:
+def test_wrong_types_are_refused_locally(thing: Any) -> None:
     with pytest.raises(TypeError):
         encode_serial(thing)

@@ -42,14 +42,14 @@ def line(make_samples: MakeSamples) -> list[bytes]:
     return [encode_serial(make_samples(i, taxels=(i % 40) + 1)) for i in range(40)]
 
 
-def test_it_satisfies_the_seam() -> None:
+def test_decoder_satisfies_the_protocol() -> None:
     decoder: Decoder[bytes] = SerialDecoder()
     assert decoder.feed(b"") == []
 
 
 @given(sizes=st.lists(st.integers(1, 700), min_size=1, max_size=8))
 @settings(max_examples=40, deadline=None)
-def test_any_chunking_yields_the_same_frames(line: list[bytes], sizes: list[int]) -> None:
+def test_chunking_does_not_change_the_frames(line: list[bytes], sizes: list[int]) -> None:
     decoder = SerialDecoder()
     assert sequences(feed_in(decoder, b"".join(line), sizes)) == list(range(40))
     assert refused(decoder) == 0
@@ -57,7 +57,7 @@ def test_any_chunking_yields_the_same_frames(line: list[bytes], sizes: list[int]
 
 @given(garbage=st.binary(max_size=3000), sizes=st.lists(st.integers(1, 900), min_size=1))
 @settings(max_examples=80, deadline=None)
-def test_garbage_a_delimiter_and_a_good_frame_yield_that_frame(
+def test_good_frame_after_garbage_is_found(
     line: list[bytes], garbage: bytes, sizes: list[int]
 ) -> None:
     decoder = SerialDecoder()
@@ -66,7 +66,7 @@ def test_garbage_a_delimiter_and_a_good_frame_yield_that_frame(
 
 @given(chunks=st.lists(st.binary(max_size=2500), max_size=12))
 @settings(max_examples=60, deadline=None)
-def test_memory_stays_bounded_whatever_comes(chunks: list[bytes]) -> None:
+def test_memory_is_bounded_for_any_input(chunks: list[bytes]) -> None:
     decoder = SerialDecoder()
     for chunk in chunks:
         decoder.feed(chunk)
@@ -75,7 +75,7 @@ def test_memory_stays_bounded_whatever_comes(chunks: list[bytes]) -> None:
 
 @given(st.data())
 @settings(max_examples=60, deadline=None)
-def test_counters_do_not_depend_on_the_chunking(line: list[bytes], data: st.DataObject) -> None:
+def test_chunking_does_not_change_the_counters(line: list[bytes], data: st.DataObject) -> None:
     rng = np.random.default_rng(data.draw(st.integers(0, 999)))
     wire = bytearray(b"".join(line))
     for at in rng.integers(0, len(wire), 25):
@@ -86,7 +86,7 @@ def test_counters_do_not_depend_on_the_chunking(line: list[bytes], data: st.Data
     assert whole.counters == pieces.counters
 
 
-def test_trailing_tells_what_came_after_each_frame(line: list[bytes]) -> None:
+def test_trailing_counts_bytes_after_each_frame(line: list[bytes]) -> None:
     decoder = SerialDecoder()
     chunk = line[0] + line[1] + line[2][:10]
     first, second = decoder.feed(chunk)
@@ -97,7 +97,7 @@ def test_trailing_tells_what_came_after_each_frame(line: list[bytes]) -> None:
     assert fourth.trailing == 5
 
 
-def test_a_flood_of_zeros_costs_no_memory_and_no_frame(line: list[bytes]) -> None:
+def test_flood_of_zeros_takes_no_memory_and_loses_no_frame(line: list[bytes]) -> None:
     decoder = SerialDecoder()
     for _ in range(200):
         assert decoder.feed(bytes(4096)) == []
@@ -108,21 +108,21 @@ def test_a_flood_of_zeros_costs_no_memory_and_no_frame(line: list[bytes]) -> Non
 
 
 @pytest.mark.parametrize("chunk", [1, 100, 5000])
-def test_an_endless_frame_is_dropped_to_the_next_delimiter(line: list[bytes], chunk: int) -> None:
+def test_endless_frame_is_dropped_up_to_the_next_delimiter(line: list[bytes], chunk: int) -> None:
     decoder = SerialDecoder()
     endless = b"\x55" * 20_000 + b"\0"
     assert sequences(feed_in(decoder, endless + line[1], [chunk])) == [1]
     assert decoder.counters["oversized"] == refused(decoder) == 1
 
 
-def test_the_longest_frame_still_passes(make_samples: MakeSamples) -> None:
+def test_longest_frame_is_accepted(make_samples: MakeSamples) -> None:
     longest = encode_serial(Log(20, 1, "x" * 255))
     decoder = SerialDecoder()
     assert sequences(decoder.feed(encode_serial(make_samples(9, taxels=128)) + longest)) == [9]
     assert decoder.counters["accepted"] == 2
 
 
-def test_payload_of_the_largest_size_passes_and_one_more_byte_does_not(
+def test_largest_payload_is_accepted_and_one_more_byte_refused(
     reference: SimpleNamespace,
 ) -> None:
     for size, accepted in ((1024, 1), (1025, 0), (1040, 0)):
@@ -161,7 +161,7 @@ def test_all_zero_packets_are_refused(reference: SimpleNamespace) -> None:
         assert refused(decoder) == 1
 
 
-def test_reset_forgets_the_unfinished_frame_but_not_the_counts(line: list[bytes]) -> None:
+def test_reset_drops_the_partial_frame_but_keeps_the_counters(line: list[bytes]) -> None:
     decoder = SerialDecoder()
     decoder.feed(line[0] + line[1][:20])
     decoder.reset()
@@ -217,7 +217,9 @@ def spoil(kind: str, frames: list[bytes], rng: np.random.Generator) -> tuple[byt
 
 @pytest.mark.parametrize("kind", EVIL)
 @pytest.mark.parametrize("seed", range(3))
-def test_evil_wires(kind: str, seed: int, line: list[bytes]) -> None:
+def test_corrupted_streams_never_yield_wrong_frames(
+    kind: str, seed: int, line: list[bytes]
+) -> None:
     rng = np.random.default_rng(seed)
     wire, damaged = spoil(kind, line, rng)
     decoder = SerialDecoder()
@@ -229,7 +231,7 @@ def test_evil_wires(kind: str, seed: int, line: list[bytes]) -> None:
         assert got == sorted(set(got))
 
 
-def test_a_delayed_frame_counts_once_and_where_it_came(line: list[bytes]) -> None:
+def test_delayed_frame_is_counted_once_on_arrival(line: list[bytes]) -> None:
     decoder = SerialDecoder()
     late = [*line[:3], *line[4:9], line[3], *line[9:]]
     assert sequences(feed_in(decoder, b"".join(late), [333])) == [
@@ -248,7 +250,7 @@ def test_a_delayed_frame_counts_once_and_where_it_came(line: list[bytes]) -> Non
 
 @given(st.integers(0, 10**6))
 @settings(max_examples=120, deadline=None)
-def test_frames_lost_are_at_most_frames_touched_and_one(line: list[bytes], seed: int) -> None:
+def test_damage_loses_at_most_one_frame_beyond_those_touched(line: list[bytes], seed: int) -> None:
     """One fault anywhere: bytes cut out, put in, changed, over any number of frames."""
     rng = np.random.default_rng(seed)
     wire = b"".join(line)

@@ -98,7 +98,7 @@ def frame_of(name: str) -> bytes:
     return SERIAL[name][-1][1]
 
 
-def test_the_document_has_a_vector_for_every_message() -> None:
+def test_protocol_document_has_a_vector_for_every_message() -> None:
     assert set(SERIAL) == {*MESSAGES, *NEWER, "newer_type"}
     assert {type(m).__name__ for m in MESSAGES.values()} == {
         c.__name__
@@ -110,7 +110,7 @@ def test_the_document_has_a_vector_for_every_message() -> None:
 
 
 @pytest.mark.parametrize("name", SERIAL)
-def test_the_document_agrees_with_the_reference(name: str, reference: SimpleNamespace) -> None:
+def test_protocol_document_matches_the_reference(name: str, reference: SimpleNamespace) -> None:
     *fields, (label, crc), (_, frame) = SERIAL[name]
     assert label == "crc"
     body = b"".join(data for _, data in fields)
@@ -120,12 +120,12 @@ def test_the_document_agrees_with_the_reference(name: str, reference: SimpleName
 
 
 @pytest.mark.parametrize("name", MESSAGES)
-def test_our_encoder_writes_the_vector(name: str) -> None:
+def test_encoder_writes_the_vector(name: str) -> None:
     assert encode_serial(MESSAGES[name]) == frame_of(name)
 
 
 @pytest.mark.parametrize("name", [*MESSAGES, *NEWER])
-def test_our_decoder_reads_the_vector(name: str, same: Callable[[object, object], bool]) -> None:
+def test_decoder_reads_the_vector(name: str, same: Callable[[object, object], bool]) -> None:
     decoder = SerialDecoder()
     (received,) = decoder.feed(frame_of(name))
     assert same(received.message, (MESSAGES | NEWER)[name])
@@ -159,7 +159,7 @@ def test_every_can_vector_is_used() -> None:
 
 
 @pytest.mark.parametrize(("name", "message", "board", "transfer"), CAN_VECTORS)
-def test_can_vectors(
+def test_can_vectors_are_read_and_written(
     name: str,
     message: Message,
     board: int,
@@ -183,7 +183,7 @@ def test_can_vectors(
     assert received.board == board
 
 
-def test_the_unframed_vector() -> None:
+def test_unframed_vector_is_read_and_written() -> None:
     frame = b"".join(data for _, data in blocks("hex")["anyskin"])
     samples = FloatSamples(
         np.array([[1, -2, 300.5]], np.float32), np.array([25], np.float32), np.zeros(1, np.uint8)

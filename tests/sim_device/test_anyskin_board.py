@@ -66,7 +66,7 @@ def test_failed_read_is_an_unflagged_frame_with_an_impossible_temperature() -> N
     assert not any(s.status[[0, 1, 3, 4]].any() for s in samples)
 
 
-def test_a_pause_costs_frames_and_is_counted() -> None:
+def test_pause_loses_frames_and_is_counted() -> None:
     board = AnySkinBoard(build_skin("anyskin", 0))
     stream(board, 100)
     late = decode(board.tick(Instant(10_000 * MS)))
@@ -91,7 +91,7 @@ def test_wire_faults_are_counted_per_frame() -> None:
     assert counters["sent"] + counters["duplicated"] == counters["intact"] + counters["lost"]
 
 
-def test_what_such_a_board_cannot_be(flat_geometry) -> None:
+def test_impossible_anyskin_boards_are_refused(flat_geometry) -> None:
     skin = SkinModel(flat_geometry((3, 7)), anyskin_parameters(), np.random.default_rng(0))
     with pytest.raises(ValueError, match="21 magnetometers: 1 to 20"):
         AnySkinBoard(skin)
@@ -101,7 +101,7 @@ def test_what_such_a_board_cannot_be(flat_geometry) -> None:
         AnySkinBoard(build_skin("anyskin", 0), loop_rate=0.0)
 
 
-def test_it_does_not_listen() -> None:
+def test_anyskin_board_ignores_input() -> None:
     board = AnySkinBoard(build_skin("anyskin", 0))
     board.receive(b"\x01\x02\x00", Instant(0))
     assert len(board.tick(Instant(0))) == 82

@@ -11,7 +11,7 @@ from sim_device.board.firmware import CanBoard, SerialBoard
 from sim_device.faults import FaultPlan
 
 
-def test_planned_reset_is_a_watchdogs(serial) -> None:
+def test_planned_reset_is_reported_as_watchdog_reset(serial) -> None:
     host = serial(plan=FaultPlan.parse("reset@1s"))
     host.run(2300, {200: [Start(1)]})
     assert host.of(Status)[-1].reset_cause == 2
@@ -19,7 +19,7 @@ def test_planned_reset_is_a_watchdogs(serial) -> None:
     assert host.sequences[-1] < 81
 
 
-def test_nobody_reading_makes_overruns_that_are_counted_exactly(serial) -> None:
+def test_unread_board_counts_its_overruns_exactly(serial) -> None:
     host = serial()
     host.run(1000, {200: [Start(1)]})
     before = len(host.sequences)
@@ -32,7 +32,7 @@ def test_nobody_reading_makes_overruns_that_are_counted_exactly(serial) -> None:
     assert before < len(host.sequences)
 
 
-def test_a_slow_line_drops_the_oldest_samples(serial) -> None:
+def test_slow_line_drops_the_oldest_samples(serial) -> None:
     # 16 taxels make about 145 bytes a sample: 100 Hz need 14.5 kB/s, and there are 5.
     host = serial(line_rate=5000.0)
     host.run(3000, {200: [Start(1)]})
@@ -44,7 +44,7 @@ def test_a_slow_line_drops_the_oldest_samples(serial) -> None:
     assert host.board.counters["overruns"] >= lost
 
 
-def test_broken_taxels(serial) -> None:
+def test_broken_taxels_behave_as_planned(serial) -> None:
     host = serial(
         plan=FaultPlan.parse("stuck=pad:3@0.5s,saturated=pad:0@0.5s+0.2s,failed=pad:15@0.5s+0.1s")
     )
@@ -76,7 +76,7 @@ def test_plans_that_do_not_fit_the_board_are_refused(serial, spec: str, message:
         serial(plan=FaultPlan.parse(spec))
 
 
-def test_every_lost_sample_is_in_the_account(serial) -> None:
+def test_every_lost_sample_is_accounted_for(serial) -> None:
     spec = "seed=3,flip=2e-5,loss=0.02,duplicate=0.02,splice=0.01,byteloss=1e-5,silence@3s+0.5s"
     host = serial(plan=FaultPlan.parse(spec))
     host.run(6000, {200: [Start(1)]})

@@ -45,7 +45,7 @@ Check = Callable[[NDArray[np.int16]], bool]
         ("twin=skin:1", 3, lambda counts: counts.tolist() == COUNTS[2].tolist()),
     ],
 )
-def test_one_chip_is_spoilt_and_no_other(faults: str, row: int, right: Check) -> None:
+def test_only_the_chosen_chip_is_broken(faults: str, row: int, right: Check) -> None:
     out = spoilt(faults)
     assert right(out.counts[row])
     others = np.arange(5) != row
@@ -53,7 +53,7 @@ def test_one_chip_is_spoilt_and_no_other(faults: str, row: int, right: Check) ->
     assert not out.status.any()  # nothing is flagged
 
 
-def test_a_press_takes_a_wrapping_chip_over_the_end() -> None:
+def test_press_takes_a_wrapping_chip_across_the_wrap() -> None:
     broken = BrokenTaxels(FaultPlan.parse("wrap=skin:0"), TAXELS)
     broken.spoil(reading(), 1.0)
     pressed = reading()
@@ -61,13 +61,13 @@ def test_a_press_takes_a_wrapping_chip_over_the_end() -> None:
     assert broken.spoil(pressed, 1.1).counts[2, 2] == 30767 + 2500 - 65536
 
 
-def test_what_dithers_stays_where_it_was_but_for_its_last_bits() -> None:
+def test_dithering_chip_changes_only_its_last_bits() -> None:
     broken = BrokenTaxels(FaultPlan.parse("dither=left:1"), TAXELS)
     seen = np.array([broken.spoil(reading(9 * k), 1.0).counts[1] for k in range(50)])
     assert (np.ptp(seen, axis=0) == 1).all()
 
 
-def test_thermometers_infinities_and_failed_reads() -> None:
+def test_thermometer_infinity_and_failed_read_faults() -> None:
     assert spoilt("hot=left:0").temperature_c.tolist() == [99.0, 27.0, 27.0, 27.0, 27.0]
     infinite = spoilt("inf=skin:2").infinite
     assert infinite is not None
@@ -75,7 +75,7 @@ def test_thermometers_infinities_and_failed_reads() -> None:
     assert spoilt("failed=left:0").status[0] == TaxelStatus.READ_FAILED
 
 
-def test_all_chips_for_a_share_of_the_time() -> None:
+def test_fault_applies_to_all_chips_part_of_the_time() -> None:
     broken = BrokenTaxels(FaultPlan.parse("zeros=skin:*:0.25@1s+9s"), TAXELS)
     zeros = np.array([(broken.spoil(reading(), 2.0).counts == 0).all(axis=1) for _ in range(2000)])
     assert not zeros[:, :2].any()
@@ -83,7 +83,7 @@ def test_all_chips_for_a_share_of_the_time() -> None:
     assert broken.counters["zeros"] == zeros.sum()
 
 
-def test_old_readings_come_again_to_the_bit() -> None:
+def test_stale_readings_repeat_bit_for_bit() -> None:
     broken = BrokenTaxels(FaultPlan.parse("copy@0s+9s"), TAXELS)
     out = [broken.spoil(reading(k), 1.0).counts[0, 0] - 100 for k in range(100)]
     old = [k for k in range(100) if out[k] != k]
@@ -99,6 +99,6 @@ def test_old_readings_come_again_to_the_bit() -> None:
         ("zeros=palm:*", "there is no array 'palm'; allowed: 'left', 'skin'"),
     ],
 )
-def test_chips_that_are_not_there_are_refused(faults: str, message: str) -> None:
+def test_missing_chips_are_refused(faults: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         BrokenTaxels(FaultPlan.parse(faults), TAXELS)

@@ -24,7 +24,7 @@ def chips(n: int = 4, parameters: ChipParameters = IDEAL.chip, seed: int = 0) ->
     ("gain", "xy", "z"),
     [(7, 0.150, 0.242), (6, 0.200, 0.323), (5, 0.250, 0.403), (4, 0.300, 0.484), (0, 0.751, 1.210)],
 )
-def test_scales_of_the_datasheet(gain: int, xy: float, z: float) -> None:
+def test_scales_match_the_datasheet(gain: int, xy: float, z: float) -> None:
     assert ChipSetting(gain=gain).lsb_ut == pytest.approx((xy, xy, z))
     assert ChipSetting(gain=gain, resolution=2).lsb_ut == pytest.approx((4 * xy, 4 * xy, 4 * z))
 
@@ -32,7 +32,7 @@ def test_scales_of_the_datasheet(gain: int, xy: float, z: float) -> None:
 @pytest.mark.parametrize(
     ("filter_", "ms"), [(2, 1.84), (3, 2.61), (4, 4.15), (5, 7.22), (6, 13.4), (7, 25.7)]
 )
-def test_conversion_times_of_the_datasheet(filter_: int, ms: float) -> None:
+def test_conversion_times_match_the_datasheet(filter_: int, ms: float) -> None:
     assert ChipSetting(filter=filter_).conversion_time * 1e3 == pytest.approx(ms, rel=0.005)
 
 
@@ -43,7 +43,7 @@ def test_fastest_rate_is_that_of_the_slowest_oscillator() -> None:
 @pytest.mark.parametrize(
     "codes", [{"gain": 8}, {"gain": -1}, {"resolution": 4}, {"oversampling": 4}, {"filter": 8}]
 )
-def test_codes_that_the_chip_lacks_are_refused(codes: dict[str, int]) -> None:
+def test_unsupported_codes_are_refused(codes: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=next(iter(codes))):
         ChipSetting(**codes)
 
@@ -82,7 +82,7 @@ def test_end_of_scale_is_flagged() -> None:
     assert reading.status.tolist() == [0, 0, 0, TaxelStatus.SATURATED]
 
 
-def test_noise_is_that_of_real_boards_and_averages_down() -> None:
+def test_noise_matches_real_boards_and_averages_down() -> None:
     sensor = chips(2000, ChipParameters())
     rng = np.random.default_rng(5)
     default = sensor.convert(np.zeros((2000, 3)), 25.0, rng).counts * sensor.lsb_ut
@@ -118,11 +118,11 @@ def test_cross_axis_and_drift_stay_within_their_bounds() -> None:
 
 
 @pytest.mark.parametrize(("raw", "celsius"), [(0, -998.1), (65535, 451.8), (46244, 25.0)])
-def test_thermometer_formula(raw: int, celsius: float) -> None:
+def test_thermometer_formula_matches_the_datasheet(raw: int, celsius: float) -> None:
     assert temperature_of_raw(np.array(float(raw))) == pytest.approx(celsius, abs=0.05)
 
 
-def test_thermometer_reads_in_its_own_steps() -> None:
+def test_thermometer_reads_in_its_steps() -> None:
     reading = chips().convert(np.zeros((4, 3)), 31.234, np.random.default_rng(0))
     assert reading.temperature_c == pytest.approx([31.234] * 4, abs=0.5 / 45.2)
     steps = (reading.temperature_c - 25) * 45.2

@@ -40,13 +40,13 @@ def test_total_force_is_conserved_anywhere_on_the_skin(
     assert shared.sum(axis=0) == pytest.approx(2 * np.array(force), abs=1e-9)
 
 
-def test_total_force_survives_the_turn_to_taxel_axes(real_skin) -> None:
+def test_total_force_is_conserved_in_taxel_axes(real_skin) -> None:
     model: SkinModel = real_skin()
     contact = Contact(np.array([0.004, -0.003, 0.0]), np.array([0.5, -0.2, -3.0]))
     assert model.taxel_force([contact]).sum(axis=0) == pytest.approx([0.5, -0.2, -3.0])
 
 
-def test_a_contact_between_four_taxels_is_shared_alike_and_one_on_a_taxel_is_its_own() -> None:
+def test_contact_is_shared_by_its_nearest_taxels() -> None:
     spreader = Spreader(TAXELS[:32], PARAMETERS)
     corners = [2 * 8 + 2, 2 * 8 + 3, 8 + 2, 8 + 3]
     between = spreader.weights([Contact(TAXELS[corners].mean(axis=0), np.zeros(3))])[0]
@@ -55,7 +55,7 @@ def test_a_contact_between_four_taxels_is_shared_alike_and_one_on_a_taxel_is_its
     assert on_it[10] > 0.95
 
 
-def test_a_wider_contact_is_spread_wider() -> None:
+def test_wider_contact_is_spread_wider() -> None:
     spreader = Spreader(TAXELS[:32], PARAMETERS)
     shares = [
         spreader.weights([Contact(TAXELS[10], np.zeros(3), r)])[0, 10] for r in (2e-3, 8e-3, 2e-2)
@@ -63,7 +63,7 @@ def test_a_wider_contact_is_spread_wider() -> None:
     assert shares[0] > shares[1] > shares[2]
 
 
-def test_the_rigid_body_bears_what_is_off_the_skin() -> None:
+def test_force_off_the_skin_is_borne_by_the_body() -> None:
     spreader = Spreader(TAXELS, PARAMETERS)
     push = np.array([0, -1.0, 0])
     far = Contact(np.array([-0.05, 0.0, 0.0]), push)
@@ -78,7 +78,7 @@ def test_prompt_displacement_is_force_over_stiffness() -> None:
     assert moved[0] == pytest.approx([2.0 / 25e3, -1.0 / 25e3, -5.0 / 50e3])
 
 
-def test_a_crushed_elastomer_yields_no_further() -> None:
+def test_crushed_elastomer_yields_no_further() -> None:
     assert rubber(PLAIN).load(np.array([[0, 0, -1000.0]]), 0.01)[0, 2] == pytest.approx(-2.5e-3)
 
 
@@ -100,7 +100,7 @@ def test_creep_follows_its_time_constant() -> None:
 
 @pytest.mark.parametrize("peak", [0.5, 5.0, 20.0])
 @pytest.mark.parametrize(("axis", "share"), [(2, 0.03), (0, 0.08)])
-def test_hysteresis_is_its_share_of_the_peak(peak: float, axis: int, share: float) -> None:
+def test_hysteresis_is_a_fraction_of_the_peak(peak: float, axis: int, share: float) -> None:
     body = rubber(replace(PARAMETERS, creep=0.0, hysteresis_time=1e9))
     stiffness = 50e3 if axis == 2 else 25e3
 
@@ -119,7 +119,7 @@ def test_hysteresis_is_its_share_of_the_peak(peak: float, axis: int, share: floa
     assert max(slopes) - min(slopes) < 1e-9
 
 
-def test_rubber_forgets_its_peak() -> None:
+def test_elastomer_forgets_its_peak() -> None:
     body = rubber(replace(PARAMETERS, creep=0.0))
     body.load(np.array([[0, 0, -10.0]]), 0.1)
     remains = -body.load(np.zeros((1, 3)), 0.0)[0, 2] * 50e3
@@ -129,12 +129,12 @@ def test_rubber_forgets_its_peak() -> None:
     assert later == pytest.approx(remains * math.exp(-1), rel=1e-6)
 
 
-def test_time_does_not_go_back() -> None:
+def test_backward_time_is_not_accepted() -> None:
     with pytest.raises(ValueError, match="back"):
         rubber(PLAIN).load(np.zeros((1, 3)), -0.1)
 
 
-def test_reset_recovers_the_rubber() -> None:
+def test_reset_relaxes_the_elastomer() -> None:
     body = rubber(PARAMETERS)
     body.load(np.array([[3.0, 0, -10.0]]), 5.0)
     body.reset()

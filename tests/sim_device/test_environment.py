@@ -24,7 +24,7 @@ UNIFORM = EnvironmentParameters(gradient_ut_per_m=0.0)
     st.floats(-10, 10),
 )
 @settings(max_examples=40, deadline=None)
-def test_turning_keeps_the_size_of_the_earths_field(axis: tuple[float, ...], angle: float) -> None:
+def test_turning_preserves_the_earth_field_magnitude(axis: tuple[float, ...], angle: float) -> None:
     turn = rotation_about(np.array(axis) / np.linalg.norm(axis), angle)
     field = Environment(UNIFORM).at(0.0, turn).field_ut(np.zeros((1, 3)))[0]
     assert np.linalg.norm(field) == pytest.approx(50.0)
@@ -37,7 +37,7 @@ def test_field_points_north_and_down() -> None:
     assert field == pytest.approx([25.0, 0.0, -50 * math.sin(math.radians(60))])
 
 
-def test_gradient_is_a_field_without_sources() -> None:
+def test_gradient_field_has_no_sources() -> None:
     surroundings = Environment(EnvironmentParameters(field_ut=0, gradient_ut_per_m=30)).at(0.0)
     gradient = surroundings.field_ut(np.eye(3)).T
     assert np.trace(gradient) == pytest.approx(0)
@@ -53,7 +53,7 @@ def test_gradient_stays_in_the_world_when_the_skin_turns() -> None:
     assert field == pytest.approx([-15, 0, 0])
 
 
-def test_board_warms_up() -> None:
+def test_board_temperature_rises() -> None:
     environment = Environment()
     assert environment.at(0).temperature_c == pytest.approx(23)
     assert environment.at(300).temperature_c == pytest.approx(23 + 4 * (1 - math.exp(-1)))
@@ -76,7 +76,7 @@ def test_temperature_may_be_scripted() -> None:
         ("1e1deg/1s", 1, (0, 0, 1), 10),
     ],
 )
-def test_rotation_script(
+def test_rotation_script_is_followed(
     text: str, seconds: float, axis: tuple[float, ...], degrees: float
 ) -> None:
     expected = rotation_about(np.array(axis), math.radians(degrees))
@@ -91,6 +91,6 @@ def test_rotation_script(
         *("90deg/10s@0,0,0", "90deg/10s@1,2", "1e999deg/1s", "90deg/1e999s", "90grad/10s"),
     ],
 )
-def test_bad_rotation_says_what_is_allowed(text: str) -> None:
+def test_bad_rotation_names_allowed_values(text: str) -> None:
     with pytest.raises(ValueError, match=r"rotation .*allowed.*90deg/10s"):
         parse_rotation(text)

@@ -10,7 +10,7 @@ from sim_device.faults import ALL_TAXELS, FaultPlan, TaxelFault, TaxelFaultKind,
 from tactile_core.config import ConfigError
 
 
-def test_plan_from_text() -> None:
+def test_fault_plan_is_parsed_from_text() -> None:
     plan = FaultPlan.parse(
         "seed=7, flip=1e-5,loss=0.01,delay=0.5:0.1s,silence@5s+2s,silence@9s+1s,reset@8s,"
         "stuck=left:3@2s,failed=tip:0@1s+0.5s,saturated=right:31,busoff@3.5s+0.25s"
@@ -36,7 +36,7 @@ def test_nan_is_a_failed_read() -> None:
     assert FaultPlan.parse("nan=tip:1@2s") == FaultPlan.parse("failed=tip:1@2s")
 
 
-def test_chips_break_in_every_way_all_or_a_share_of_the_time() -> None:
+def test_every_chip_fault_can_be_permanent_or_intermittent() -> None:
     text = ",".join(f"{kind}=skin:1@2s" for kind in TaxelFaultKind)
     assert [fault.kind for fault in FaultPlan.parse(text).taxels] == list(TaxelFaultKind)
     plan = FaultPlan.parse("zeros=skin:*:0.05@4s+2s,copy@1s+2s")
@@ -46,7 +46,7 @@ def test_chips_break_in_every_way_all_or_a_share_of_the_time() -> None:
     assert plan.copy == (Window(1, 2),)
 
 
-def test_no_text_is_no_fault() -> None:
+def test_empty_text_is_no_fault() -> None:
     assert FaultPlan.parse("") == FaultPlan()
     assert not FaultPlan.parse("").touches_wire
     assert FaultPlan.parse("loss=0.1").touches_wire

@@ -49,7 +49,7 @@ probability = st.sampled_from([0.0, 0.0, 0.02, 0.2])
     )
 )
 @settings(max_examples=60, deadline=None)
-def test_what_is_accepted_is_what_came_through_intact(plan: FaultPlan) -> None:
+def test_accepted_frames_are_the_intact_ones(plan: FaultPlan) -> None:
     wire, decoder = SerialWire(plan), SerialDecoder()
     sent = frames(100)
     received = [m for piece in carry(wire, sent) for m in decoder.feed(piece)]
@@ -81,7 +81,7 @@ def test_no_fault_changes_nothing() -> None:
         (FaultPlan(silence=(Window(1.0, 2.0),)), "silenced", 200, 200),
     ],
 )
-def test_every_fault_happens_as_often_as_told_and_is_counted(plan, counter, low, high) -> None:
+def test_every_fault_happens_at_its_rate_and_is_counted(plan, counter, low, high) -> None:
     wire = SerialWire(plan)
     carry(wire, frames(1000))
     assert low <= wire.counters[counter] <= high
@@ -125,7 +125,7 @@ def can_frames(n: int, fd: bool = False) -> list[CanFrame]:
     return [f for i in range(n) for f in encoder.encode(Log(20, i, "x" * 60))]
 
 
-def test_can_faults_are_counted_and_no_transfer_is_mixed() -> None:
+def test_can_faults_are_counted_and_transfers_never_mixed() -> None:
     plan = FaultPlan(
         seed=4, flip=1e-4, loss=0.01, duplicate=0.02, reorder=0.01, splice=0.005, delay=0.01
     )
@@ -144,7 +144,7 @@ def test_can_faults_are_counted_and_no_transfer_is_mixed() -> None:
     assert all(r.message.text == "x" * 60 for r in received)
 
 
-def test_flips_in_can_frames_are_caught() -> None:
+def test_bit_flips_in_can_frames_are_detected() -> None:
     wire, decoder = CanWire(FaultPlan(seed=1, flip=0.002)), CanDecoder()
     encoder = CanEncoder(3, True)
     for i in range(500):
@@ -157,7 +157,7 @@ def test_flips_in_can_frames_are_caught() -> None:
     assert intact <= decoder.counters["accepted"] <= intact + 10
 
 
-def test_bus_off_is_told_by_error_frames_and_ends() -> None:
+def test_bus_off_is_reported_by_error_frames_and_ends() -> None:
     wire = CanWire(FaultPlan(busoff=(Window(1.0, 0.5),)))
     data = can_frames(1)
     assert wire.pass_on(data, 0.9) == data

@@ -52,7 +52,7 @@ def acks(host) -> list[tuple[int, int, AckResult]]:
     return [(a.command, a.request, a.result) for a in host.of(Ack)]
 
 
-def test_board_boots_speaks_and_waits_to_be_started(talk) -> None:
+def test_board_boots_announces_itself_and_waits_for_start(talk) -> None:
     host = talk()
     host.run(1200)
     assert [type(r.message) for _, r in host.log] == [Log, Status]
@@ -93,7 +93,7 @@ def test_samples_carry_the_board_clock_of_their_start(serial) -> None:
     assert len(ticks) == 101
 
 
-def test_warm_clock_drifts(serial, calm) -> None:
+def test_board_clock_drifts_with_temperature(serial, calm) -> None:
     host = serial(clock=ClockParameters(error=0.0, error_per_k=-1e-3), environment=calm)
     host.run(300, {200: [ClockPoll(1)]})
     (cold,) = host.of(ClockReply)
@@ -133,7 +133,7 @@ def test_rate_is_set_within_limits(talk) -> None:
     assert host.of(Status)[0].rate_mhz == 50_000
 
 
-def test_gain_changes_scale_descriptor_and_counts_alike(serial, calm) -> None:
+def test_gain_changes_scale_descriptor_and_counts_together(serial, calm) -> None:
     host = serial(environment=calm)
     host.run(
         600, {200: [Start(1)], 400: [SetGain(2, 0, 1, 1, 0, 2), Identify(3)], 590: [Identify(4)]}
@@ -234,7 +234,7 @@ def test_board_streams_on_when_the_host_falls_silent(serial) -> None:
     assert host.sequences == list(range(780))
 
 
-def test_two_boards_on_a_bus_hear_what_is_theirs(real_skin, identity, host) -> None:
+def test_two_boards_on_a_bus_obey_their_own_commands(real_skin, identity, host) -> None:
     first = host(CanBoard(real_skin(), identity, node=1))
     second = host(CanBoard(real_skin(), identity, node=2))
     frames = CanEncoder(2, False).encode(Identify(1))
@@ -252,7 +252,7 @@ def test_two_boards_on_a_bus_hear_what_is_theirs(real_skin, identity, host) -> N
         ]
 
 
-def test_samples_of_a_press_show_it_where_it_is(serial, calm, tmp_path) -> None:
+def test_samples_show_a_press_at_its_position(serial, calm, tmp_path) -> None:
     script = tmp_path / "press.toml"
     script.write_text(
         "[[press]]\nposition_mm = [-24, -24, 0]\nnormal_n = 4\nstart_s = 0.5\nhold_s = 1\n"
@@ -267,7 +267,7 @@ def test_samples_of_a_press_show_it_where_it_is(serial, calm, tmp_path) -> None:
     assert host.board.skin.true_force[0, 2] == pytest.approx(-4.0, abs=0.2)
 
 
-def test_contacts_and_attitude_may_be_set_by_whoever_moves_the_board(serial) -> None:
+def test_contacts_and_attitude_can_be_set_from_outside(serial) -> None:
     host = serial()
     host.run(400, {200: [Start(1)]})
     host.board.contacts = [Contact(np.array([0.024, 0.024, 0.0]), np.array([0, 0, -3.0]))]
@@ -280,7 +280,7 @@ def test_contacts_and_attitude_may_be_set_by_whoever_moves_the_board(serial) -> 
     assert turned == pytest.approx(np.full(8, 86.6), abs=8)
 
 
-def test_rates_and_nodes_that_cannot_be_are_refused(real_skin, identity) -> None:
+def test_impossible_rates_and_nodes_are_refused(real_skin, identity) -> None:
     for rate in (0.0, -5.0, 400.0, float("nan")):
         with pytest.raises(ValueError, match="rate"):
             SerialBoard(real_skin(), identity, rate=rate)
@@ -288,14 +288,14 @@ def test_rates_and_nodes_that_cannot_be_are_refused(real_skin, identity) -> None
         CanBoard(real_skin(), identity, node=127)
 
 
-def test_time_does_not_go_back(serial) -> None:
+def test_backward_time_is_not_accepted(serial) -> None:
     host = serial()
     host.run(10)
     with pytest.raises(ValueError, match="back"):
         host.board.tick(Instant(5 * MS))
 
 
-def test_frame_times_on_the_bus() -> None:
+def test_frame_times_on_the_bus_match_the_literature() -> None:
     classic = CanEncoder(1, False).encode(ClockPoll(1))[0]
     assert len(classic.data) == 8
     # 131 bits without stuffing, at most a quarter more with it.
@@ -303,7 +303,7 @@ def test_frame_times_on_the_bus() -> None:
     assert OVERHEAD == 8
 
 
-def test_unread_can_frames_of_other_traffic_do_no_harm(real_skin, identity) -> None:
+def test_foreign_can_frames_are_harmless(real_skin, identity) -> None:
     board = CanBoard(real_skin(), identity, node=5)
     decoder = CanDecoder()
     foreign = CanEncoder(6, False).encode(Log(20, 0, "from another board"))

@@ -24,7 +24,7 @@ def stream(board: AnySkinBoard, until_ms: int) -> list[bytes]:
 
 
 @pytest.mark.parametrize("name", [name for name in SKETCHES if name != "anyskin"])
-def test_every_sketch_is_found_and_read(name: str) -> None:
+def test_every_sketch_format_is_detected_and_read(name: str) -> None:
     usual = AnySkinBoard(build_skin("anyskin", 3))
     fields = [r.message.field_ut for r in AnySkinDecoder().feed(b"".join(stream(usual, 800)))]
     board = AnySkinBoard(build_skin("anyskin", 3), write=writer_of(name, 5), banner=True)
@@ -43,7 +43,7 @@ def test_every_sketch_is_found_and_read(name: str) -> None:
     np.testing.assert_allclose(got[-1], fields[-1][:chips], atol=step)
 
 
-def test_a_layout_is_written_and_read() -> None:
+def test_layout_is_written_and_read() -> None:
     write = writer_of("int16:5txyz,big,start=aa55,check=sum", 5)
     board = AnySkinBoard(build_skin("anyskin", 3), write=write)
     watch = Survey()

@@ -50,7 +50,7 @@ def test_press_rises_holds_falls_and_repeats(script) -> None:
     assert indenter.duration == pytest.approx(9.0)
 
 
-def test_place_and_direction_on_the_skin(script) -> None:
+def test_press_position_and_direction_on_the_skin(script) -> None:
     (contact,) = load_script(script(PRESS)).contacts(2.0)
     left = finger().arrays[0]
     # 8.25, 8 mm from the middle of a 4 x 8 grid of 16.5 and 16 mm is a taxel.
@@ -63,14 +63,14 @@ def test_place_and_direction_on_the_skin(script) -> None:
     assert contact.radius == pytest.approx(0.006)
 
 
-def test_position_in_the_end_effectors_frame(script) -> None:
+def test_press_position_in_the_end_effector_frame(script) -> None:
     text = "[[press]]\nposition_mm = [60.0, -28.5, 4.0]\nnormal_n = 2\nramp_s = 0\n"
     (contact,) = load_script(script(text)).contacts(0.5)
     assert contact.position == pytest.approx([0.06, -0.0285, 0.004])
     assert contact.force == pytest.approx([0, 2, 0])
 
 
-def test_script_loops(script) -> None:
+def test_press_script_loops(script) -> None:
     indenter = load_script(script("loop_s = 10\n" + PRESS))
     assert normal_at(indenter, 2.0) == pytest.approx(normal_at(indenter, 42.0)) == 4
     assert indenter.contacts(2.0)[0].force == pytest.approx(indenter(12.0)[0].force)
@@ -82,13 +82,13 @@ def test_script_for_another_skin(script) -> None:
     assert contact.force == pytest.approx([-1, 0, 0])
 
 
-def test_the_example_works() -> None:
+def test_example_script_works() -> None:
     example = Path(__file__).resolve().parents[2] / "docs" / "press.toml"
     indenter = load_script(example)
     assert any(indenter.contacts(t / 10) for t in range(120))
 
 
-def test_the_example_for_the_five_chip_board_leaves_time_to_tare() -> None:
+def test_example_for_five_chips_leaves_time_to_tare() -> None:
     example = Path(__file__).resolve().parents[2] / "docs" / "press-anyskin.toml"
     indenter = load_script(example, anyskin())
     assert not any(indenter.contacts(t / 10) for t in range(50))

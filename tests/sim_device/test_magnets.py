@@ -20,7 +20,7 @@ def at(x: float, z: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("gap", "expected_mt"), [(4e-3, 10.2), (5e-3, 5.2)])
-def test_field_on_axis(gap: float, expected_mt: float) -> None:
+def test_field_on_axis_matches_the_dipole(gap: float, expected_mt: float) -> None:
     field = at(0, gap)
     assert field[2] / 1000 == pytest.approx(expected_mt, abs=0.05)
     # mu0/4pi * 2m/r^3
@@ -31,7 +31,9 @@ def test_field_on_axis(gap: float, expected_mt: float) -> None:
 @pytest.mark.parametrize(
     ("gap", "normal_mt_per_mm", "lateral_mt_per_mm"), [(4e-3, 8.0, 3.8), (5e-3, 3.25, 1.6)]
 )
-def test_gradients(gap: float, normal_mt_per_mm: float, lateral_mt_per_mm: float) -> None:
+def test_field_gradients_match_finite_differences(
+    gap: float, normal_mt_per_mm: float, lateral_mt_per_mm: float
+) -> None:
     normal = (at(0, gap - PRESS) - at(0, gap))[2] / (PRESS * 1e6)
     lateral = abs(at(PRESS, gap)[0]) / (PRESS * 1e6)
     assert normal == pytest.approx(normal_mt_per_mm, abs=0.05)
@@ -39,7 +41,7 @@ def test_gradients(gap: float, normal_mt_per_mm: float, lateral_mt_per_mm: float
 
 
 @pytest.mark.parametrize(("gap", "percent"), [(4e-3, (7.3, 1.7, 0.8)), (5e-3, (13.6, 3.5, 1.7))])
-def test_crosstalk_at_5_8_and_10_mm(gap: float, percent: tuple[float, ...]) -> None:
+def test_crosstalk_matches_at_5_8_and_10_mm(gap: float, percent: tuple[float, ...]) -> None:
     own = np.linalg.norm(at(0, gap - PRESS) - at(0, gap))
     for pitch, expected in zip((5e-3, 8e-3, 10e-3), percent, strict=True):
         other = np.linalg.norm(at(pitch, gap - PRESS) - at(pitch, gap))
@@ -51,7 +53,7 @@ def test_crosstalk_at_5_8_and_10_mm(gap: float, percent: tuple[float, ...]) -> N
     st.floats(-3, 3),
 )
 @settings(max_examples=30, deadline=None)
-def test_field_turns_with_its_source(axis: tuple[float, ...], angle: float) -> None:
+def test_field_rotates_with_its_source(axis: tuple[float, ...], angle: float) -> None:
     turn = rotation_about(np.array(axis) / np.linalg.norm(axis), angle)
     offset, moment = np.array([2e-3, 1e-3, -4e-3]), np.array([1e-3, 0, 3e-3])
     turned = dipole_field_ut(turn @ offset, turn @ moment)

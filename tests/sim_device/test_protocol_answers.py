@@ -43,7 +43,7 @@ def run(controller: Controller, start_ms: int, end_ms: int) -> list[Message]:
     return said
 
 
-def test_the_status_comes_before_anybody_asked_who_is_there() -> None:
+def test_status_is_sent_before_any_identify() -> None:
     said = run(board(), 0, 1500)
     assert any(isinstance(m, Status) for m in said)
     assert not any(isinstance(m, Descriptor | Samples) for m in said)
@@ -58,7 +58,7 @@ def test_the_status_comes_before_anybody_asked_who_is_there() -> None:
         SetGain(7, 255, 7, 0, 3, 7),  # too slow for 100 Hz
     ],
 )
-def test_a_gain_that_it_lacks_is_refused_and_nothing_changes(gain: SetGain) -> None:
+def test_unsupported_gain_is_refused_and_changes_nothing(gain: SetGain) -> None:
     controller = board()
     run(controller, 0, 500)
     before = controller.descriptor()
@@ -68,7 +68,7 @@ def test_a_gain_that_it_lacks_is_refused_and_nothing_changes(gain: SetGain) -> N
     assert controller.descriptor() == before
 
 
-def test_arrays_that_begin_together_carry_the_same_ticks() -> None:
+def test_arrays_sampled_together_carry_the_same_ticks() -> None:
     controller = board()
     run(controller, 0, 500)
     controller.handle(Start(1), Instant(500 * MS))
@@ -81,7 +81,7 @@ def test_arrays_that_begin_together_carry_the_same_ticks() -> None:
 
 
 @pytest.mark.parametrize("model", ["finger", "anyskin"])
-def test_a_press_makes_z_grow(model: str) -> None:
+def test_press_increases_z(model: str) -> None:
     skin = build_skin(model, 0)
     array = skin.geometry.arrays[0]
     middle = array.taxels // 2 if model == "finger" else 0
@@ -96,7 +96,7 @@ def test_a_press_makes_z_grow(model: str) -> None:
     assert counts[1][2] - counts[0][2] > 200
 
 
-def test_a_frame_with_bit_7_is_somebody_elses() -> None:
+def test_frame_with_bit_7_set_is_ignored() -> None:
     decoder = CanDecoder()
     (frame,) = CanEncoder(5, fd=True).encode(Identify(1))
     assert len(decoder.feed((frame,))) == 1

@@ -35,12 +35,12 @@ def change(model: SkinModel, force: np.ndarray) -> np.ndarray:
     return model.settled_field_ut(force, 25.0) - model.settled_field_ut(0 * force, 25.0)
 
 
-def test_rest_field_is_that_of_the_recordings(ideal_skin) -> None:
+def test_rest_field_matches_the_recordings(ideal_skin) -> None:
     rest = ideal_skin().settled_field_ut(np.zeros((16, 3)), 25.0)
     assert rest[:, 2] / 1000 == pytest.approx([10.2] * 16, abs=0.4)
 
 
-def test_sensitivity_is_that_of_real_skins(ideal_skin) -> None:
+def test_sensitivity_matches_real_skins(ideal_skin) -> None:
     model = ideal_skin()
     normal = change(model, press(model, 5, (0, 0, -1.0)))[5]
     shear = change(model, press(model, 5, (1.0, 0, 0)))[5]
@@ -75,7 +75,7 @@ def test_neighbours_feel_a_press_by_the_crosstalk_of_their_pitch(ideal_skin) -> 
     assert np.linalg.norm(felt[1]) / np.linalg.norm(felt[0]) == pytest.approx(0.0172, abs=2e-4)
 
 
-def test_turning_in_a_uniform_field_leaves_the_size_of_the_change(ideal_skin) -> None:
+def test_turning_in_a_uniform_field_preserves_the_change_magnitude(ideal_skin) -> None:
     model = ideal_skin()
     environment = Environment(
         EnvironmentParameters(gradient_ut_per_m=0, room_c=25, self_heating_k=0),
@@ -100,7 +100,7 @@ def test_each_effect_can_be_switched_off(flat_geometry, calm) -> None:
     assert np.array_equal(counts[:, 2], first[:, 2])
 
 
-def test_chip_yaw_is_undone_by_the_host() -> None:
+def test_chip_yaw_is_corrected_by_the_host() -> None:
     model = SkinModel(
         build_skin("anyskin", 0).geometry, SkinParameters().ideal(), np.random.default_rng(0)
     )
@@ -114,7 +114,7 @@ def test_chip_yaw_is_undone_by_the_host() -> None:
     assert in_chip == pytest.approx(np.array(expected_chip, float), abs=1e-9)
 
 
-def test_true_force_is_that_of_the_last_sample(real_skin, calm) -> None:
+def test_true_force_belongs_to_the_last_sample(real_skin, calm) -> None:
     model = real_skin()
     model.sample(
         Instant(0), [Contact(np.array([0.008, 0.008, 0]), np.array([0.3, 0, -2.0]))], calm.at(0)
@@ -124,7 +124,7 @@ def test_true_force_is_that_of_the_last_sample(real_skin, calm) -> None:
     assert not model.true_force.any()
 
 
-def test_time_does_not_go_back(real_skin, calm) -> None:
+def test_backward_time_is_not_accepted(real_skin, calm) -> None:
     model = real_skin()
     model.sample(Instant(MS), [], calm.at(0))
     with pytest.raises(ValueError, match="back"):
@@ -154,7 +154,7 @@ def calibrated() -> tuple[SkinModel, object]:
 
 @pytest.mark.parametrize(("newton", "bound"), [(0.5, 0.03), (1.0, 0.03), (2.0, 0.02), (5.0, 0.04)])
 @pytest.mark.parametrize("shear", [0.0, 0.3])
-def test_factory_calibration_gives_forces_back(calibrated, newton, bound, shear) -> None:
+def test_factory_calibration_recovers_forces(calibrated, newton, bound, shear) -> None:
     model, calibration = calibrated
     for array, taxels in zip(calibration.arrays, model.geometry.slices, strict=True):
         for i in range(0, array.geometry.taxels, 5):
@@ -177,7 +177,9 @@ def test_factory_calibration_knows_rest_field_and_drift(calibrated) -> None:
 
 @pytest.mark.parametrize(("hold_s", "bound"), [(0.3, 0.05), (2.0, 0.045), (10.0, 0.06)])
 @pytest.mark.parametrize("newton", [1.0, 5.0])
-def test_calibrated_force_of_a_real_press(calm, newton: float, hold_s: float, bound: float) -> None:
+def test_calibrated_force_of_a_press_is_accurate(
+    calm, newton: float, hold_s: float, bound: float
+) -> None:
     """Creep, hysteresis, curvature and noise together, over a hundred averaged samples."""
     model = build_skin("finger", 4)
     calibration = nominal_calibration(model, "00").arrays[0]
@@ -209,7 +211,7 @@ def test_calibration_measures_its_own_board_only() -> None:
     assert np.array_equal(ours.arrays[0].newton_per_ut, again.arrays[0].newton_per_ut)
 
 
-def test_calibration_leaves_the_skin_as_it_was() -> None:
+def test_calibration_does_not_change_the_skin() -> None:
     model, untouched = build_skin("finger", 5), build_skin("finger", 5)
     nominal_calibration(model, "00")
     at = Environment().at(0.0)

@@ -70,7 +70,7 @@ def wait(arm: SimulatedArm, seconds: float) -> list[ArmState]:
     return arm.advance(after(arm.now, seconds))
 
 
-def test_it_moves_as_commanded_and_reports_it(arm: SimulatedArm) -> None:
+def test_arm_moves_as_commanded_and_reports_it(arm: SimulatedArm) -> None:
     state = drive(arm, 1.0, Twist(0.04, -0.03, 0.2))[-1]
     assert state.twist.vx == pytest.approx(0.04, rel=1e-3)
     assert (state.x, state.y) == pytest.approx((-0.2 + 0.04, -0.03), abs=0.001)
@@ -80,7 +80,7 @@ def test_it_moves_as_commanded_and_reports_it(arm: SimulatedArm) -> None:
     assert (state.fx, state.fy, state.mz) == (0.0, 0.0, 0.0)
 
 
-def test_states_come_at_their_own_rate_without_commands(arm: SimulatedArm) -> None:
+def test_states_come_at_their_rate_without_commands(arm: SimulatedArm) -> None:
     states = wait(arm, 0.5)
     assert len(states) == 50
     steps = {b.captured - a.captured for a, b in pairwise(states)}
@@ -88,7 +88,7 @@ def test_states_come_at_their_own_rate_without_commands(arm: SimulatedArm) -> No
     assert {state.mode for state in states} == {"ready"}
 
 
-def test_uneven_polling_loses_and_doubles_nothing(build: Any) -> None:
+def test_uneven_polling_loses_and_repeats_nothing(build: Any) -> None:
     rng = np.random.default_rng(0)
     arm = arm_in(build.cupboard(), ArmSettings(state_rate=200))
     states = []
@@ -102,7 +102,7 @@ def test_uneven_polling_loses_and_doubles_nothing(build: Any) -> None:
     assert arm.now == stamps[-1]
 
 
-def test_time_does_not_run_backwards(arm: SimulatedArm) -> None:
+def test_backward_time_is_refused(arm: SimulatedArm) -> None:
     drive(arm, 0.1, FORWARD)
     before, pose = arm.now, arm.world.finger().x
     assert arm.advance(Instant(before - 50_000_000)) == []
@@ -111,7 +111,7 @@ def test_time_does_not_run_backwards(arm: SimulatedArm) -> None:
 
 
 @pytest.mark.parametrize("expiry", [0.02, DEFAULT_EXPIRY, MAX_EXPIRY, 10.0])
-def test_it_rests_within_100_ms_of_the_last_command(build: Any, expiry: float) -> None:
+def test_arm_rests_within_100_ms_of_the_last_command(build: Any, expiry: float) -> None:
     arm = arm_in(build.cupboard(), ArmSettings(state_rate=200))
     drive(arm, 0.5, FORWARD)
     arm.command(FORWARD, arm.now, expiry)
@@ -128,7 +128,7 @@ def test_it_rests_within_100_ms_of_the_last_command(build: Any, expiry: float) -
     assert wait(arm, 1.0)[-1].x == pytest.approx(x, abs=1e-6)
 
 
-def test_a_new_command_moves_a_stopped_arm_again(arm: SimulatedArm) -> None:
+def test_new_command_moves_a_stopped_arm_again(arm: SimulatedArm) -> None:
     drive(arm, 0.2, FORWARD)
     assert wait(arm, 0.2)[-1].mode == "stopped"
     assert drive(arm, 0.2, FORWARD)[-1].mode == "moving"
@@ -138,7 +138,7 @@ def test_a_new_command_moves_a_stopped_arm_again(arm: SimulatedArm) -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(vx=st.floats(-10, 10), vy=st.floats(-10, 10), omega=st.floats(-10, 10))
-def test_speeds_are_cut_to_the_limits_and_keep_their_direction(
+def test_speeds_are_limited_and_keep_their_direction(
     build: Any, vx: float, vy: float, omega: float
 ) -> None:
     arm = arm_in(build.cupboard())
@@ -153,7 +153,7 @@ def test_speeds_are_cut_to_the_limits_and_keep_their_direction(
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_a_command_that_is_no_number_stops_it(arm: SimulatedArm, bad: float) -> None:
+def test_non_finite_command_stops_the_arm(arm: SimulatedArm, bad: float) -> None:
     for twist in (Twist(bad, 0, 0), Twist(0, bad, 0), Twist(0, 0, bad)):
         drive(arm, 0.1, FORWARD)
         assert not arm.command(twist, arm.now)
@@ -165,7 +165,7 @@ def test_a_command_that_is_no_number_stops_it(arm: SimulatedArm, bad: float) -> 
     assert (arm.counters["not_finite"], arm.counters["bad_expiry"]) == (3, 3)
 
 
-def test_the_wrench_never_stays_above_the_confirmed_limit(build: Any) -> None:
+def test_wrench_never_stays_above_the_confirmed_limit(build: Any) -> None:
     tip = FINGER_OUTLINE[3][0]
     arm = arm_in(build.cupboard(start=Pose(0.375 - tip - 0.01, 0.0, 0.0)))
     for limit in (5.0, 10.0):
@@ -187,7 +187,7 @@ def test_limits_are_confirmed_by_every_state(build: Any) -> None:
     assert ArmLimits(state.v_max, state.omega_max, state.f_max, state.m_max) == confirmed
 
 
-def test_refused_limits_show_in_the_answer_and_the_state(build: Any) -> None:
+def test_refused_limits_show_in_reply_and_state(build: Any) -> None:
     arm = arm_in(build.cupboard(), limits=None)
     arm.inject(ArmFault.REFUSES_LIMITS)
     assert arm.request_limits(LIMITS) == FACTORY_LIMITS
@@ -196,7 +196,7 @@ def test_refused_limits_show_in_the_answer_and_the_state(build: Any) -> None:
     assert arm.request_limits(LIMITS) == LIMITS
 
 
-def test_a_silent_arm_sends_nothing_and_moves_on(arm: SimulatedArm) -> None:
+def test_silent_arm_sends_nothing_but_keeps_moving(arm: SimulatedArm) -> None:
     drive(arm, 0.1, FORWARD)
     arm.inject(ArmFault.SILENT)
     x = arm.world.finger().x
@@ -207,7 +207,7 @@ def test_a_silent_arm_sends_nothing_and_moves_on(arm: SimulatedArm) -> None:
     assert state.captured == arm.now
 
 
-def test_a_frozen_state_has_fresh_stamps_and_old_values(arm: SimulatedArm) -> None:
+def test_frozen_state_has_fresh_stamps_and_old_values(arm: SimulatedArm) -> None:
     last = drive(arm, 0.1, FORWARD)[-1]
     arm.inject(ArmFault.FROZEN)
     states = drive(arm, 0.2, FORWARD)
@@ -217,7 +217,7 @@ def test_a_frozen_state_has_fresh_stamps_and_old_values(arm: SimulatedArm) -> No
     assert arm.world.finger().x > last.x + 0.005
 
 
-def test_a_stale_state_has_old_stamps_too(arm: SimulatedArm) -> None:
+def test_stale_state_has_old_stamps(arm: SimulatedArm) -> None:
     last = drive(arm, 0.1, FORWARD)[-1]
     arm.inject(ArmFault.STALE)
     states = drive(arm, 0.2, FORWARD)
@@ -233,7 +233,7 @@ def test_a_stale_state_has_old_stamps_too(arm: SimulatedArm) -> None:
         (ArmFault.FAST, (0.05, -0.025, 0.5)),
     ],
 )
-def test_an_arm_that_is_mounted_wrongly_moves_otherwise(
+def test_wrongly_mounted_arm_deviates(
     fault: ArmFault, went: tuple[float, float, float], arm: SimulatedArm
 ) -> None:
     """And says so: its state is true, its limits do not help."""
@@ -256,7 +256,7 @@ def test_states_echo_the_command_in_force(arm: SimulatedArm) -> None:
     assert wait(arm, 0.3)[-1].echo == second, "the last that was, although it is over"
 
 
-def test_a_biased_force_sensor_is_biased_in_its_own_frame(build: Any) -> None:
+def test_force_bias_is_in_the_sensor_frame(build: Any) -> None:
     turned = build.cupboard(start=Pose(-0.2, 0.0, math.pi / 2))
     arm = arm_in(turned, ArmSettings(bias=(3.0, 0.0, 0.1)))
     arm.inject(ArmFault.BIASED)
@@ -268,7 +268,7 @@ def test_a_biased_force_sensor_is_biased_in_its_own_frame(build: Any) -> None:
 
 
 @pytest.mark.parametrize("fault", [ArmFault.ESTOP, ArmFault.FAULT])
-def test_a_stop_latches_until_an_operator_enables(arm: SimulatedArm, fault: ArmFault) -> None:
+def test_stop_latches_until_the_operator_enables(arm: SimulatedArm, fault: ArmFault) -> None:
     drive(arm, 0.2, FORWARD)
     arm.inject(fault)
     state = drive(arm, 0.05, FORWARD)[-1]
@@ -285,7 +285,7 @@ def test_a_stop_latches_until_an_operator_enables(arm: SimulatedArm, fault: ArmF
     assert drive(arm, 0.1, FORWARD)[-1].mode == "moving"
 
 
-def test_the_e_stop_outranks_a_fault(arm: SimulatedArm) -> None:
+def test_emergency_stop_outranks_a_fault(arm: SimulatedArm) -> None:
     arm.inject(ArmFault.ESTOP)
     arm.inject(ArmFault.FAULT)
     assert arm.mode == "estop"
@@ -308,7 +308,7 @@ def test_latency_delays_commands_and_states(build: Any) -> None:
     assert slow.world.finger().x == -0.2
 
 
-def test_noise_has_the_given_spread_and_the_seeds_bits(build: Any) -> None:
+def test_noise_has_its_spread_and_is_seeded(build: Any) -> None:
     noisy = ArmSettings(
         position_noise=1e-4, heading_noise=1e-3, speed_noise=2e-3, turn_noise=3e-3,
         force_noise=0.1, moment_noise=0.02,
@@ -354,20 +354,20 @@ def test_buffers_are_bounded_and_losses_counted(build: Any) -> None:
         {"bias": (math.nan, 0.0, 0.0)},
     ],
 )
-def test_settings_no_arm_has_are_refused(change: dict[str, Any]) -> None:
+def test_impossible_arm_settings_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(change))):
         ArmSettings(**change)
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
 @pytest.mark.parametrize("name", ["v_max", "omega_max", "f_max", "m_max"])
-def test_limits_that_do_not_limit_are_refused(name: str, bad: float) -> None:
+def test_useless_limits_are_refused_by_the_arm(name: str, bad: float) -> None:
     figures = {"v_max": 0.05, "omega_max": 0.3, "f_max": 10.0, "m_max": 1.5, name: bad}
     with pytest.raises(ValueError, match=name):
         ArmLimits(**figures)
 
 
-def test_a_trial_is_a_function_of_its_seed(build: Any) -> None:
+def test_trial_is_a_function_of_its_seed(build: Any) -> None:
     def trial() -> list[ArmState]:
         scene = build.cupboard(build.box(0.05, 0.005), build.disc(0.12, -0.01))
         arm = arm_in(scene, ArmSettings(force_noise=0.1, command_latency=0.003))

@@ -51,7 +51,7 @@ def test_pushed_objects_end_in_the_same_place(
     assert np.abs(mine[:, :2] - theirs[:, :2]).max() < 0.003
 
 
-def test_both_say_the_same_of_a_push_into_the_corner(build: Any) -> None:
+def test_both_engines_agree_on_a_push_into_the_corner(build: Any) -> None:
     scene = build.cupboard(build.box(0.375 - 0.021, 0.0), start=Pose(0.17, 0.0, 0.0))
     wrenches = []
     for engine in (MujocoWorld, PymunkWorld):

@@ -19,7 +19,7 @@ def squeezed() -> list[Scene]:
     return [authors_sim(seed) for seed in SEEDS]
 
 
-def test_fill_is_that_of_the_simulator(squeezed: list[Scene]) -> None:
+def test_fill_matches_the_authors_simulator(squeezed: list[Scene]) -> None:
     fill = [scene.fill for scene in squeezed]
     # 0.37 over 88 scenes, from 0.26 to 0.53; the standard error over 24 is 0.014.
     assert np.mean(fill) == pytest.approx(0.37, abs=0.04)
@@ -27,7 +27,7 @@ def test_fill_is_that_of_the_simulator(squeezed: list[Scene]) -> None:
     assert max(fill) < 0.6
 
 
-def test_objects_are_of_the_simulators_kind(squeezed: list[Scene]) -> None:
+def test_object_kinds_match_the_authors_simulator(squeezed: list[Scene]) -> None:
     for scene in squeezed:
         assert 20 <= len(scene.objects) <= 30
         for item in scene.objects:
@@ -40,7 +40,7 @@ def test_objects_are_of_the_simulators_kind(squeezed: list[Scene]) -> None:
     assert np.mean(discs) == pytest.approx(0.41, abs=0.07)  # as in the recorded scenes
 
 
-def test_some_stick_out_at_the_front_and_into_the_back_wall(squeezed: list[Scene]) -> None:
+def test_some_objects_overlap_front_edge_and_back_wall(squeezed: list[Scene]) -> None:
     front = [[o.x - o.half_extent[0] for o in scene.objects] for scene in squeezed]
     back = [[o.x + o.half_extent[0] - scene.depth for o in scene.objects] for scene in squeezed]
     assert np.mean([sum(e < 0 for e in row) for row in front]) == pytest.approx(3.1, abs=1.5)
@@ -49,7 +49,7 @@ def test_some_stick_out_at_the_front_and_into_the_back_wall(squeezed: list[Scene
     assert max(max(row) for row in back) < 0.0105
 
 
-def test_objects_pile_up_at_the_edges(squeezed: list[Scene]) -> None:
+def test_objects_accumulate_at_the_edges(squeezed: list[Scene]) -> None:
     x = [10 * o.x for scene in squeezed for o in scene.objects]
     y = [10 * o.y for scene in squeezed for o in scene.objects]
     # Counts of the authors' simulator over 88 scenes (2,221 objects).
@@ -62,7 +62,7 @@ def test_objects_pile_up_at_the_edges(squeezed: list[Scene]) -> None:
     assert np.abs(share_y - of_y).max() < 0.05
 
 
-def test_nothing_overlaps_by_more_than_the_simulator_lets_it(squeezed: list[Scene]) -> None:
+def test_overlaps_stay_within_those_of_the_simulator(squeezed: list[Scene]) -> None:
     for scene in squeezed:
         discs = [o for o in scene.objects if o.shape is Shape.DISC]
         for a, b in combinations(discs, 2):
@@ -72,12 +72,12 @@ def test_nothing_overlaps_by_more_than_the_simulator_lets_it(squeezed: list[Scen
 
 
 @pytest.mark.parametrize("name", ["authors_sim", "hardware"])
-def test_the_same_seed_gives_the_same_bits(name: str) -> None:
+def test_same_seed_gives_identical_scenes(name: str) -> None:
     assert generate(name, 7).to_json() == generate(name, 7).to_json()
     assert generate(name, 7) != generate(name, 8)
 
 
-def test_start_and_goal_lie_where_the_simulator_puts_them(squeezed: list[Scene]) -> None:
+def test_start_and_goal_match_the_authors_simulator(squeezed: list[Scene]) -> None:
     for scene in squeezed:
         assert (scene.start.x, scene.start.heading) == (-0.2, 0.0)
         assert abs(scene.start.y) <= 0.15
@@ -87,7 +87,7 @@ def test_start_and_goal_lie_where_the_simulator_puts_them(squeezed: list[Scene])
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_the_grid_is_that_of_the_bench(seed: int) -> None:
+def test_grid_scene_matches_the_bench(seed: int) -> None:
     scene = hardware(seed)
     assert (scene.depth, scene.width) == (0.38, 0.53)
     assert 15 <= len(scene.objects) <= 22
@@ -105,7 +105,7 @@ def test_the_grid_is_that_of_the_bench(seed: int) -> None:
     assert all(gap(a, b) > 0 for a, b in combinations(scene.objects, 2))
 
 
-def test_an_unknown_generator_is_refused_with_those_there_are() -> None:
+def test_unknown_generator_lists_available_ones() -> None:
     with pytest.raises(ValueError, match=r"kitchen.*authors_sim, hardware"):
         generate("kitchen", 1)
     with pytest.raises(ValueError, match="-1"):

@@ -18,7 +18,7 @@ BACK, FRONT = FINGER_OUTLINE[0][0], FINGER_OUTLINE[3][0]
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.7, math.pi / 2])
-def test_the_finger_is_drawn_from_its_back_to_its_front(build: Any, heading: float) -> None:
+def test_finger_marker_spans_back_to_front(build: Any, heading: float) -> None:
     scene = build.cupboard(start=Pose(0.1, 0.02, heading))
     (finger,) = (m for m in scene_markers(MujocoWorld(scene), 0).markers if m.ns == "finger")
     half = (FRONT - BACK) / 2
@@ -29,7 +29,7 @@ def test_the_finger_is_drawn_from_its_back_to_its_front(build: Any, heading: flo
     assert (x - half * c, y - half * s) == pytest.approx((0.1 + BACK * c, 0.02 + BACK * s))
 
 
-def test_a_finger_of_another_width_is_drawn_so(build: Any) -> None:
+def test_finger_marker_has_the_finger_width(build: Any) -> None:
     narrow = replace(world_parameters("authors_sim"), finger_width=0.04)
     world = MujocoWorld(build.cupboard(), narrow)
     (finger,) = (m for m in scene_markers(world, 0).markers if m.ns == "finger")

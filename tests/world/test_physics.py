@@ -43,7 +43,7 @@ def run(world: World, seconds: float, twist: Twist) -> None:
 
 @pytest.mark.parametrize("mass", [0.25, 0.75])
 @pytest.mark.parametrize("shape", ["disc", "box"])
-def test_a_block_starts_to_slide_at_mu_m_g(
+def test_block_starts_to_slide_at_mu_m_g(
     engine: Engine, build: Any, shape: str, mass: float
 ) -> None:
     item = {"disc": build.disc, "box": build.box}[shape](0.15, 0.0, mass=mass)
@@ -66,7 +66,7 @@ def test_a_block_starts_to_slide_at_mu_m_g(
 
 
 @pytest.mark.parametrize("limit", [5.0, 10.0, 15.0])
-def test_a_push_against_the_wall_plateaus_at_the_arms_limit(
+def test_push_against_the_wall_plateaus_at_the_arm_limit(
     engine: Engine, build: Any, limit: float
 ) -> None:
     world = engine(build.cupboard(start=Pose(0.375 - TIP - 0.02, 0.0, 0.0)))
@@ -84,7 +84,7 @@ def test_a_push_against_the_wall_plateaus_at_the_arms_limit(
         assert abs(contact.y) <= 0.00353 + SKIN
 
 
-def test_an_object_jammed_against_the_wall_bears_the_limit_too(engine: Engine, build: Any) -> None:
+def test_jammed_object_bears_the_arm_limit(engine: Engine, build: Any) -> None:
     item = build.box(0.375 - 0.0201, 0.0)
     world = engine(build.cupboard(item, start=Pose(item.x - 0.02 - TIP - 0.005, 0.0, 0.0)))
     run(world, 1.0, FORWARD)
@@ -93,7 +93,7 @@ def test_an_object_jammed_against_the_wall_bears_the_limit_too(engine: Engine, b
     assert world.poses()[0, 0] + 0.02 == pytest.approx(0.375, abs=0.0005)
 
 
-def test_a_sliding_object_stops_after_v2_over_2_mu_g(build: Any) -> None:
+def test_sliding_object_stops_after_v2_over_2_mu_g(build: Any) -> None:
     for item in (build.disc(0.1, 0.0), build.box(0.1, 0.0)):
         world = MujocoWorld(build.cupboard(item))
         world.data.qvel[0] = speed = 0.1
@@ -102,7 +102,7 @@ def test_a_sliding_object_stops_after_v2_over_2_mu_g(build: Any) -> None:
         assert world.poses()[0, 0] - 0.1 == pytest.approx(way, rel=0.03)
 
 
-def test_a_spinning_object_stops_after_w2_over_2_alpha(build: Any) -> None:
+def test_spinning_object_stops_after_w2_over_2_alpha(build: Any) -> None:
     disc = build.disc(0.1, 0.0)
     world = MujocoWorld(build.cupboard(disc))
     world.data.qvel[3] = spin = 3.0
@@ -122,7 +122,7 @@ def test_mean_lever_is_the_mean_distance_from_the_centre(build: Any) -> None:
     assert mean_lever(build.box(0, 0, size=(0.04, 0.04))) == pytest.approx(0.383 * 0.04, rel=2e-3)
 
 
-def test_no_energy_comes_from_nowhere(engine: Engine) -> None:
+def test_energy_is_never_created(engine: Engine) -> None:
     scene = authors_sim(3)
     # Bullet's world leaves objects in the walls, as its users do, and they are shot out.
     scene = replace(scene, objects=settled(scene, world_parameters("authors_sim")))
@@ -145,7 +145,7 @@ def test_no_energy_comes_from_nowhere(engine: Engine) -> None:
     assert world.motor_work > 0
 
 
-def test_what_nobody_touches_stays_where_it_is(engine: Engine) -> None:
+def test_untouched_objects_stay_in_place(engine: Engine) -> None:
     world = engine(authors_sim(4))
     before = world.poses()
     run(world, 2.0, ZERO)
@@ -171,7 +171,7 @@ def test_same_commands_same_bits() -> None:
 @pytest.mark.parametrize(
     ("y", "twist", "normal"), [(0.1, Twist(0, 0.05, 0), 1.0), (-0.1, Twist(0, -0.05, 0), -1.0)]
 )
-def test_a_side_touch_is_felt_where_it_is(
+def test_side_touch_is_located_correctly(
     engine: Engine, build: Any, y: float, twist: Twist, normal: float
 ) -> None:
     world = engine(build.cupboard(build.disc(0.17, y), start=Pose(0.12, 0.0, 0.0)))
@@ -277,7 +277,7 @@ def test_objects_pushed_past_the_front_edge_fall_and_are_counted(
     assert world.ejected == 1
 
 
-def test_objects_that_overlap_a_wall_are_moved_out_and_not_shot(build: Any) -> None:
+def test_objects_overlapping_a_wall_are_moved_out_gently(build: Any) -> None:
     scene = build.cupboard(build.disc(0.375 - 0.03, 0.0), build.disc(0.1, 0.1))
     world = MujocoWorld(scene)
     assert world.poses()[0, 0] == pytest.approx(0.375 - 0.04, abs=0.001)
@@ -301,7 +301,7 @@ def test_misuse_is_refused(engine: Engine, build: Any) -> None:
 
 
 @pytest.mark.parametrize("name", ["hardware", "authors_sim"])
-def test_a_free_finger_follows_its_command(name: str, build: Any) -> None:
+def test_free_finger_follows_its_command(name: str, build: Any) -> None:
     parameters = WORLD_PARAMETERS[name]
     world = MujocoWorld(build.cupboard(), parameters)
     v, w = parameters.limits.v_max, parameters.limits.omega_max
@@ -319,7 +319,7 @@ def test_a_free_finger_follows_its_command(name: str, build: Any) -> None:
     assert limits.m_max * 0.005 / parameters.finger_inertia <= w / 2 * (1 + 1e-9)
 
 
-def test_a_finger_that_starts_turned_is_turned(engine: Engine, build: Any) -> None:
+def test_finger_start_heading_is_respected(engine: Engine, build: Any) -> None:
     # Turned to the left, its tip is where the disc is.
     start = Pose(0.1, 0.0, math.pi / 2)
     world = engine(build.cupboard(build.disc(0.1, TIP + 0.042), start=start))
@@ -330,7 +330,7 @@ def test_a_finger_that_starts_turned_is_turned(engine: Engine, build: Any) -> No
     assert all(contact.x == pytest.approx(TIP, abs=1e-3) for contact in contacts)
 
 
-def test_physics_that_diverges_is_an_error_and_leaves_no_file(
+def test_diverging_physics_is_an_error_and_leaves_no_file(
     build: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -35,7 +35,7 @@ def test_sixty_scenes_at_true_scale(authors: Path) -> None:
     assert np.mean([scene.fill for scene in scenes]) == pytest.approx(0.37, abs=0.005)
 
 
-def test_outcomes_have_the_published_rates(authors: Path) -> None:
+def test_outcomes_match_the_published_rates(authors: Path) -> None:
     outcomes = load_outcomes(authors / "outcomes_1_60.csv")
     rates = {"straight": 33, "burrow": 60, "excavate": 40, "clock": 47, "event": 63}
     for strategy, rate in rates.items():
@@ -45,7 +45,7 @@ def test_outcomes_have_the_published_rates(authors: Path) -> None:
     assert all((o.entered_step is not None) == o.entered for o in outcomes)
 
 
-def test_straight_reaches_end_as_they_did_there(
+def test_straight_reaches_end_as_recorded(
     authors: Path, reach_straight: Callable[..., Any]
 ) -> None:
     """Four scenes of sixty; over all sixty 19 succeed, 20 there, and 55 end alike."""
@@ -60,7 +60,7 @@ def test_straight_reaches_end_as_they_did_there(
     assert agreed >= 3  # one in twelve differs
 
 
-def test_a_recorded_scene_is_the_one_that_was_made(recorded: Path) -> None:
+def test_recorded_scene_is_read_as_made(recorded: Path) -> None:
     """At true scale and in our axes, to the millionth that the file keeps."""
     scenes = load_recorded(recorded / "scenes_5_8.json.gz")
     assert [scene.seed for scene in scenes] == [5, 6, 7, 8]
@@ -76,7 +76,7 @@ def test_a_recorded_scene_is_the_one_that_was_made(recorded: Path) -> None:
             assert np.cos(one.yaw - other.yaw) == pytest.approx(1.0)
 
 
-def test_outcomes_say_what_happened_in_the_scenes(
+def test_outcomes_are_consistent_with_the_scenes(
     recorded: Path, reach_straight: Callable[..., Any]
 ) -> None:
     scenes = {s.seed: s for s in load_recorded(recorded / "scenes_5_8.json.gz")}
@@ -107,14 +107,14 @@ ENTRY: dict[str, Any] = {
 }  # fmt: skip
 
 
-def test_a_scene_file_made_by_hand(tmp_path: Path) -> None:
+def test_hand_written_scene_file_is_read(tmp_path: Path) -> None:
     (scene,) = load_recorded(write(tmp_path / "scenes.json.gz", ENTRY))
     assert scene.start == Pose(-0.2, 0.05, 0.0)
     assert scene.goal == pytest.approx((0.358, -0.1))
     assert scene.objects[0].yaw == pytest.approx(2 * np.arctan2(0.6, 0.8))
 
 
-def test_damaged_files_are_refused_by_name(tmp_path: Path) -> None:
+def test_damaged_scene_files_are_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="missing"):
         load_recorded(tmp_path / "missing.json.gz")
     (tmp_path / "plain.json.gz").write_text("{}")

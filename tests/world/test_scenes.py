@@ -40,20 +40,20 @@ def objects(draw: st.DrawFn) -> SceneObject:
         objects=st.lists(objects(), max_size=5).map(tuple),
     )
 )
-def test_a_scene_survives_json_to_the_last_bit(scene: Scene) -> None:
+def test_scene_round_trips_through_json_exactly(scene: Scene) -> None:
     again = Scene.from_json(scene.to_json())
     assert again == scene
     assert again.to_json() == scene.to_json()
 
 
-def test_fill_is_footprint_over_cupboard(build: Any) -> None:
+def test_fill_is_footprint_area_over_cupboard_area(build: Any) -> None:
     scene = build.cupboard(
         build.box(0.1, 0.0, size=(0.04, 0.05)), build.disc(0.2, 0.1, radius=0.03)
     )
     assert scene.fill == pytest.approx((0.002 + math.pi * 0.0009) / (0.375 * 0.55))
 
 
-def test_half_extent_of_a_turned_box(build: Any) -> None:
+def test_half_extent_of_a_rotated_box(build: Any) -> None:
     turned = build.box(0, 0, size=(0.04, 0.02), yaw=math.pi / 2)
     assert turned.half_extent == pytest.approx((0.01, 0.02))
 
@@ -69,7 +69,7 @@ def test_half_extent_of_a_turned_box(build: Any) -> None:
         ({"shape": Shape.DISC, "size_x": 0.05}, "one diameter"),
     ],
 )
-def test_objects_that_cannot_be_are_refused(change: dict[str, Any], says: str) -> None:
+def test_impossible_objects_are_refused(change: dict[str, Any], says: str) -> None:
     figures: dict[str, Any] = {
         "shape": Shape.BOX, "size_x": 0.04, "size_y": 0.04, "height": 0.07, "mass": 0.5,
         "x": 0.1, "y": 0.0, "yaw": 0.0,
@@ -78,7 +78,7 @@ def test_objects_that_cannot_be_are_refused(change: dict[str, Any], says: str) -
         SceneObject(**{**figures, **change})
 
 
-def test_a_scene_names_a_parameter_set_that_exists(build: Any) -> None:
+def test_scene_must_name_an_existing_parameter_set(build: Any) -> None:
     raw = json.loads(build.cupboard().to_json())
     raw["parameters"] = "kitchen"
     with pytest.raises(SceneError, match=r"kitchen.*authors_sim, hardware"):
@@ -100,6 +100,6 @@ def test_too_many_objects_are_refused(build: Any) -> None:
         ('{"format": 1, "goal": 3}', "damaged"),
     ],
 )
-def test_damaged_json_is_refused_with_the_reason(text: str, says: str) -> None:
+def test_damaged_json_is_refused_with_a_reason(text: str, says: str) -> None:
     with pytest.raises(SceneError, match=says):
         Scene.from_json(text)

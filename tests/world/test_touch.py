@@ -22,7 +22,7 @@ def left_touch(body: int, force: float = -2.0) -> FingerContact:
     return FingerContact(0.07, 0.0285, 0.0, 1.0, 0.3, force, body)
 
 
-def test_the_line_bears_the_whole_force_at_the_height_of_the_object(build: Any) -> None:
+def test_contact_line_bears_the_whole_force_at_object_height(build: Any) -> None:
     scene = build.cupboard(build.box(0.1, 0.1))  # 70 mm high, on the shelf
     felt = on_skin([left_touch(0)], scene)
     assert sum(c.force for c in felt) == pytest.approx([0.3, -2.0, 0.0])
@@ -34,7 +34,7 @@ def test_the_line_bears_the_whole_force_at_the_height_of_the_object(build: Any) 
     assert all(c.position[:2].tolist() == [0.07, 0.0285] for c in felt)
 
 
-def test_a_wall_is_felt_over_the_whole_height_and_a_coaster_not_at_all(build: Any) -> None:
+def test_wall_is_felt_over_the_full_height_and_a_coaster_not_at_all(build: Any) -> None:
     low = build.box(0.1, 0.1)
     low = type(low)(low.shape, low.size_x, low.size_y, 0.01, low.mass, low.x, low.y, low.yaw)
     scene = build.cupboard(low)
@@ -44,7 +44,7 @@ def test_a_wall_is_felt_over_the_whole_height_and_a_coaster_not_at_all(build: An
     assert np.ptp([c.position[2] for c in wall]) > FINGER_HEIGHT / 2
 
 
-def test_pressure_on_the_taxels_is_the_force_of_the_contact(build: Any) -> None:
+def test_taxel_pressure_sums_to_the_contact_force(build: Any) -> None:
     """The chain's first links: physics to contacts to taxels, in newtons."""
     world = MujocoWorld(build.cupboard(build.disc(0.17, 0.1), start=Pose(0.1, 0.0, 0.0)))
     for _ in range(150):
@@ -61,7 +61,7 @@ def test_pressure_on_the_taxels_is_the_force_of_the_contact(build: Any) -> None:
     assert -force[left, 2].sum() == pytest.approx(normal, rel=0.05)
 
 
-def test_touches_of_one_body_close_together_are_one_contact() -> None:
+def test_nearby_touches_of_one_body_are_one_contact() -> None:
     upper = (3, 0.05, 0.0285, 0.0, 1.0, 0.1, -1.0)
     lower = (3, 0.05, 0.0285, 0.0, 1.0, 0.3, -3.0)
     far = (3, 0.09, 0.0285, 0.0, 1.0, 0.0, -2.0)

@@ -1,0 +1,162 @@
+"""An arm that obeys twists without inertia, on a bus of its own."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import zenoh
+
+from tactile_core.bus.commanding import (
+    CommandDesk,
+    LimitsRequest,
+    NotGrantedError,
+    Order,
+    limits_fields,
+    serve_desk,
+)
+from tactile_core.bus.messages import MSG, codec, header
+from tactile_core.bus.services import ServiceError, declare_service
+from tactile_core.bus.session import BusConfig, close_session, open_session
+from tactile_core.bus.streams import declare_publisher
+from tactile_core.bus.topics import ARM_STATE, COMMAND, service_key
+from tactile_core.types import ArmLimits, WallClock, monotonic_now
+
+
+@dataclass(frozen=True)
+class Heard:
+    """A command and when it came, in s of the monotonic clock."""
+
+    at: float
+    vx: float
+    vy: float
+    omega: float
+    order: Order
+
+    @property
+    def still(self) -> bool:
+        return self.vx == self.vy == self.omega == 0.0
+
+
+class FakeArm:
+    """Obeys twists without inertia, each until it expires; its tip starts at the shelf's edge."""
+
+    def __init__(self, endpoint: str, name: str = "arm") -> None:
+        self.name = name
+        self.x, self.y, self.heading = -0.158, 0.0, 0.0
+        self.force = (0.0, 0.0, 0.0)
+        self.mode = "ready"
+        self.paused = False
+        self.does = lambda speed: speed  # what it makes of the speed that it is told
+        self.frozen: Any = None  # a state whose values are repeated under fresh stamps
+        self.deaf_to_limits = False
+        self.limits = ArmLimits(0.5, 1.0, 100.0, 20.0)
+        self.heard: list[Heard] = []
+        self.travelled = 0.0
+        self.session = open_session(BusConfig(listen=(endpoint,), connect=()))
+        self._wall = WallClock.take()
+        self._stopping = threading.Event()
+        self._key = COMMAND.key(name)
+        self.desk = CommandDesk()
+        self._subscriber = self.session.declare_subscriber(self._key, self._hear)
+        key = service_key(name, "limits", "arm")
+        self._services = serve_desk(self.session, name, self.desk)
+        self._services.append(declare_service(self.session, key, self._limit, LimitsRequest))
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    @property
+    def moving(self) -> bool:
+        return self.speed != (0.0, 0.0, 0.0)
+
+    @property
+    def speed(self) -> tuple[float, float, float]:
+        last = self.heard[-1] if self.heard else None
+        if last is None or monotonic_now() >= last.order.expires or self.mode in ("estop", "fault"):
+            return (0.0, 0.0, 0.0)
+        vx, vy, omega = self.does((last.vx, last.vy, last.omega))
+        return (vx, vy, omega)
+
+    def close(self) -> None:
+        self._stopping.set()
+        self._thread.join()
+        close_session(self.session)
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        now = monotonic_now()
+        if self.desk.hear(sample.payload.to_bytes(), now) is not None:
+            return
+        order = self.desk.newest(now)
+        if order is None:  # it expired while this thread waited for the machine
+            return
+        twist = order.twist
+        heard = Heard(time.monotonic(), twist.vx, twist.vy, twist.omega, order)
+        assert all(math.isfinite(v) for v in (heard.vx, heard.vy, heard.omega))
+        self.heard.append(heard)
+
+    def _limit(self, request: LimitsRequest) -> ArmLimits:
+        try:
+            self.desk.authorise("limits", request, monotonic_now(), **limits_fields(request.limits))
+        except NotGrantedError as error:
+            raise ServiceError(str(error)) from error
+        if not self.deaf_to_limits:
+            self.limits = request.limits
+        return self.limits
+
+    def _run(self) -> None:
+        publisher = declare_publisher(self.session, ARM_STATE, self.name)
+        sequence, last = 0, time.monotonic()
+        while not self._stopping.wait(0.005):
+            now = time.monotonic()
+            vx, vy, omega = self.speed
+            self.x += vx * (now - last)
+            self.y += vy * (now - last)
+            self.heading += omega * (now - last)
+            self.travelled += math.hypot(vx, vy) * (now - last)
+            last = now
+            if not self.paused:
+                sequence += 1
+                data = codec().encode(ARM_STATE, self._state(sequence))
+                publisher.put(data, self._wall.wall_ns(monotonic_now()))
+
+    def freeze(self) -> None:
+        """Go on reporting what is the case now, whatever happens."""
+        self.frozen = self._state(0)
+
+    def _state(self, sequence: int) -> Any:
+        now, limits = monotonic_now(), self.limits
+        if self.frozen is not None:
+            stamp = header(self._wall.wall_ns(now), "cupboard")
+            return replace(
+                self.frozen, header=stamp, captured_ns=now, sequence=sequence, **self._echo()
+            )
+        vx, vy, omega = self.speed
+        fx, fy, mz = self.force
+        return MSG.ArmState(
+            header=header(self._wall.wall_ns(now), "cupboard"),
+            captured_ns=now,
+            sequence=sequence,
+            x=self.x,
+            y=self.y,
+            heading=self.heading,
+            twist=MSG.Twist(MSG.Vector3(vx, vy, 0.0), MSG.Vector3(0.0, 0.0, omega)),
+            wrench=MSG.Wrench(MSG.Vector3(fx, fy, 0.0), MSG.Vector3(0.0, 0.0, mz)),
+            mode=self.mode,
+            v_max=limits.v_max,
+            omega_max=limits.omega_max,
+            f_max=limits.f_max,
+            m_max=limits.m_max,
+            **self._echo(),
+        )
+
+    def _echo(self) -> dict[str, Any]:
+        last, commander = (self.heard[-1].order if self.heard else None), self.desk.commander
+        mine = last is not None and last.commander == commander
+        return {
+            "commander": commander,
+            "command_sequence": last.sequence if mine else 0,
+            "command_ns": last.decided if mine else 0,
+        }

@@ -1,0 +1,106 @@
+"""reachd as a real process beside a fake arm and a fake board, and what reachd publishes."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from support.fake_arm import FakeArm
+from support.network import free_endpoint
+from support.processes import Program
+from support.waiting import PATIENCE_S, wait_until
+from support.wire import Wire
+from tactile_core.bus.messages import codec
+from tactile_core.bus.services import ServiceError, call
+from tactile_core.bus.topics import REACH_EVENT, REACH_STATE, service_key
+
+
+class ReachdLab:
+    """Starts what a test needs, and hears what reachd says."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.reachd_at = free_endpoint()
+        self.arm_at = free_endpoint()
+        self.events: list[Any] = []
+        self.states: list[Any] = []
+        self._arm: FakeArm | None = None
+        self._programs: list[Program] = []
+        self._wires: list[Wire] = []
+
+    @property
+    def arm(self) -> FakeArm:
+        if self._arm is None:
+            self._arm = FakeArm(self.arm_at)
+            session = self._arm.session
+            for topic, into in ((REACH_EVENT, self.events), (REACH_STATE, self.states)):
+                session.declare_subscriber(topic.key("reach"), _into(topic, into))
+        return self._arm
+
+    def wire(self, target: str) -> Wire:
+        """A way to ``target`` that can be cut."""
+        self._wires.append(Wire(target))
+        return self._wires[-1]
+
+    def board(
+        self,
+        name: str = "board0",
+        ahead: float = 0.0,
+        prefix: str = "",
+        via: str | None = None,
+    ) -> Program:
+        script = str(Path(__file__).with_name("board_process.py"))
+        return self._start(
+            [sys.executable, script, via or self.reachd_at, name, str(ahead), prefix]
+        )
+
+    def reachd(
+        self, *words: str, listen: str | None = None, via: str | None = None, **environment: str
+    ) -> Program:
+        bus = ["--listen", listen or self.reachd_at, "--connect", via or self.arm_at]
+        return self._start([sys.executable, "-m", "reachd", *bus, *words], **environment)
+
+    def ask(self, service: str, request: object = None) -> Any:
+        return call(self.arm.session, service_key("reach", service, "reach"), request, PATIENCE_S)
+
+    def arms(self) -> bool:
+        """Ask to arm; False as long as it is refused, as before the arm has granted its command."""
+        try:
+            return bool(self.ask("arm")["armed"])
+        except ServiceError:
+            return False
+
+    def codes(self, kind: str) -> list[str]:
+        return [event.code for event in list(self.events) if event.kind == kind]
+
+    def reaching(self, program: Program) -> None:
+        """Wait until the arm moves."""
+        wait_until(lambda: self.arm.moving or program.process.poll() is not None)
+        assert program.process.poll() is None, program.said
+
+    def told_to_stand(self) -> None:
+        """Wait until the last word to the arm is zero: it may be on its way when reachd is gone."""
+        wait_until(lambda: bool(self.arm.heard) and all(h.still for h in self.arm.heard[-3:]))
+
+    def close(self) -> None:
+        for program in self._programs:
+            program.end()
+        for wire in self._wires:
+            wire.close()
+        if self._arm is not None:
+            self._arm.close()
+
+    def _start(self, words: list[str], **environment: str) -> Program:
+        program = Program(
+            self.folder, words, **({"TACTILE_RUNTIME_DIR": str(self.folder)} | environment)
+        )
+        self._programs.append(program)
+        return program
+
+
+def _into(topic: Any, into: list[Any]) -> Callable[[zenoh.Sample], None]:
+    return lambda sample: into.append(codec().decode(topic, sample.payload.to_bytes()))

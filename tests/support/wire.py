@@ -1,0 +1,89 @@
+"""A TCP connection that can be cut or delayed so that neither end is told."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import socket
+import threading
+import time
+
+from support.waiting import PATIENCE_S
+
+
+class Wire:
+    """A TCP connection to ``target`` that can be cut so that neither end is told.
+
+    ``delay``: s that what goes towards ``target`` takes; the other way is as quick as ever.
+    """
+
+    def __init__(self, target: str) -> None:
+        self.delay = 0.0
+        self._target = int(target.rpartition(":")[2])
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+        self._whole = threading.Event()
+        self._whole.set()
+        self._ends: list[socket.socket] = [self._listener]
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self) -> None:
+        """Pass nothing on; what is sent stays under way."""
+        self._whole.clear()
+
+    def mend(self) -> None:
+        """Pass everything on again, and first what was under way."""
+        self._whole.set()
+
+    def close(self) -> None:
+        self._whole.set()
+        for end in self._ends:
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+            end.close()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = self._listener.accept()
+                far = self._far()
+                if far is None:
+                    near.close()
+                    continue
+                self._ends += [near, far]
+                waiting: queue.SimpleQueue[tuple[float, bytes]] = queue.SimpleQueue()
+                for work, args in (
+                    (self._hold, (near, waiting)),
+                    (self._let_go, (waiting, far)),
+                    (self._pump, (far, near)),
+                ):
+                    threading.Thread(target=work, args=args, daemon=True).start()
+
+    def _far(self) -> socket.socket | None:
+        try:
+            return socket.create_connection(("127.0.0.1", self._target), timeout=PATIENCE_S)
+        except OSError:
+            return None  # nobody listens yet; whoever connects tries again
+
+    def _hold(self, source: socket.socket, waiting: queue.SimpleQueue[tuple[float, bytes]]) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(65536):
+                waiting.put((time.monotonic() + self.delay, data))
+        waiting.put((0.0, b""))
+
+    def _let_go(self, waiting: queue.SimpleQueue[tuple[float, bytes]], sink: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while (item := waiting.get())[1]:
+                time.sleep(max(0.0, item[0] - time.monotonic()))
+                self._whole.wait()
+                sink.sendall(item[1])
+            sink.shutdown(socket.SHUT_RDWR)
+
+    def _pump(self, source: socket.socket, sink: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(65536):
+                self._whole.wait()
+                sink.sendall(data)
+        for end in (source, sink):
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
