@@ -7,7 +7,7 @@ SOAK_MINUTES ?= 60
 KILLS ?= 1000
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-random lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage hostile recordings stress soak fuzz-pipeline kills docs docs-reference pictures clean
+.PHONY: help setup test test-random test-loaded lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage hostile recordings stress soak fuzz-pipeline kills docs docs-reference pictures clean
 
 help:  ## list the targets (what `make` alone does)
 	@echo "make TARGET, where TARGET is one of:"
@@ -27,14 +27,21 @@ lint: setup  ## style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# Neighbouring tests share daemons and logs, so each worker gets a stretch of them.
+WORKERS := -n 2 --dist worksteal
 test: lint  ## set everything up, pass lint and all tests
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest $(WORKERS)
 
 # The property tests on new examples; `make test` draws the same ones every time. RUNS=20: as often.
 RUNS ?= 1
 test-random: setup  ## the property tests on new examples; RUNS=20: as often
 	@for run in $$(seq $(RUNS)); do \
-	  $(BIN)/python -m pytest -q -n 2 --hypothesis-profile=random -m "hypothesis or random" || exit 1; done
+	  $(BIN)/python -m pytest -q $(WORKERS) --hypothesis-profile=random -m "hypothesis or random" || exit 1; done
+
+# The suite RUNS times beside two busy loops; docs/results/suite.json keeps a row for each run, so
+# that it may be stopped and gone on with later. SINCE=COMMIT counts runs of later commits, too.
+test-loaded: setup  ## the suite RUNS times beside two busy loops
+	$(BIN)/python tests/loaded_runs.py --runs $(RUNS) $(if $(SINCE),--since $(SINCE))
 
 # The reference of every configuration file, from the code that reads them.
 docs-reference: setup  ## the reference of configuration files, from the code

@@ -19,6 +19,7 @@ from sensor_proto.can_transfers import CanDecoder, CanEncoder
 from sensor_proto.framing import SerialDecoder, encode_serial
 from sensor_proto.packets import Descriptor, FloatSamples, Identify, Message, Samples, Start
 from sim_device.cli import main
+from support.waiting import wait_until
 from tactile_core.calibration import load
 from tactiled.transports import PortGone, Transport
 from tactiled.transports.can_bus import CanTransport
@@ -181,7 +182,7 @@ def test_anyskin_board_streams_floats_without_commands(launch: Launch, tmp_path:
 
 
 def test_unplugged_board_vanishes_and_returns_freshly_booted(
-    launch: Launch, tmp_path: Path, eventually: Any
+    launch: Launch, tmp_path: Path
 ) -> None:
     launch("boards", "--pty", "board0", "--unplug", "2s+0.5s")
     link = tmp_path / "board0"
@@ -189,8 +190,8 @@ def test_unplugged_board_vanishes_and_returns_freshly_booted(
     host.open()
     with pytest.raises(PortGone):
         hear(host, SerialDecoder(), lambda m: False)
-    assert eventually(lambda: not os.path.lexists(link))
-    assert eventually(link.exists)
+    wait_until(lambda: not os.path.lexists(link))
+    wait_until(link.exists)
     host.open()
     received = hear(host, SerialDecoder(), greeted, hello)
     assert min(s.sequence for s in kinds(received, Samples)) < 50

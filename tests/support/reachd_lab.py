@@ -87,7 +87,9 @@ class ReachdLab:
         wait_until(lambda: bool(self.arm.heard) and all(h.still for h in self.arm.heard[-3:]))
 
     def close(self) -> None:
-        for program in self._programs:
+        # Daemons end before their boards: one that outlives its board follows the link that is
+        # left to a terminal which may already belong to another test.
+        for program in reversed(self._programs):
             program.end()
         for wire in self._wires:
             wire.close()

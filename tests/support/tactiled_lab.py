@@ -48,7 +48,9 @@ class TactiledLab:
     def close(self) -> None:
         for session in self._sessions:
             close_session(session)
-        for program in self._programs:
+        # Daemons end before their boards: one that outlives its board follows the link that is
+        # left to a terminal which may already belong to another test.
+        for program in reversed(self._programs):
             program.end()
 
     def _start(self, name: str, *words: str) -> Program:
