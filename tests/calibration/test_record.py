@@ -80,8 +80,7 @@ def served(folder: Path, *words: str) -> Iterator[tuple[str, Person]]:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     port, press = folder / "skin", folder / "press.toml"
     press.write_text(PRESSES)
-    simulator = [command("simdevice"), "boards", "--board", "anyskin", "--rate", "40"]
-    simulator += ["--pty", str(port)]
+    simulator = [command("simdevice"), "boards", "--board", "anyskin", "--pty", str(port)]
     daemon = [command("tactiled"), "--port", str(port), "--board", "anyskin", "--no-log"]
     with running([*simulator, "--press", str(press)], folder / "simdevice") as board:
         wait_for(port, board, folder / "simdevice")

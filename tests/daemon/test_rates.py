@@ -12,7 +12,6 @@ import pytest
 from sensor_proto.anyskin import encode_anyskin
 from sensor_proto.framing import SerialDecoder, encode_serial
 from sensor_proto.packets import Descriptor, FloatSamples
-from support.waiting import wait_until
 from tactile_core.calibration import nominal
 from tactile_core.types import Instant
 from tactiled.blocks import Chunk, Cycle, SampleBlock
@@ -45,12 +44,12 @@ def floats(rng: np.random.Generator, cut: int = 0) -> bytes:
     return encode_anyskin(samples)[cut:]
 
 
-def play_floats(line: SerialLine, at: At, rate: float, frames: int) -> list[Any]:
+def play_floats(line: SerialLine, at: At, rate: float, frames: int, until: float) -> list[Any]:
     """A float board that is heard from in the middle of a frame on; looked at every 10 ms."""
     rng, events, sent = np.random.default_rng(0), [], 0
     line.connect(at(0.0))
     step = min(0.01, 1 / rate)
-    for k in range(round(wait_until / step)):
+    for k in range(round(until / step)):
         now = k * step
         events += line.tick(at(now))
         line.outgoing()

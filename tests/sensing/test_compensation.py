@@ -141,7 +141,7 @@ def test_five_taxels_hold_through_any_contact_for_some_seconds(lone):
     assert cycle.features.valid
     assert cycle.features.codes == ("compensation_held:skin",)
     np.testing.assert_allclose(cycle.force, s.force, atol=0.3)
-    later = s.go(pressed=range(5), cycles=1600)  # doubted after some 14 s
+    later = s.go(pressed=range(5), cycles=6000)
     assert later.features.codes == ("compensation_held:skin", "uncertain:skin")
     assert not later.features.valid
     assert later.features.normal_force_bound > cycle.features.normal_force_bound
