@@ -37,7 +37,7 @@ def git(*words: str) -> str:
         ["git", "-C", str(ROOT), *words], capture_output=True, text=True, check=False
     )
     if done.returncode != 0:
-        raise RuntimeError(done.stderr.strip())
+        raise RuntimeError(done.stderr.strip().splitlines()[0])
     return done.stdout.strip()
 
 
