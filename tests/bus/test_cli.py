@@ -151,7 +151,7 @@ def test_names_that_options_take_are_those_of_the_code() -> None:
 
 
 @pytest.mark.parametrize("parser", EVERY, ids=lambda parser: parser.prog)
-def test_no_parser_takes_a_negative_value_for_a_flag(parser: argparse.ArgumentParser) -> None:
+def test_no_parser_mistakes_a_negative_value_for_a_flag(parser: argparse.ArgumentParser) -> None:
     flags = [flag for action in parser._actions for flag in action.option_strings]
     for value in VALUES:
         assert parser._parse_optional(value) is None, value

@@ -127,7 +127,7 @@ def test_toml_within_bounds_is_read() -> None:
     assert printable("a\x1b\x07\x9b\u202e") == "a\\x1b\\x07\\x9b\\u202e"
 
 
-def test_a_zero_byte_in_a_name_is_a_refusal() -> None:
+def test_nul_byte_in_a_name_is_refused() -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         read_text("a\0b", LIMIT)
 

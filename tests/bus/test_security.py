@@ -314,7 +314,7 @@ def test_at_a_unix_socket_a_stranger_without_the_secret_is_not_heard(
         assert list(session.get("arm/arm/srv/limits", timeout=0.3)) == []
 
 
-def test_insecure_by_name_lets_everybody_in(
+def test_explicit_insecure_mode_admits_everyone(
     join: Any, plain: Any, free_port: Any, until: Any
 ) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"

@@ -17,13 +17,14 @@ from typing import Any
 
 import pytest
 
+from support.waiting import wait_until
 from tactile_core import daemon as supervision
 from tactile_core.log.retention import DiskWatch
 from tactile_core.types import NS_PER_S, Instant, monotonic_now
 from tactile_tools.operate import health
 from tactiled.arguments import make_parser
 from tactiled.daemon import Daemon
-from tactiled.diagnostics import DRIFT_N, WINDOW_S, WINDOWS, DriftWatch
+from tactiled.diagnostics import ALARM_WINDOW_S, DRIFT_N, WINDOWS, DriftWatch
 from tactiled.settings import make_settings
 
 
@@ -156,7 +157,7 @@ def watch(forces: list[float], seconds_each: float = 1.0) -> str | None:
     return drift.alarm()
 
 
-LONG = round(WINDOW_S * (WINDOWS + 1)) + 2
+LONG = round(ALARM_WINDOW_S * (WINDOWS + 1)) + 2
 
 
 def test_drifted_zero_raises_the_drift_alarm() -> None:

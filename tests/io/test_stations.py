@@ -187,7 +187,7 @@ def test_virtual_buses_can_be_served() -> None:
     plan.station.close()
 
 
-def test_the_status_says_rates_and_losses_on_a_terminal_only(
+def test_status_line_is_shown_only_on_a_terminal(
     request_of: BoardsRequest, capsys: pytest.CaptureFixture[str]
 ) -> None:
     planned = plan_boards(replace(request_of, ptys=request_of.ptys[:1]))

@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 
 from reachd.strategies.parameters import parameters
+from support import trial_trace
 from tactile_tools.reach.lockstep import run_trial
 
 DEPTHS = ("contacts", "taxels")
@@ -62,15 +63,15 @@ def test_another_seed_gives_other_random_choices() -> None:
     assert len(digests) > 1
 
 
-def test_trials_one_after_another_leave_nothing_behind(trace: ModuleType) -> None:
-    scene = trace.crowded()
-    alone = trace.traced(scene, "hybrid_event", 3, "taxels", seconds=1.5)[1]
-    trace.traced(trace.crowded(4), "straight", 9, "taxels", seconds=1.0)
-    assert trace.traced(scene, "hybrid_event", 3, "taxels", seconds=1.5)[1] == alone
+def test_trials_do_not_affect_later_trials() -> None:
+    scene = trial_trace.crowded()
+    alone = trial_trace.traced(scene, "hybrid_event", 3, "taxels", seconds=1.5)[1]
+    trial_trace.traced(trial_trace.crowded(4), "straight", 9, "taxels", seconds=1.0)
+    assert trial_trace.traced(scene, "hybrid_event", 3, "taxels", seconds=1.5)[1] == alone
 
 
-def test_a_trial_runs_at_the_period_of_its_settings(trace: ModuleType) -> None:
-    scene = trace.crowded(4)
+def test_a_trial_runs_at_the_period_of_its_settings() -> None:
+    scene = trial_trace.crowded(4)
     fast = parameters(scene.parameters)
     slow = replace(fast, safety=replace(fast.safety, period=2 * fast.safety.period))
     results = [

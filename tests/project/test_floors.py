@@ -102,7 +102,7 @@ def test_rooms_inside_a_package_import_downward(package: str, room: str) -> None
 
 
 @pytest.mark.parametrize("room", ["boards", "sensing"])
-def test_the_pure_rooms_of_tactiled_own_no_thread_file_or_clock(room: str) -> None:
+def test_pure_packages_of_tactiled_use_no_thread_file_or_clock(room: str) -> None:
     files = sorted((ROOMS["tactiled"] / room).glob("*.py"))
     assert len(files) > 5
     for path in files:
@@ -110,7 +110,7 @@ def test_the_pure_rooms_of_tactiled_own_no_thread_file_or_clock(room: str) -> No
 
 
 @pytest.mark.parametrize("module", ["tactiled.daemon", "reachd.daemon", "sim_device.runner"])
-def test_start_up_waits_for_no_slow_library(module: str) -> None:
+def test_startup_imports_no_slow_library(module: str) -> None:
     code = (
         f"import {module}, sys; "
         "print([m for m in ('sklearn', 'matplotlib', 'scipy') if m in sys.modules])"

@@ -156,25 +156,25 @@ def test_single_values_are_overridden() -> None:
         ({"safety.tip_region": [[0, 0], [1, "a"], [0, 1]]}, ["tip_region[1][1]", "m"]),
     ],
 )
-def test_what_cannot_be_used_is_refused_in_words(given: dict, words: list[str]) -> None:
+def test_unusable_values_are_refused_with_a_reason(given: dict, words: list[str]) -> None:
     with pytest.raises(ConfigError) as error:
         parameters("hardware", given)
     for word in words:
         assert word in str(error.value)
 
 
-def test_a_region_is_no_list_of_numbers() -> None:
+def test_region_as_a_list_of_numbers_is_refused() -> None:
     with pytest.raises(ConfigError, match="pivot_region"):
         replace(HARDWARE.safety, pivot_region=((0, 0), (1, 0), (0, 1)))  # type: ignore[arg-type]  # that is the mistake
 
 
-def test_unknown_set_lists_the_sets() -> None:
+def test_unknown_set_lists_available_sets() -> None:
     with pytest.raises(ConfigError, match="hardware, authors_sim"):
         parameters("hardwear")
 
 
 @pytest.mark.parametrize("check", sorted(ALWAYS_ON))
-def test_some_checks_cannot_be_switched_off(check: Check) -> None:
+def test_essential_checks_cannot_be_disabled(check: Check) -> None:
     with pytest.raises(ConfigError, match="cannot be switched off"):
         parameters("authors_sim", {"safety.disabled": [check.value]})
 
@@ -225,7 +225,7 @@ def test_region_membership_is_correct() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "0.3", "a,b", "0.3,0.1,0.2", "0.3;0.1"])
-def test_a_malformed_target_is_refused(text: str) -> None:
+def test_malformed_target_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match="not X,Y in metres"):
         parse_target(text)
 

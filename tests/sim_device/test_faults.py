@@ -79,7 +79,7 @@ def test_empty_text_is_no_fault() -> None:
         ("copy@2s", "allowed: Ts[+]Ds"),
     ],
 )
-def test_bad_text_names_the_entry_and_what_is_allowed(text: str, message: str) -> None:
+def test_bad_text_names_the_entry_and_allowed_values(text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         FaultPlan.parse(text)
 

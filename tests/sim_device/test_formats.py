@@ -78,7 +78,7 @@ def test_boards_of_one_controller_sit_on_different_sides() -> None:
     "options",
     [{"arrays": (5, 5)}, {"format": "reskin-text"}, {"banner": True}],
 )
-def test_only_boards_that_send_floats_write_otherwise(options: dict[str, object]) -> None:
+def test_other_formats_are_for_float_boards_only(options: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="--kind anyskin"):
         plan_boards(BoardsRequest(ptys=(Path("a"),), **options))  # type: ignore[arg-type]
     (planned,) = plan_boards(BoardsRequest(ptys=(Path("a"),), board="anyskin", **options))  # type: ignore[arg-type]

@@ -149,12 +149,12 @@ def test_errors_name_file_line_key_and_remedy(script, old, new, line, message) -
         ),
     ],
 )
-def test_scripts_that_make_no_sense(script, text, message) -> None:
+def test_senseless_scripts_are_refused(script, text, message) -> None:
     with pytest.raises(ConfigError, match=message):
         load_script(script(text))
 
 
-def test_missing_and_unreadable_files(tmp_path: Path) -> None:
+def test_missing_and_unreadable_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"nowhere.toml: cannot be read .No such file"):
         load_script(tmp_path / "nowhere.toml")
     with pytest.raises(ConfigError, match="cannot be read"):
