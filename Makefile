@@ -7,7 +7,7 @@ SOAK_MINUTES ?= 60
 KILLS ?= 1000
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-random test-loaded lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage hostile recordings stress soak fuzz-pipeline kills docs docs-reference pictures clean
+.PHONY: help setup test test-random test-loaded lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage hostile recordings stress soak fuzz-pipeline kills firmware-test docs docs-reference pictures clean
 
 help:  ## list the targets (what `make` alone does)
 	@echo "make TARGET, where TARGET is one of:"
@@ -111,6 +111,11 @@ docs: setup  ## the documents as a site in build/site
 pictures: setup  ## pages and pictures that are made from the code
 	$(BIN)/python -m tactile_tools.dev.architecture docs/pictures
 	$(BIN)/python -m tactile_tools.dev.topics_page docs/topics.md
+
+# The C headers: compilers, sanitizers, a million inputs of the fuzzer, emulators. Nothing is installed;
+# what is not here is skipped, saying what to install (docs/firmware.md).
+firmware-test: setup
+	TACTILE_FIRMWARE=full TACTILE_FIRMWARE_JSON=docs/results/firmware.json $(BIN)/python -m pytest -q -rs -n 0 --timeout 900 tests/firmware
 
 clean:  ## delete .venv and what tools leave
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -660,6 +660,8 @@ def shape_error(packet: bytes) -> Reject | None:
         return Reject.RUNT
     if packet[2] + (packet[3] << 8) != size - OVERHEAD:
         return Reject.LENGTH
+    if size > MAX_PACKET:
+        return Reject.OVERSIZED
     return None
 
 

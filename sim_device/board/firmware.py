@@ -31,6 +31,7 @@ from sensor_proto.packets import (
     Message,
     Reboot,
     Received,
+    Reject,
     Samples,
     SetGain,
     SetRate,
@@ -303,6 +304,10 @@ class Controller:
         run = self._run
         if now < run.ready:
             return
+        if len(run.replies) == MAX_QUEUED_REPLIES:
+            # No room for an answer: not obeyed either, so that the host sends it again.
+            self.count_rejected(1)
+            return
         match message:
             case Identify():
                 self._reply(self.descriptor())
@@ -335,7 +340,8 @@ class Controller:
     def refuse(self, command: int, request: int, now: Instant) -> None:
         """Answer a command of a type that this firmware does not know."""
         self.advance(now)
-        if now >= self._run.ready and command & HOST_BIT:
+        room = len(self._run.replies) < MAX_QUEUED_REPLIES
+        if now >= self._run.ready and command & HOST_BIT and room:
             self._reply(Ack(command, request, AckResult.UNKNOWN_COMMAND))
 
     def count_rejected(self, frames: int) -> None:
@@ -587,7 +593,11 @@ class SimulatedBoard(SkinOwner, ABC):
         for command, request in decoder.take_unknown():
             self.controller.refuse(command, request, now)
         counters = decoder.counters
-        rejected = sum(counters.values()) - counters[ACCEPTED]
+        # An idle line, and what others say on the bus, is no frame of the host's.
+        passed = (
+            counters[ACCEPTED] + counters.get(Reject.EMPTY, 0) + counters.get(Reject.FOREIGN, 0)
+        )
+        rejected = sum(counters.values()) - passed
         self.controller.count_rejected(rejected - self._rejected)
         self._rejected = rejected
 
