@@ -114,7 +114,7 @@ pictures: setup  ## pages and pictures that are made from the code
 
 # The C headers: compilers, sanitizers, a million inputs of the fuzzer, emulators. Nothing is installed;
 # what is not here is skipped, saying what to install (docs/firmware.md).
-firmware-test: setup
+firmware-test: setup  ## the C headers: compilers, sanitizers, fuzzer, emulators
 	TACTILE_FIRMWARE=full TACTILE_FIRMWARE_JSON=docs/results/firmware.json $(BIN)/python -m pytest -q -rs -n 0 --timeout 900 tests/firmware
 
 clean:  ## delete .venv and what tools leave

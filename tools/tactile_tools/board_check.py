@@ -902,34 +902,6 @@ def check(host: Host) -> Iterator[tuple[str, str, str]]:
             raise Unreachable(f"during the check “{title}”: {error}") from error
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``board-check`` to the umbrella command."""
-    parser = subparsers.add_parser(
-        "board-check",
-        help="prove that a board speaks the wire protocol",
-        description="Holds a board on a serial port or a CAN bus to PROTOCOL.md: messages, "
-        "refusals, rates, clock, counters, restart. It reboots the board, changes its rate and "
-        "gain, and leaves it stopped, as after a reset. No tactiled may have the port.",
-        epilog="exit status: 0 all passed; 1 some failed; 2 bad argument; 3 no board, or port "
-        "missing, busy or not permitted.",
-    )
-    port = parser.add_mutually_exclusive_group(required=True)
-    port.add_argument("--port", metavar="P", help="serial port, or usb:SERIAL_NUMBER")
-    port.add_argument(
-        "--can", metavar="SPEC", help="CAN bus INTERFACE:CHANNEL[@BITRATE[/DATA_BITRATE]][+fd]"
-    )
-    parser.add_argument(
-        "--baud", type=int, default=115_200, metavar="BIT/S", help="of a UART (default 115200)"
-    )
-    parser.add_argument(
-        "--node",
-        type=int,
-        metavar="N",
-        help="number of the board on the bus, 0 to 126 (default: the only one that answers)",
-    )
-    parser.set_defaults(func=run)
-
-
 def run(options: argparse.Namespace) -> int:
     """Judge one board; print a line for each demand."""
     try:

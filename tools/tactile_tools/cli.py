@@ -52,6 +52,9 @@ COMMANDS: Final = {
     "status": Command("how the boards of a running tactiled do", f"{HERE}:_fill_status"),
     "tare": Command("take what the untouched skin reads now as its rest", f"{HERE}:_fill_tare"),
     "health": Command("say in one line whether a rig is well", f"{HERE}:_fill_health"),
+    "board-check": Command(
+        "prove that a board speaks the wire protocol", f"{HERE}:_fill_board_check"
+    ),
     "calibrate": Command(
         "fit models of force to recordings of a board, and judge them",
         "tactile_tools.calibrate.cli",
@@ -74,6 +77,8 @@ COMMANDS: Final = {
         "install the daemons as systemd services, or remove them",
         f"{HERE}:_fill_service",
     ),
+    "foxglove": Command("show the running rig live in Foxglove", f"{HERE}:_fill_foxglove"),
+    "ros2": Command("bridge to ROS 2, and the message package", "tactile_tools.ros2.cli"),
     "completion": Command(
         "print a script that lets a shell complete our commands", f"{HERE}:_fill_completion"
     ),
@@ -423,6 +428,56 @@ def _fill_uninstall(parser: Parser) -> None:
         "--purge", action="store_true", help="delete configurations in /etc/tactile as well"
     )
     parser.set_defaults(func=later("tactile_tools.operate.service:uninstall"))
+
+
+def _fill_board_check(parser: Parser) -> None:
+    parser.description = (
+        "Holds a board on a serial port or a CAN bus to PROTOCOL.md: messages, refusals, rates, "
+        "clock, counters, restart. It reboots the board, changes its rate and gain, and leaves it "
+        "stopped, as after a reset. No tactiled may have the port."
+    )
+    parser.epilog = (
+        "exit status: 0 all passed; 1 some failed; 2 bad argument; 3 no board, or port missing, "
+        "busy or not permitted."
+    )
+    port = parser.add_mutually_exclusive_group(required=True)
+    port.add_argument("--port", metavar="P", help="serial port, or usb:SERIAL_NUMBER")
+    port.add_argument(
+        "--can", metavar="SPEC", help="CAN bus INTERFACE:CHANNEL[@BITRATE[/DATA_BITRATE]][+fd]"
+    )
+    parser.add_argument(
+        "--baud", type=count, default=115_200, metavar="BIT/S", help="of a UART (default 115200)"
+    )
+    parser.add_argument(
+        "--node",
+        type=whole(most=126),
+        metavar="N",
+        help="number of the board on the bus, 0 to 126 (default: the only one that answers)",
+    )
+    parser.set_defaults(func=later("tactile_tools.board_check:run"))
+
+
+def _fill_foxglove(parser: Parser) -> None:
+    parser.description = (
+        "Serves the streams of the bus to Foxglove until it is stopped, on this machine only: the "
+        "protocol has no authentication (docs/foxglove.md)."
+    )
+    parser.epilog = "exit status: 0 stopped; 2 bad argument or foxglove-sdk missing; 3 port in use."
+    parser.add_argument(
+        "--port",
+        type=whole(most=65_535),
+        default=8765,
+        metavar="N",
+        help="TCP port, 0: any (default 8765)",
+    )
+    parser.add_argument(
+        "--control",
+        action="store_true",
+        help="let viewers arm reachd, give it goals and set rates; every user of this machine may "
+        "connect",
+    )
+    add_bus(parser, "tool")
+    parser.set_defaults(func=later("tactile_tools.foxglove:run"))
 
 
 def _fill_completion(parser: Parser) -> None:

@@ -353,6 +353,11 @@ def close_session(session: zenoh.Session, timeout: float = CLOSE_TIMEOUT) -> boo
     return done.wait(timeout)
 
 
+def open_sessions() -> list[zenoh.Session]:
+    """Sessions that this process has open, oldest first."""
+    return [opened.session for opened in _open_sessions.values()]
+
+
 def config_of(session: zenoh.Session) -> BusConfig | None:
     """What a session that is open was opened with, None for one of somebody else's."""
     opened = _open_sessions.get(str(session.zid()))

@@ -23,6 +23,7 @@ from tactile_core.cli import (
     refuse,
     seconds,
     speed,
+    whole,
 )
 from tactile_tools.options import add_log_files
 from tactiled.sensing import METHODS
@@ -42,7 +43,10 @@ COMMANDS = {
     "rosbag": Command("make a folder that `ros2 bag` plays", f"{HERE}:_rosbag"),
 }
 
-FORMATS = ("csv", "parquet", "npz")
+FORMATS = ("csv", "parquet", "npz", "lerobot")
+
+MAX_FPS = 1000
+"""Frames a second of a LeRobot data set at most."""
 
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kMG]i?)?B?", re.IGNORECASE)
 _POWERS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "ki": 1 << 10, "mi": 1 << 20, "gi": 1 << 30}
@@ -176,11 +180,25 @@ def _export(parser: Parser) -> None:
         "(header.stamp_ns, wrench.force.x); columns.json says what each column is. Lists of "
         "numbers are columns name.0, name.1 … in CSV, lists in Parquet, matrices in npz; lists of "
         "messages are JSON in CSV, lists of structures in Parquet, flat arrays with offsets in "
-        "npz. Raw bytes of boards are left out unless --topic names them."
+        "npz. Raw bytes of boards are left out unless --topic names them. lerobot: a LeRobot data "
+        "set (v3.0) with one episode a log, see docs/lerobot.md."
     )
     parser.former(to="format")
     add_log_files(parser)
     parser.add_argument("--format", choices=FORMATS, required=True, help="of the tables")
+    parser.add_argument(
+        "--fps",
+        type=whole(least=1, most=MAX_FPS),
+        default=50,
+        metavar="N",
+        help="lerobot: frames a second that all streams are brought to (default 50)",
+    )
+    parser.add_argument(
+        "--task",
+        default="reach into the cupboard",
+        metavar="TEXT",
+        help="lerobot: what the robot was doing (default: reach into the cupboard)",
+    )
     add_out(parser, "new folder (default: FILE's name and format)")
     _add_selection(parser)
     parser.set_defaults(func=_work("export"))

@@ -17,6 +17,7 @@ from tactile_core.bus.messages import DecodeError
 from tactile_core.bus.topics import RAW, find_topic
 from tactile_core.cli import progress, require
 from tactile_tools.log.arguments import Selection, select
+from tactile_tools.log.sources import find_series
 from tactile_tools.log.stream import Reading, Record, Stream, read_merged
 from tactile_tools.log.terminal import (
     FAULTY,
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from tactile_tools.log.decode import Decoder
     from tactile_tools.log.tables import Table
 
-FORMATS = ("csv", "parquet", "npz")
+FORMATS = ("csv", "parquet", "npz", "lerobot")
 
 MAX_FILES = 65_536
 
@@ -43,6 +44,8 @@ has it was made by this tool, and may be overwritten with --force."""
 
 def run(options: argparse.Namespace) -> int:
     """Export; 0 when every message was written, 1 when some were lost or could not be decoded."""
+    if options.format == "lerobot":
+        return _lerobot(options)
     if options.format != "npz":
         require("pyarrow", extra="export")
     chosen = select(options)
@@ -67,6 +70,20 @@ def run(options: argparse.Namespace) -> int:
         with contextlib.suppress(OSError):
             shutil.rmtree(part)
     return _report(result, out, left_out)
+
+
+def _lerobot(options: argparse.Namespace) -> int:
+    from tactile_tools.log import lerobot
+
+    if options.topic or options.first_time is not None or options.last_time is not None:
+        raise ToolError(
+            "--to lerobot takes whole logs: cut them first (tactile log split), and leave --topic, "
+            "--from and --until out"
+        )
+    logs = find_series(options.files)
+    source = logs[0].paths[0]
+    out = options.out or source.with_name(f"{source.stem}_lerobot")
+    return lerobot.run(logs, out, fps=options.fps, task=options.task, force=options.force)
 
 
 def _is_no_raw(left_out: set[str], topic: str) -> bool:

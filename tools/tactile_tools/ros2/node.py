@@ -1,0 +1,197 @@
+"""A ROS 2 node over a zenoh client session: publishers, subscriptions and the tokens of them.
+
+A client of the router hears and reaches every node, also behind a router that does not forward
+between peers (rmw_zenohd's default). It reconnects by itself when the router comes back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import threading
+import uuid
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+import zenoh.ext
+
+from tactile_core.bus.messages import MAX_PAYLOAD, codec
+from tactile_core.bus.streams import ATTACHMENT, WALL_LIMIT_NS, BusSample, read_sample
+from tactile_tools.ros2.names import STREAM, Endpoint, EndpointKind, Node, Qos, type_hash
+
+DEFAULT_ROUTER = "tcp/127.0.0.1:7447"
+"""Where rmw_zenohd listens."""
+
+CONNECT_TIMEOUT_S = 3.0
+
+HEARTBEAT_S = 0.5
+"""After the last message of a latched topic, its number is repeated once so late: a subscriber that
+missed the message asks for it again. rmw_zenoh does the same."""
+
+
+class RouterError(Exception):
+    """The router cannot be reached; the message names the remedy."""
+
+
+def open_client(router: str, timeout_s: float = CONNECT_TIMEOUT_S) -> zenoh.Session:
+    """A client session at ``router``; `RouterError` when nothing answers there in time."""
+    values = {
+        "mode": "client",
+        "connect/endpoints": [router],
+        "connect/timeout_ms": round(timeout_s * 1000),
+        "connect/exit_on_failure": True,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/link/rx/max_message_size": MAX_PAYLOAD + 4096,
+        "transport/shared_memory/enabled": False,
+    }
+    config = zenoh.Config()
+    try:
+        for key, value in values.items():
+            config.insert_json5(key, json.dumps(value))
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        reason = str(error).partition(" at /")[0]
+        raise RouterError(
+            f"no ROS 2 router answers at {router} ({reason}): start one with `ros2 run "
+            "rmw_zenoh_cpp rmw_zenohd`, or name its endpoint with --router tcp/HOST:PORT"
+        ) from error
+
+
+class RosPublisher:
+    """Publishes CDR bytes on one topic; drops when the link is full, never waits.
+
+    ``matched``: whether anybody subscribes; always true for a latched topic, which keeps its last
+    message for later subscribers.
+    """
+
+    def __init__(self, session: zenoh.Session, endpoint: Endpoint) -> None:
+        self.endpoint = endpoint
+        self.matched = endpoint.qos.transient_local
+        self._sequence = 0
+        self._putting = threading.Lock()
+        self._gid = uuid.uuid4().bytes
+        drop = zenoh.CongestionControl.DROP
+        self._publisher: Any  # zenoh's two kinds have nothing in common but their methods
+        if endpoint.qos.transient_local:
+            self._publisher = zenoh.ext.declare_advanced_publisher(
+                session,
+                endpoint.key,
+                congestion_control=drop,
+                cache=zenoh.ext.CacheConfig(endpoint.qos.depth),
+                publisher_detection=True,
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(
+                    heartbeat=None, sporadic_heartbeat=HEARTBEAT_S
+                ),
+            )
+        else:
+            publisher = session.declare_publisher(
+                endpoint.key, congestion_control=drop, express=True
+            )
+            publisher.declare_matching_listener(self._match)
+            # The stubs say bool.
+            status: Any = publisher.matching_status
+            self.matched = status.matching
+            self._publisher = publisher
+        self._token = session.liveliness().declare_token(endpoint.token)
+
+    def put(self, data: bytes, wall_ns: int, lost: int = 0) -> None:
+        """Send ``data`` stamped with its wall-clock time; ``lost``: messages lost before it."""
+        wall_ns = min(max(wall_ns, 0), WALL_LIMIT_NS)
+        with self._putting:  # boards of several daemons share /diagnostics
+            self._sequence += 1 + lost
+            attachment = ATTACHMENT.pack(self._sequence, wall_ns, 16, self._gid)
+            self._publisher.put(data, attachment=attachment)
+
+    def close(self) -> None:
+        """Take the publisher and its token back."""
+        with contextlib.suppress(zenoh.ZError):
+            self._token.undeclare()
+            self._publisher.undeclare()
+
+    def _match(self, status: zenoh.MatchingStatus) -> None:
+        self.matched = status.matching
+
+
+class RosSubscription:
+    """Hands every sample of one topic to ``take``, in zenoh's thread. ``oversized``: not taken."""
+
+    def __init__(
+        self, session: zenoh.Session, endpoint: Endpoint, take: Callable[[BusSample], None]
+    ) -> None:
+        self.endpoint = endpoint
+        self.oversized = 0
+        self._take = take
+        self._subscriber = session.declare_subscriber(endpoint.key, self._hear)
+        self._token = session.liveliness().declare_token(endpoint.token)
+
+    def close(self) -> None:
+        """Take the subscription and its token back."""
+        with contextlib.suppress(zenoh.ZError):
+            self._token.undeclare()
+            self._subscriber.undeclare()
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        if len(sample.payload) > MAX_PAYLOAD:
+            self.oversized += 1
+        else:
+            self._take(read_sample(sample))
+
+
+class RosNode:
+    """One node with its endpoints. Not thread-safe: declare and close from one thread."""
+
+    def __init__(
+        self, router: str, name: str, *, namespace: str = "", domain: int = 0, distro: str
+    ) -> None:
+        self.distro = distro
+        self._session = open_client(router)
+        self.node = Node(domain, str(self._session.zid()), name, namespace)
+        self._endpoints: list[RosPublisher | RosSubscription] = []
+        self._token = self._session.liveliness().declare_token(self.node.token)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the router is there."""
+        return bool(self._session.info.routers_zid())
+
+    def publish(self, topic: str, type_name: str, qos: Qos = STREAM) -> RosPublisher:
+        """Declare a publisher; ``topic`` is within the namespace unless it begins with a slash."""
+        made = RosPublisher(self._session, self._endpoint("MP", topic, type_name, qos))
+        self._endpoints.append(made)
+        return made
+
+    def subscribe(
+        self, topic: str, type_name: str, take: Callable[[BusSample], None], qos: Qos = STREAM
+    ) -> RosSubscription:
+        """Declare a subscription; see `publish`."""
+        made = RosSubscription(self._session, self._endpoint("MS", topic, type_name, qos), take)
+        self._endpoints.append(made)
+        return made
+
+    def close(self, timeout_s: float = 1.0) -> None:
+        """Take everything back and leave; a router that does not answer is not waited for."""
+
+        def leave() -> None:
+            for endpoint in self._endpoints:
+                endpoint.close()
+            with contextlib.suppress(zenoh.ZError):
+                self._token.undeclare()
+                self._session.close()
+
+        thread = threading.Thread(target=leave, name="ros2-close", daemon=True)
+        thread.start()
+        thread.join(timeout_s)
+
+    def _endpoint(self, kind: EndpointKind, topic: str, type_name: str, qos: Qos) -> Endpoint:
+        rihs01 = codec().schema(type_name).type_hash
+        return Endpoint(
+            node=self.node,
+            number=len(self._endpoints) + 1,
+            kind=kind,
+            topic=self.node.resolve(topic),
+            type_name=type_name,
+            type_hash=type_hash(self.distro, rihs01),
+            qos=qos,
+        )
