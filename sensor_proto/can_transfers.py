@@ -353,7 +353,7 @@ class CanDecoder:
         if not size <= len(raw) <= size + (_FD_PADDING if fd else 0):
             self._tally[Reject.LENGTH] += 1
             return None
-        if size > packets.MAX_PACKET:
+        if size > MAX_PACKET:
             self._tally[Reject.OVERSIZED] += 1
             return None
         return raw[:size]

@@ -119,8 +119,9 @@ class Live:
     """
 
     def __init__(self, bus: zenoh.Session, port: int = DEFAULT_PORT, *, control: bool = False):
-        import foxglove
         from foxglove.websocket import Capability
+
+        import foxglove
 
         self.counts: Counter[str] = Counter()
         self._bus = bus

@@ -27,7 +27,7 @@ from sim_device.world.engines import make_world
 from sim_device.world.scene_loading import load_scene
 from tactile_core.geometry import Side
 from tactile_core.types import Instant, after, seconds_between
-from tactile_tools.reach.lockstep import BEGIN, PERIOD
+from tactile_tools.reach.lockstep import BEGIN
 from tactile_tools.reach.touch_senses import ContactSense, Sense, TaxelSense
 
 Float32 = NDArray[np.float32]
@@ -259,7 +259,7 @@ class _Episode:
         }
 
     def _advance(self) -> None:
-        self._now = after(self._now, PERIOD)
+        self._now = after(self._now, self._p.safety.period)
         self._state = self._arm.advance(self._now)[-1]
         self._touch = self._sense.feel(self._world, self._now)
 

@@ -33,6 +33,7 @@ from tactile_core.bus.topics import (
     Topic,
     find_topic,
 )
+from tactile_core.cli import progress
 from tactile_core.types import NS_PER_S
 from tactile_tools.log.decode import Decoder
 from tactile_tools.log.sources import Series
@@ -43,7 +44,6 @@ from tactile_tools.log.terminal import (
     cannot_write,
     complain,
     plain_console,
-    progress,
 )
 
 Float32 = NDArray[np.float32]

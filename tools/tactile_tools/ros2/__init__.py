@@ -1,5 +1,1 @@
-"""``tactile ros2``: a bridge to ROS 2 over zenoh, and the message package for a ROS workspace."""
-
-from tactile_tools.ros2.cli import add_parser
-
-__all__ = ["add_parser"]
+"""ROS 2 without ROS: a bridge to rmw_zenoh, and our messages as a source package."""

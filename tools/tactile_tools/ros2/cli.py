@@ -17,7 +17,9 @@ DONE, REFUSED = 0, 3
 HERE = "tactile_tools.ros2.cli"
 
 COMMANDS = {
-    "bridge": Command("make our streams ROS 2 topics, and pass requests on", f"{HERE}:_fill_bridge"),
+    "bridge": Command(
+        "make our streams ROS 2 topics, and pass requests on", f"{HERE}:_fill_bridge"
+    ),
     "package": Command("write the ROS 2 source package tactile_msgs", f"{HERE}:_fill_package"),
 }
 
