@@ -49,6 +49,10 @@ not writable.
 """
 
 
+VIEW_PORT = 8420
+"""Where the live page is, unless another port is asked for."""
+
+
 class _Port(argparse.Action):
     """Collects --port and --can in one list, in the order in which they were given."""
 
@@ -183,6 +187,14 @@ def make_parser() -> argparse.ArgumentParser:
         default=1.0,
         metavar="X",
         help="of a replay: times real time, or inf (default 1)",
+    )
+    add(
+        "--view",
+        type=whole(most=65_535),
+        nargs="?",
+        const=VIEW_PORT,
+        metavar="PORT",
+        help=f"open the live page, too: http://127.0.0.1:PORT (default {VIEW_PORT}; 0: any)",
     )
     add("--verbose", action="store_true", help="say more")
     return parser

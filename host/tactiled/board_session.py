@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from tactile_core.bus.topics import AMBIENT, CONTACTS, FEATURES, FIELD, FORCES, GEOMETRY, LOG, Topic
-from tactile_core.calibration import saves
+from tactile_core.calibration import BoardCalibration, saves
 from tactile_core.calibration.file import SUFFIX
 from tactile_core.log.recorder import Recorder
 from tactile_core.throttle import Throttle
@@ -193,17 +193,27 @@ class Station:
         self._maker = MessageMaker(calibration, self._outlet.wall)
         self._picture = SkinPicture(calibration.geometry)
         self.chips = ChipWatch(calibration.geometry)
-        recorder = self.recorder
-        if recorder is not None:
-            text = saves(calibration).encode()
-            recorder.attach(f"{self.name}{SUFFIX}", "application/toml", text)
-            summary = {key: str(value) for key, value in self.calibration_summary().items()}
-            recorder.metadata(
-                f"board:{self.name}",
-                {"model": identity.model, "firmware": identity.firmware} | summary,
-            )
+        if self.recorder is not None:
+            self._attach_calibration(self.recorder, calibration, identity)
             self._note_state()
         self.send_geometry()
+
+    def describe_to(self, recorder: Recorder | None) -> None:
+        """Begin another log of this board: its calibration there, its geometry to everybody."""
+        if recorder is not None and self.choice is not None and self.identity is not None:
+            self._attach_calibration(recorder, self.choice.calibration, self.identity)
+        self.send_geometry()
+
+    def _attach_calibration(
+        self, recorder: Recorder, calibration: BoardCalibration, identity: Identity
+    ) -> None:
+        text = saves(calibration).encode()
+        recorder.attach(f"{self.name}{SUFFIX}", "application/toml", text)
+        summary = {key: str(value) for key, value in self.calibration_summary().items()}
+        recorder.metadata(
+            f"board:{self.name}",
+            {"model": identity.model, "firmware": identity.firmware} | summary,
+        )
 
     def _note_state(self) -> None:
         """Have every later file of the log say what is needed to run it by itself."""

@@ -59,7 +59,21 @@ def _run(ending: Ending, options: argparse.Namespace) -> int:
             raise CommandError(trouble, REFUSED)
         return DONE
 
-    return serve(daemon, ending, "running", work)
+    def work_with_page() -> int:
+        from tactiled.page import PageError, PageProcess
+
+        if options.view is None:
+            return work()
+        try:
+            page = PageProcess(options.view, daemon.settings.bus)
+        except (PageError, OSError) as error:
+            raise CommandError(str(error), REFUSED) from error
+        try:
+            return work()
+        finally:
+            page.close()
+
+    return serve(daemon, ending, "running", work_with_page)
 
 
 def _watch(daemon: Daemon, status: StatusLines, ending: Ending) -> str | None:

@@ -38,6 +38,7 @@ from tactiled.memory import Collector, return_large_buffers
 from tactiled.port import Port, Trouble
 from tactiled.publisher import Outlet
 from tactiled.reader import MAX_AGE, Inbox, PortReader, Wake
+from tactiled.recordings import Recordings
 from tactiled.rerun import PORT_PREFIX, RecordedError, describe, recorded_port
 from tactiled.services import BoardServices
 from tactiled.settings import REPLAY_PREFIX, PortSettings, Settings
@@ -90,6 +91,7 @@ class Daemon(Service):
         self._calls: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._session: zenoh.Session | None = None
         self._outlet: Outlet | None = None
+        self._recordings: Recordings | None = None
         self._readers: list[PortReader] = []
         self._services: list[BoardServices] = []
         self._tokens: list[zenoh.LivelinessToken] = []
@@ -121,6 +123,9 @@ class Daemon(Service):
         transports = [_make_transport(port, settings.speed) for port in settings.ports]
         self._session = session = open_session(settings.bus)
         self._outlet = outlet = Outlet(session, None, self._wall, self._prefix)
+        self._recordings = Recordings(
+            outlet, settings.recorder, settings.log, self._call, lambda: self.stations
+        )
         for wanted, transport in zip(settings.ports, transports, strict=True):
             self.ports.append(self._make_port(wanted, transport, outlet))
         if settings.log is not None:
@@ -173,9 +178,10 @@ class Daemon(Service):
 
     def _open_station(self, port: Port, node: int, name: str) -> Station | Trouble:
         """Take a name on the bus; called from the pipeline's thread for boards on a CAN bus."""
-        session, outlet = self._session, self._outlet
+        session, outlet, recordings = self._session, self._outlet, self._recordings
         assert session is not None
         assert outlet is not None
+        assert recordings is not None
         station = Station(name, outlet, self._shelf, self.settings.pipeline)
         if self._prefix:
             # A recording is nobody to be spoken to.
@@ -186,7 +192,9 @@ class Daemon(Service):
                 "stop that one, or give this board another --name",
             )
         self._tokens.append(declare_alive(session, name))
-        self._services.append(BoardServices(session, self._call, self._shelf, port, node, station))
+        self._services.append(
+            BoardServices(session, self._call, self._shelf, port, node, station, recordings)
+        )
         return station
 
     def _open_log(self, destination: Path) -> Recorder:
@@ -230,6 +238,9 @@ class Daemon(Service):
         self._services.clear()
         if self._outlet is not None:
             self._outlet.end()
+        if self._recordings is not None and not self._recordings.close():
+            log.error("the recording was not closed in time; see `tactile log recover`")
+            clean = False
         if self.recorder is not None and not self.recorder.close():
             log.error("the log was not closed in time; see `tactile log recover`")
             clean = False
@@ -332,6 +343,8 @@ class Daemon(Service):
         outlet = self._outlet
         if outlet is None:
             return
+        if self._recordings is not None:
+            self._recordings.each_second(now)
         for port in self.ports:
             for node, station in port.stations.items():
                 try:
@@ -348,6 +361,8 @@ class Daemon(Service):
         wall_ns = self._wall.wall_ns(now)
         values = diagnostics.summary(port, node, station, now)
         values["alarms"] = self._alarms.each_second(station, now)
+        if self._recordings is not None:
+            values["recording"] = self._recordings.summary()
         station.summary = values
         message = diagnostics.message(station.name, values, self.recorder, wall_ns)
         outlet.send(DIAGNOSTICS, station.name, message, wall_ns)

@@ -228,6 +228,8 @@ class Outlet:
     ) -> None:
         self.wall = wall
         self.recorder = recorder
+        self.recording: Recorder | None = None
+        """A second log, of what is published, while somebody has asked for one."""
         self.late = 0
         self.refused = 0
         self._ended = False
@@ -248,11 +250,15 @@ class Outlet:
         ValueError or TypeError for a message that cannot be encoded, and for nothing else.
         """
         data = self._codec.encode(topic, message)
+        recorder, recording = self.recorder, None
         if topic.published:
             self._publish(topic, name, data, stamp_ns)
-        if self.recorder is not None and topic.logged:
+            recording = self.recording
+        if topic.logged and (recorder is not None or recording is not None):
             now_ns = self.wall.wall_ns(monotonic_now())
-            self.recorder.write(topic, name, data, now_ns, stamp_ns)
+            for log_of in (recorder, recording):
+                if log_of is not None:
+                    log_of.write(topic, name, data, now_ns, stamp_ns)
 
     def raw(self, name: str, port: str, chunk: Chunk) -> None:
         """Log what one read returned; called from the reader's thread."""

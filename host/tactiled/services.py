@@ -1,4 +1,4 @@
-"""What can be asked of a board while it runs: status, tare, set_rate, recalibrate, geometry.
+"""Services of a running board: status, tare, set_rate, recalibrate, geometry, record.
 
 Requests come on zenoh's threads and are carried out by the pipeline's thread. Whatever goes wrong
 comes back as an error reply.
@@ -27,6 +27,7 @@ from tactiled.boards.events import Answered, Event
 from tactiled.calibration_store import Shelf
 from tactiled.diagnostics import log_summary, summary
 from tactiled.port import Port
+from tactiled.recordings import Recordings, RecordRequest
 
 PIPELINE_TIMEOUT = 1.0
 """s the pipeline's thread may take to look at a request: it does so every 10 ms."""
@@ -76,9 +77,11 @@ class BoardServices:
         port: Port,
         node: int,
         station: Station,
+        recordings: Recordings,
         prefix: str = "",
     ) -> None:
         self._run = run
+        self._recordings = recordings
         self._shelf = shelf
         self._port = port
         self._node = node
@@ -89,6 +92,7 @@ class BoardServices:
             "set_rate": (self._set_rate, RateRequest),
             "recalibrate": (self._recalibrate, Nothing),
             "geometry": (self._geometry, Nothing),
+            "record": (recordings.serve, RecordRequest),
         }
         lead = f"{prefix}/" if prefix else ""
         self._services: list[Service] = [
@@ -106,6 +110,7 @@ class BoardServices:
             values = summary(self._port, self._node, self._station, monotonic_now())
             recorder = self._station.recorder
             values["alarms"] = self._station.summary.get("alarms", [])
+            values["recording"] = self._recordings.summary()
             return values | {"log": None if recorder is None else log_summary(recorder)}
 
         result: dict[str, Any] = self._do(sum_up)

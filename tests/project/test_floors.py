@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[2]
 ROOMS = {
     "sensor_proto": ROOT / "sensor_proto",
     "tactile_core": ROOT / "host" / "tactile_core",
+    "tactile_reach": ROOT / "host" / "tactile_reach",
     "tactiled": ROOT / "host" / "tactiled",
     "reachd": ROOT / "host" / "reachd",
     "sim_device": ROOT / "sim_device",
@@ -21,10 +22,18 @@ ROOMS = {
 MAY_IMPORT = {
     "sensor_proto": set(),
     "tactile_core": {"sensor_proto"},
+    "tactile_reach": {"sensor_proto", "tactile_core"},
     "tactiled": {"sensor_proto", "tactile_core"},
     "reachd": {"sensor_proto", "tactile_core"},
     "sim_device": {"sensor_proto", "tactile_core"},
-    "tactile_tools": {"sensor_proto", "tactile_core", "tactiled", "reachd", "sim_device"},
+    "tactile_tools": {
+        "sensor_proto",
+        "tactile_core",
+        "tactile_reach",
+        "tactiled",
+        "reachd",
+        "sim_device",
+    },
 }
 IO_MODULES = {"serial", "can", "zenoh", "mcap", "threading", "socket", "logging", "time", "os"}
 

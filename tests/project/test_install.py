@@ -12,7 +12,10 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = ("tactiled", "reachd", "simdevice", "tactile")
-TOP_LEVEL = {"sensor_proto", "sim_device", "tactile_core", "tactiled", "reachd", "tactile_tools"}
+TOP_LEVEL = {
+    "sensor_proto", "sim_device", "tactile_core", "tactile_reach", "tactiled", "reachd",
+    "tactile_tools",
+}  # fmt: skip
 
 
 def run(*words: str | Path, **kwargs: object) -> subprocess.CompletedProcess[str]:
@@ -44,6 +47,7 @@ def test_wheel_holds_only_our_packages(wheel: Path) -> None:
     assert {t for t in tops if not t.endswith(".dist-info")} == TOP_LEVEL
     assert "sensor_proto/PROTOCOL.md" in names
     assert "tactile_core/bus/msg/ContactFeatures.msg" in names
+    assert "tactile_tools/view/page/index.html" in names
 
 
 @pytest.mark.timeout(300)

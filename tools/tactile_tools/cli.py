@@ -52,6 +52,12 @@ COMMANDS: Final = {
     "status": Command("how the boards of a running tactiled do", f"{HERE}:_fill_status"),
     "tare": Command("take what the untouched skin reads now as its rest", f"{HERE}:_fill_tare"),
     "health": Command("say in one line whether a rig is well", f"{HERE}:_fill_health"),
+    "view": Command("the live page: skin, forces and reach in a browser", "tactile_tools.bus_commands:fill_view"),
+    "list": Command("what is on the bus: keys, rates, services", "tactile_tools.bus_commands:fill_list"),
+    "echo": Command("print the messages of a key", "tactile_tools.bus_commands:fill_echo"),
+    "hz": Command("rate, jitter and losses of a key", "tactile_tools.bus_commands:fill_hz"),
+    "call": Command("ask a service of a daemon", "tactile_tools.bus_commands:fill_call"),
+    "cpp-header": Command("messages and their decoder as a C++ header", "tactile_tools.bus_commands:fill_cpp_header"),
     "board-check": Command(
         "prove that a board speaks the wire protocol", f"{HERE}:_fill_board_check"
     ),
@@ -280,6 +286,15 @@ def _fill_demo(parser: Parser) -> None:
     add_strategy(parser)
     add_scene(parser)
     add_seeds(parser, default=35)
+    parser.add_argument(
+        "--view-port",
+        type=whole(most=65_535),
+        default=8420,
+        metavar="N",
+        help="of the live page on which the demo can be watched (default 8420; another that is "
+        "free when that is in use)",
+    )
+    parser.add_argument("--no-view", action="store_true", help="open no page")
     parser.set_defaults(func=later("tactile_tools.demo:run"))
 
 

@@ -6,16 +6,18 @@ import argparse
 import contextlib
 import itertools
 import os
+import socket
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
 
 from tactile_core.cli import FAILED, REFUSED, CommandError, require, seeds_of, working
 from tactile_tools.plot.series import LogUnreadableError
-from tactile_tools.processes import busy_text, command, running, socket_at, wait_for
+from tactile_tools.processes import busy_text, command, free_port, running, socket_at, wait_for
 
 BOARD = "finger"
 
@@ -26,6 +28,11 @@ SEED = 35
 """A scene in which hybrid_event needs all it has: it goes straight, burrows past objects at the
 front, stalls at a heavy disc before the target and excavates. It gets there in every run so far,
 in lockstep and in real time, also on a machine with four times the work it can do."""
+
+VIEW_PORT = 8420
+
+PAGE_S = 20.0
+"""For the live page to answer, on a busy machine."""
 
 TIME_LIMIT_S = 30.0
 """The authors' 20 s, and what a busy machine takes: whatever is stale there holds the arm."""
@@ -114,7 +121,7 @@ def what_next(log: Path, png: Path) -> str:
     return (
         f"wrote {log} and {png}\n"
         f"Next: open {png}; `tactile log info {log}` says what the log holds, `tactile plot {log} "
-        "--what forces` draws it otherwise, and Foxglove plays it."
+        "--what forces` draws it otherwise, `tactile view {log}` plays it."
     )
 
 
@@ -153,6 +160,17 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
         flush=True,
     )
     with contextlib.ExitStack() as stack:
+        if not options.no_view:
+            port = _page_port(options.view_port)
+            page = [command("tactile"), "view", "--port", str(port)]
+            page += [word for at in (arm, skin, reach) for word in ("--connect", at)]
+            said = folder / "view.txt"
+            showing = stack.enter_context(running(page, said))
+            address = f"http://127.0.0.1:{port}"
+            if _is_served(port, showing):
+                print(f"Watch it at {address}", flush=True)
+            else:
+                print(f"The live page could not be opened: {said.read_text()[-300:]}", flush=True)
         said = folder / "cupboard.txt"
         first = stack.enter_context(running([*cupboard, "--connect", skin], said))
         wait_for(board, first, said)
@@ -172,6 +190,27 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
             for name in ("cupboard.txt", "tactiled.txt"):
                 print(f"--- {name}\n{(folder / name).read_text(errors='replace')[-1500:]}")
     return code
+
+
+def _page_port(wanted: int) -> int:
+    """``wanted``, or another where somebody has it."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", wanted))
+        except OSError:
+            return free_port()
+        return int(probe.getsockname()[1])
+
+
+def _is_served(port: int, process: subprocess.Popen[bytes]) -> bool:
+    """Wait until the page answers; False when its process has ended, or it takes too long."""
+    deadline = time.monotonic() + PAGE_S
+    while process.poll() is None and time.monotonic() < deadline:
+        with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0):
+            return True
+        time.sleep(0.05)
+    return False
 
 
 def _ended(process: subprocess.Popen[bytes]) -> int:

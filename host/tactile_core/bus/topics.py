@@ -101,8 +101,8 @@ def find_topic(key: str) -> tuple[Topic, str] | None:
 def service_key(name: str, service: str, kind: str = "tactile") -> str:
     """Key of a queryable of a daemon.
 
-    ``kind`` tactile: status, tare, set_rate, recalibrate; arm: claim, release, limits, clear,
-    status; reach: goal, stop, reset, arm, clear, status.
+    ``kind`` tactile: status, tare, set_rate, record, recalibrate, geometry; arm: claim, release,
+    limits, clear, status; reach: goal, stop, reset, arm, clear, status.
     """
     return Topic(kind + "/{name}/srv/" + service, "", 0).key(name)
 

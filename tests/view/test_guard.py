@@ -1,0 +1,66 @@
+"""Who may open the page: pure decisions, and the kernel's word on who owns a connection."""
+
+from __future__ import annotations
+
+import os
+import socket
+
+import pytest
+
+from tactile_tools.view.guard import Guard, is_loopback, owner_of
+
+TOKEN = "a" * 24
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:8420", "localhost:8420", "[::1]:8420", "localhost:99"])
+def test_names_of_this_machine_are_served(host: str) -> None:
+    assert Guard(8420).refuse_host(host) is None
+
+
+@pytest.mark.parametrize(
+    "host", [None, "", "evil.example:8420", "127.0.0.1.evil.example", "10.0.0.2:8420", "a b", "\r"]
+)
+def test_other_names_are_refused_so_that_a_name_made_to_point_here_gets_nothing(
+    host: str | None,
+) -> None:
+    assert Guard(8420).refuse_host(host)
+
+
+def test_with_a_token_addresses_are_served_and_names_that_were_given() -> None:
+    guard = Guard(8420, TOKEN, frozenset({"robot"}))
+    assert guard.refuse_host("10.0.0.2:8420") is None
+    assert guard.refuse_host("robot:8420") is None
+    assert guard.refuse_host("robot:80")
+    assert guard.refuse_host("evil.example:8420")
+
+
+def test_pages_of_others_may_not_use_the_stream() -> None:
+    guard = Guard(8420)
+    assert guard.refuse_origin("127.0.0.1:8420", "http://127.0.0.1:8420") is None
+    assert guard.refuse_origin("127.0.0.1:8420", None) is None
+    for origin in ("http://evil.example", "null", "http://127.0.0.1:9999", "file://"):
+        assert guard.refuse_origin("127.0.0.1:8420", origin)
+
+
+def test_the_token_is_known_by_address_or_cookie_and_nothing_else() -> None:
+    guard = Guard(8420, TOKEN)
+    assert guard.knows_token(f"/?token={TOKEN}", None)
+    assert guard.knows_token("/live", f"other=1; {guard.cookie}={TOKEN}")
+    for path, cookies in (
+        ("/", None), ("/?token=b", None), ("/", f"{guard.cookie}=b"), ("/?token=%FF", "=;=\x01")
+    ):  # fmt: skip
+        assert not guard.knows_token(path, cookies)
+
+
+def test_the_owner_of_a_connection_is_who_opened_it() -> None:
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        socket.create_connection(server.getsockname()) as client,
+    ):
+        assert owner_of(client.getsockname()) in (os.getuid(), None)
+    assert owner_of(("not an address", 1)) is None
+
+
+def test_what_is_loopback() -> None:
+    assert all(map(is_loopback, ("127.0.0.1", "127.9.9.9", "::1", "localhost")))
+    assert not any(map(is_loopback, ("0.0.0.0", "::", "10.0.0.1", "robot")))

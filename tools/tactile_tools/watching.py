@@ -1,0 +1,55 @@
+"""Keys, errors and the bus for ``tactile list``, ``echo``, ``hz`` and ``call``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+
+import tactile_reach as tr
+from tactile_core.options import BusTable, add_bus, bus_config
+from tactile_reach.client import Bus
+
+DONE, FAILED, USAGE, REFUSED = range(4)
+
+QUIET_S = 3.0
+"""Without a message after which a command says that it waits."""
+
+
+def key_of(text: str) -> str:
+    """A key expression; a leading slash, as topics in logs have it, is left out."""
+    import zenoh
+
+    try:
+        return str(zenoh.KeyExpr(text.strip("/")))
+    except zenoh.ZError as error:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a key; expected one as in tactile/left/features, or with wildcards "
+            "as in tactile/*/features"
+        ) from error
+
+
+def open_bus(options: argparse.Namespace) -> Bus:
+    """The bus as the flags ask for; `tactile_reach.TactileError` when it cannot be joined."""
+    return Bus(bus_config(options, BusTable(), "tool"))
+
+
+def run(name: str, work: Callable[[argparse.Namespace], int | None]) -> Callable[..., int]:
+    """``work`` as a command ``tactile name``: errors become one sentence and an exit status."""
+
+    def command(options: argparse.Namespace) -> int:
+        try:
+            return work(options) or DONE
+        except tr.TactileError as error:
+            print(f"tactile {name}: {error}", file=sys.stderr)
+            return REFUSED
+
+    return command
+
+
+def say_quiet(name: str, key: str) -> None:
+    """Tell a user who waits that nothing comes."""
+    print(
+        f"tactile {name}: nothing on {key} yet; `tactile list` shows what is published",
+        file=sys.stderr,
+    )
