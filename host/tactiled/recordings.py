@@ -20,8 +20,8 @@ from typing import Any, Literal
 import msgspec
 
 from tactile_core.bus.services import ServiceError
+from tactile_core.cli import DEFAULT_LOG
 from tactile_core.log.recorder import Recorder, RecorderError, RecorderSettings
-from tactile_core.options import DEFAULT_LOG
 from tactile_core.types import Instant, WallClock, after, monotonic_now, seconds_between, utc_text
 from tactiled.board_session import Station
 from tactiled.publisher import Outlet

@@ -11,8 +11,6 @@ from tactile_tools import watching
 TIMEOUT_S = 5.0
 
 
-
-
 def call(options: argparse.Namespace) -> None:
     """Ask, and print what comes back."""
     with watching.open_bus(options) as bus:

@@ -40,6 +40,7 @@ from tactile_tools.options import (
 )
 
 HERE: Final = "tactile_tools.cli"
+BUS: Final = "tactile_tools.bus_commands"
 
 COMMANDS: Final = {
     "log": Command(
@@ -52,12 +53,12 @@ COMMANDS: Final = {
     "status": Command("how the boards of a running tactiled do", f"{HERE}:_fill_status"),
     "tare": Command("take what the untouched skin reads now as its rest", f"{HERE}:_fill_tare"),
     "health": Command("say in one line whether a rig is well", f"{HERE}:_fill_health"),
-    "view": Command("the live page: skin, forces and reach in a browser", "tactile_tools.bus_commands:fill_view"),
-    "list": Command("what is on the bus: keys, rates, services", "tactile_tools.bus_commands:fill_list"),
-    "echo": Command("print the messages of a key", "tactile_tools.bus_commands:fill_echo"),
-    "hz": Command("rate, jitter and losses of a key", "tactile_tools.bus_commands:fill_hz"),
-    "call": Command("ask a service of a daemon", "tactile_tools.bus_commands:fill_call"),
-    "cpp-header": Command("messages and their decoder as a C++ header", "tactile_tools.bus_commands:fill_cpp_header"),
+    "view": Command("the live page: skin, forces and reach in a browser", f"{BUS}:fill_view"),
+    "list": Command("what is on the bus: keys, rates, services", f"{BUS}:fill_list"),
+    "echo": Command("print the messages of a key", f"{BUS}:fill_echo"),
+    "hz": Command("rate, jitter and losses of a key", f"{BUS}:fill_hz"),
+    "call": Command("ask a service of a daemon", f"{BUS}:fill_call"),
+    "cpp-header": Command("messages and their decoder as a C++ header", f"{BUS}:fill_cpp_header"),
     "board-check": Command(
         "prove that a board speaks the wire protocol", f"{HERE}:_fill_board_check"
     ),

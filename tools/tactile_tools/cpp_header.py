@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import Any
 
 from tactile_core.bus.messages import OWN_PACKAGE, SHORT_NAMES, codec
@@ -129,8 +128,6 @@ T decode(const std::uint8_t* data, std::size_t size) {
 }
 
 """
-
-
 
 
 def run(options: argparse.Namespace) -> int:

@@ -23,8 +23,6 @@ LENGTH = struct.Struct("<I")
 """Before each message of ``--cdr``: its length in bytes."""
 
 
-
-
 def echo(options: argparse.Namespace) -> int:
     """Print messages until told to stop."""
     decoder, schemas = Decoder(), {}

@@ -19,8 +19,6 @@ KEYS = 256
 """Keys that one line is printed of; those of a wildcard that come later are counted together."""
 
 
-
-
 @dataclass(slots=True)
 class _Key:
     count: int = 0

@@ -29,8 +29,6 @@ SERVICES = {
 """What can be asked of whom, by the kind of the name."""
 
 
-
-
 def list_bus(options: argparse.Namespace) -> None:
     """Print keys and services; `NotThereError` when there is nothing."""
     counts: Counter[str] = Counter()

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 
 import tactile_reach as tr
-from tactile_core.options import BusTable, add_bus, bus_config
+from tactile_core.options import BusTable, bus_config
 from tactile_reach.client import Bus
 
 DONE, FAILED, USAGE, REFUSED = range(4)

@@ -10,7 +10,6 @@ import os
 import signal
 import socket
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tactile_core.bus.session import BusError
@@ -38,8 +37,6 @@ examples:
 exit status: 0 ended on request; 2 bad argument, or a log without anything to show; 3 the port is
 in use or cannot be had.
 """
-
-
 
 
 def run(options: argparse.Namespace) -> int:
