@@ -14,7 +14,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["
 WHEELS = json.loads((ROOT / "tests/data/core_wheels.json").read_text(encoding="utf-8"))["wheels"]
 CORE = {
     "numpy", "pyserial", "python-can", "eclipse-zenoh", "mcap", "zstandard", "rosbags", "msgspec",
-    "rich", "psutil",
+    "rich", "psutil", "websockets",
 }  # fmt: skip
 
 
@@ -42,5 +42,5 @@ def test_every_extra_that_a_command_names_exists_and_all_holds_them() -> None:
     assert set(EXTRAS.values()) | {"experiments"} <= set(extras)
     (everything,) = extras["all"]
     held = set(re.search(r"\[(.*)\]", everything)[1].split(","))  # type: ignore[index]
-    assert held == set(extras) - {"all", "dev", "docs", "reference"}
+    assert held == set(extras) - {"all", "browser", "dev", "docs", "reference"}
     assert "tactile-reach[all]" in extras["dev"]

@@ -385,7 +385,7 @@ def bridge_process(bus: Any, router: str, *words: str) -> subprocess.Popen[str]:
         (("--domain", "500"), "expected 0 to 232"),
         (("--namespace", "/9lives"), "invalid namespace"),
         (("--node", "my node"), "invalid node name"),
-        (("--accept", "everything"), "invalid choice"),
+        (("--accept", "everything"), "allowed: goals, twist, wrench"),
     ],
 )
 def test_bad_arguments_are_refused(

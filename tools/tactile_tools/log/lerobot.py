@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -483,11 +482,3 @@ def _difference(
                 f"{len(ours)} ({', '.join(extra) or 'in another order'}); export them apart"
             )
     raise ValueError("the logs hold the same")
-
-
-def fps_of(text: str) -> int:
-    """Frames a second of ``--fps``; ValueError when it is not a whole number from 1 to 1000."""
-    value = float(text)
-    if not (math.isfinite(value) and value == round(value) and 1 <= value <= MAX_FPS):
-        raise ValueError(text)
-    return round(value)

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from tactile_core.bus.topics import NAME
-from tactile_core.cli import Command, Parser, add_bus, add_commands
+from tactile_core.cli import Command, Parser, add_bus, add_commands, add_path
 from tactile_tools.ros2.names import DEFAULT_DISTRO, DISTROS, MAX_DOMAIN, NAMESPACE, NODE_NAME
 
 DONE, REFUSED = 0, 3
@@ -91,13 +91,7 @@ def _fill_package(package: Parser) -> None:
         "Writes package.xml, CMakeLists.txt and the message definitions: put the folder into a "
         "workspace's src and build it with colcon."
     )
-    package.add_argument(
-        "--out",
-        type=Path,
-        default=Path("tactile_msgs"),
-        metavar="FOLDER",
-        help="default ./%(default)s",
-    )
+    add_path(package, "--out", "folder to write (default: ./tactile_msgs)")
     package.set_defaults(func=_package)
 
 
@@ -138,8 +132,9 @@ def _name(text: str) -> str:
 
 
 def _package(options: argparse.Namespace) -> int:
-    from tactile_tools.ros2.package import write
+    from tactile_tools.ros2.package import PACKAGE, write
 
+    options.out = options.out or Path(PACKAGE)
     try:
         written = write(options.out)
     except OSError as error:
