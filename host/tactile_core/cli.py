@@ -338,8 +338,18 @@ def run_command(
 
 
 def complain(prog: str, error: CommandError) -> int:
-    """Say what is wrong; the exit status."""
-    print(f"{prog}: {error}", file=sys.stderr)
+    """Say what is wrong; the exit status.
+
+    The text may repeat what a log or a peer says: nothing in it that a terminal would act on is
+    printed as it is.
+    """
+    text = "".join(
+        letter
+        if letter.isprintable() or letter == "\n"
+        else letter.encode("unicode_escape", "backslashreplace").decode()
+        for letter in str(error)
+    )
+    print(f"{prog}: {text}", file=sys.stderr)
     return error.code
 
 

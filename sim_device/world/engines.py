@@ -37,7 +37,7 @@ class WorldMaker(Protocol):
 def world_maker(engine: str) -> WorldMaker:
     """How to build a world in ``engine``; `EngineMissing`, or ValueError: there is none such."""
     if engine not in _CLASSES:
-        raise ValueError(f"unknown engine {engine!r}; there are: {', '.join(ENGINES)}")
+        raise ValueError(f"unknown engine {engine!r}; available: {', '.join(ENGINES)}")
     require(engine, extra=EXTRAS[engine], what=f"engine {engine!r}")
     module: Any = import_module(f"sim_device.world.{engine}_world")
     return cast("WorldMaker", getattr(module, _CLASSES[engine]))

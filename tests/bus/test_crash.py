@@ -34,4 +34,4 @@ def test_wrong_arguments_are_refused(words: list[str], capsys: pytest.CaptureFix
     with pytest.raises(SystemExit) as ended:
         main(["crash", *words])
     assert ended.value.code == 2
-    assert "allowed: a whole number above 0" in capsys.readouterr().err
+    assert "allowed: a whole number of at least 1" in capsys.readouterr().err

@@ -267,10 +267,14 @@ def test_stamps_use_the_clock_offset_taken_at_start(tmp_path: Path, record: Any)
     assert abs(offset - WallClock.take().offset_ns) < 60e9
 
 
+@pytest.mark.parametrize("pause_s", [0.001, 0.0])
 def test_file_size_limit_is_handled_like_a_full_disk(
-    tmp_path: Path, logs: Any, sequences: Any
+    tmp_path: Path, logs: Any, sequences: Any, pause_s: float
 ) -> None:
-    """The kernel refuses bytes in the middle of a write: RLIMIT_FSIZE in a process of its own."""
+    """The kernel refuses bytes in the middle of a write: RLIMIT_FSIZE in a process of its own.
+
+    Without a pause the first file fails while far more waits than one file may hold.
+    """
     limit = 40_000
     code = textwrap.dedent("""
         import os, sys, time
@@ -283,13 +287,13 @@ def test_file_size_limit_is_handled_like_a_full_disk(
         recorder = Recorder(Path(sys.argv[1]), settings)
         for i in range(400):
             recorder.write(topics.RAW, "b0", os.urandom(300), 10**18 + i, 10**18 + i)
-            time.sleep(0.001)
+            time.sleep(float(sys.argv[2]))
         closed = recorder.close(60)
         stats = recorder.stats
         print(closed, stats.written, stats.errors, sum(stats.dropped.values()))
     """)
     result = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path)],
+        [sys.executable, "-c", code, str(tmp_path), str(pause_s)],
         capture_output=True,
         text=True,
         timeout=100,

@@ -291,7 +291,7 @@ def test_plain_tcp_requires_the_secret(join: Any, plain: Any) -> None:
 
 
 def test_at_a_unix_socket_a_stranger_without_the_secret_is_not_heard(
-    rig: Path, join: Any, plain: Any, until: Any
+    rig: Path, join: Any, plain: Any
 ) -> None:
     """Somebody who got as far as the socket (its group, a folder opened by mistake)."""
     arm = join(role="arm", connect=())
@@ -307,16 +307,14 @@ def test_at_a_unix_socket_a_stranger_without_the_secret_is_not_heard(
             session.put("arm/arm/cmd_vel", b"evil")
         friend.put("arm/arm/cmd_vel", b"friend")
 
-    until(lambda: send() or len(obeyed) > 50)
+    wait_until(lambda: send() or len(obeyed) > 50)
     assert set(obeyed) == {b"friend"}
     assert [list(session.info.peers_zid()) for session in evil] == [[], []]
     for session in evil:
         assert list(session.get("arm/arm/srv/limits", timeout=0.3)) == []
 
 
-def test_explicit_insecure_mode_admits_everyone(
-    join: Any, plain: Any, free_port: Any, until: Any
-) -> None:
+def test_explicit_insecure_mode_admits_everyone(join: Any, plain: Any) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     stream = latest(join(listen=(endpoint,), connect=(), insecure=True), "tactile/*/features")
     stranger = plain(endpoint)

@@ -80,8 +80,8 @@ def served(folder: Path, *words: str) -> Iterator[tuple[str, Person]]:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     port, press = folder / "skin", folder / "press.toml"
     press.write_text(PRESSES)
-    simulator = [command("simdevice"), "boards", "--board", "anyskin", "--pty", str(port)]
-    daemon = [command("tactiled"), "--port", str(port), "--board", "anyskin", "--no-log"]
+    simulator = [command("simdevice"), "boards", "--kind", "anyskin", "--pty", str(port)]
+    daemon = [command("tactiled"), "--port", str(port), "--kind", "anyskin", "--no-log"]
     with running([*simulator, "--press", str(press)], folder / "simdevice") as board:
         wait_for(port, board, folder / "simdevice")
         began = time.monotonic()

@@ -102,7 +102,7 @@ def test_configured_kind_is_not_second_guessed(instant: At) -> None:
     line.connect(instant(0.0))
     events = feed(line, instant, 4.0, lambda k: floats(100.0 + k))
     (diagnosed,) = of(events, Diagnosed)
-    assert "--board" in diagnosed.remedy
+    assert "--kind" in diagnosed.remedy
     with pytest.raises(ValueError, match="anyskin"):
         SerialLine("p", welcome, kind="skin")
 

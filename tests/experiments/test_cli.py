@@ -44,7 +44,7 @@ def test_names_in_help_match_available_names() -> None:
         (("strategies", "--jobs", "-2"), "'-2' given; allowed: a whole number"),
         (("strategies", "--scene-seed", "-1"), "a whole number from 0 to"),
         (("strategies", "--set", "kitchen"), "unknown parameter set 'kitchen'; available:"),
-        (("strategies", "--strategies", "teleport"), "unknown strategy 'teleport'; there are:"),
+        (("strategies", "--strategies", "teleport"), "unknown strategy 'teleport'; available:"),
         (("strategies", "--source", "attic"), "no scenes are called 'attic'"),
         (("strategies", "--source", "recorded:none.gz"), "cannot read none.gz"),
         (("strategies", "--param", "time_limit"), "'time_limit' is not NAME=VALUE"),

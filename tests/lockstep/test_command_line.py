@@ -11,7 +11,7 @@ from support import trial_trace
 from tactile_tools.cli import main
 
 BAD = [
-    (["--strategy", "luck"], "there are: straight, burrow, excavate, hybrid_clock, hybrid_event"),
+    (["--strategy", "luck"], "available: straight, burrow, excavate, hybrid_clock, hybrid_event"),
     (["--strategy", "nowhere:Mine"], "No module named 'nowhere'"),
     (["--strategy", "json:Mine"], "module 'json' has no class 'Mine'"),
     (["--scene", "attic"], "allowed: authors_sim, hardware"),
@@ -21,7 +21,7 @@ BAD = [
     (["--seed", "-1"], "allowed: a whole number from 0"),
     (["--seed", "seven"], "allowed: a whole number from 0"),
     (["--trial-seed", "1e3"], "allowed: a whole number from 0"),
-    (["--set", "mine"], "there are: hardware, authors_sim"),
+    (["--set", "mine"], "available: hardware, authors_sim"),
     (["--depth", "skin"], "allowed: contacts, taxels"),
     (["--engine", "bullet"], "allowed: mujoco, pymunk"),
     (["--png", "x.png"], "give --log as well"),
@@ -125,7 +125,7 @@ def test_own_strategy_in_the_working_folder_may_fail(
     ("words", "code", "said"),
     [
         (["--scene", "attic"], 2, "allowed: authors_sim, hardware"),
-        (["--strategy", "luck"], 2, "there are: straight, burrow"),
+        (["--strategy", "luck"], 2, "available: straight, burrow"),
         (["--seed", "-1"], 2, "allowed: a whole number"),
         (["--log", "nowhere/x.mcap"], 2, "no such folder: nowhere"),
         (["--png", "nowhere/x.png"], 2, "no such folder: nowhere"),

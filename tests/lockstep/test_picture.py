@@ -88,7 +88,7 @@ def test_any_of_several_reaches_and_boards_can_be_chosen(
     words = ["plot", str(several), "--out", str(out), "--dpi", "40"]
     assert main([*words, "--reach", "1"]) == 0
     said = capsys.readouterr().out
-    assert "drawn: board finger (of 2: finger, thumb); choose with --name" in said
+    assert "drawn: board finger (of 2: finger, thumb); choose with --board" in said
     assert "drawn: arm arm (of 2: arm, b); choose with --arm" in said
     assert main(words) == 0
     said = capsys.readouterr().out
@@ -97,12 +97,15 @@ def test_any_of_several_reaches_and_boards_can_be_chosen(
     assert "  2  my_own:_Strategy, " in said
     for wrong, text in (
         (["--reach", "3"], "no reach 3 in the log; it holds 2"),
-        (["--reach", "0"], "no reach 0 in the log"),
-        (["--name", "palm"], "no board 'palm' was heard during this reach, but finger"),
+        (["--board", "palm"], "no board 'palm' was heard during this reach, but finger"),
         (["--arm", "c"], "no arm 'c' was heard during this reach, but arm"),
     ):
         assert main([*words, *wrong]) == 2
         assert text in capsys.readouterr().err
+    with pytest.raises(SystemExit) as refused:
+        main([*words, "--reach", "0"])
+    assert refused.value.code == 2
+    assert "allowed: a whole number of at least 1" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("size", LOOKS)

@@ -28,7 +28,7 @@ def test_bad_arguments_are_named_with_allowed_values(
         (("cat", path, "--topic", "/nope"), f"it holds {COMMAND}, {EVENT}, {FEATURES}"),
         (("cat", path, "--from", "soon"), "allowed: seconds since the start"),
         (("cat", path, "--from", "3", "--to", "2"), "nothing is between"),
-        (("export", path, "--to", "xls"), "invalid choice"),
+        (("export", path, "--format", "xls"), "allowed: csv, parquet, npz"),
         (("export", path, "--to", "csv", "--out", tmp_path / "file"), "is a file"),
         (("split", path, "--every", "0"), "above 0"),
         (("split", path, "--size", "big"), "a size such as 500MB"),

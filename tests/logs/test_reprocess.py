@@ -269,7 +269,7 @@ def test_log_that_cannot_be_reprocessed_is_refused(
         ((pressed, "--calibration", other, "--out", tmp_path / "o.mcap"), "fits none in"),
         ((pressed, "--calibration", bad, "--out", tmp_path / "o.mcap"), "bad.toml"),
         ((pressed, "--config", bad, "--out", tmp_path / "o.mcap"), "tare_s"),
-        ((pressed, "--feature-rate", "-3", "--out", tmp_path / "o.mcap"), "feature_rate_hz is"),
+        ((pressed, "--feature-rate", "-3", "--out", tmp_path / "o.mcap"), "of Hz above 0"),
         ((silent,), "holds no raw bytes"),
         ((pressed, silent, "--out", tmp_path / "o.mcap"), "2 logs given"),
         ((pressed,), "exists and is not overwritten"),

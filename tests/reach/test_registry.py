@@ -109,7 +109,7 @@ def test_package_provides_strategies_by_entry_point(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("1/0", ["ZeroDivisionError", "there are: straight"]),
+        ("1/0", ["ZeroDivisionError", "available: straight"]),
         ("class Other: pass", ["no class 'Mine'"]),
         ("Mine = 3", ["no class 'Mine'"]),
         ("class Mine:\n  def __init__(self): pass", ["TypeError"]),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sensor_proto import packets
+from sensor_proto import can_transfers, framing
 from tactile_tools.cli import main
 from tactile_tools.dev import fuzz
 from tactile_tools.dev.fuzzers.can import KINDS as CAN_KINDS
@@ -52,7 +52,8 @@ def test_result_is_independent_of_process_count() -> None:
 
 @pytest.mark.usefixtures("small_blocks")
 def test_fuzzer_detects_a_decoder_without_crc(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(packets, "intact", lambda packets: [True] * len(packets))
+    for module in (framing, can_transfers):
+        monkeypatch.setattr(module, "intact", lambda packets: [True] * len(packets))
     result = fuzz.run_fuzz(6000, seed=1)
     assert result["media"]["serial"]["wrong"] > 50
     assert result["media"]["can"]["wrong"] > 20

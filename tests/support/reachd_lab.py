@@ -83,8 +83,18 @@ class ReachdLab:
         assert program.process.poll() is None, program.said
 
     def told_to_stand(self) -> None:
-        """Wait until the last word to the arm is zero: it may be on its way when reachd is gone."""
-        wait_until(lambda: bool(self.arm.heard) and all(h.still for h in self.arm.heard[-3:]))
+        """Wait until the last word to the arm is zero: it may be on its way when reachd is gone.
+
+        On a loaded machine the last words may come when they have expired. No arm obeys those, so
+        then the arm must stand by itself.
+        """
+
+        def stands() -> bool:
+            arm = self.arm
+            told = bool(arm.heard) and all(h.still for h in arm.heard[-3:])
+            return told or (arm.desk.refused["late"] > 0 and not arm.moving)
+
+        wait_until(stands)
 
     def close(self) -> None:
         # Daemons end before their boards: one that outlives its board follows the link that is

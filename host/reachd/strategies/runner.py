@@ -107,8 +107,8 @@ def _factory(spec: str) -> Factory:
     module, colon, name = spec.partition(":")
     if not colon or not module or not name:
         raise StrategyError(
-            f"unknown strategy {spec!r}; there are: {', '.join(available())}; one of your own is "
-            "named module:Class"
+            f"unknown strategy {spec!r}; available: {', '.join(available())}; load your own as "
+            "module:Class"
         )
     made = getattr(import_module(module), name, None)
     if not callable(made):
@@ -124,6 +124,6 @@ def _guarded(spec: str, make: Callable[[], Strategy]) -> Strategy:
         raise
     except Exception as error:
         raise StrategyError(
-            f"strategy {spec!r} cannot be loaded ({type(error).__name__}: {error}); there are: "
+            f"strategy {spec!r} cannot be loaded ({type(error).__name__}: {error}); available: "
             f"{', '.join(available())}"
         ) from error

@@ -370,7 +370,12 @@ class Recorder:
                 self._queued_bytes -= sum(len(item.data) for item in batch)
             if not batch:
                 return
-            for item in batch:
+            for at, item in enumerate(batch):
+                if self._writer.blocked:  # the chunk to come must not outgrow the disk's limit
+                    with self._lock:
+                        self._queue.extendleft(reversed(batch[at:]))
+                        self._queued_bytes += sum(len(each.data) for each in batch[at:])
+                    return
                 if not self._writer.add(item):
                     with self._lock:
                         self._drop(item, "unwritable")
@@ -387,7 +392,7 @@ class Recorder:
                 continue
             failures = 0
             with self._lock:
-                if not self._queue:
+                if not self._queue and not self._writer.waiting:
                     return
 
     def _count_unwritten(self) -> None:

@@ -118,7 +118,7 @@ class TrialSpec:
     def typed_depth(self) -> Depth:
         """The depth of sensing; ConfigError."""
         if self.depth not in DEPTHS:
-            raise ConfigError(f"unknown depth {self.depth!r}; there are: {', '.join(DEPTHS)}")
+            raise ConfigError(f"unknown depth {self.depth!r}; available: {', '.join(DEPTHS)}")
         return self.depth
 
 

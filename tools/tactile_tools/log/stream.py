@@ -26,7 +26,7 @@ from tactile_core.log.records import (
 )
 from tactile_core.log.writer import GAP
 from tactile_tools.log.sources import FILE, Series
-from tactile_tools.log.terminal import ToolError
+from tactile_tools.log.terminal import ToolError, shown
 
 NAMED = 20
 """Topics named when one that was asked for is not there."""
@@ -382,7 +382,7 @@ def require_topics(patterns: Sequence[str] | None, logs: Sequence[Series]) -> No
     for pattern in patterns:
         wanted = matcher([pattern])
         if wanted is not None and not any(map(wanted, topics)):
-            held = ", ".join(topics[:NAMED]) if topics else "no topic at all"
+            held = ", ".join(map(shown, topics[:NAMED])) if topics else "no topic at all"
             if len(topics) > NAMED:
                 held += f" and {len(topics) - NAMED} more: tactile log info lists them"
             raise ToolError(f"no topic {pattern!r} in {logs[0].name}; it holds {held}")
