@@ -42,7 +42,7 @@ MEANINGS = {
     "--duration": {"S"},
     "--engine": {"mujoco, pymunk, pybullet"},
     "--force": {"flag"},
-    "--format": {"png, pdf, svg", "csv, parquet, npz"},
+    "--format": {"png, pdf, svg", "csv, parquet, npz, lerobot"},
     "--from": {"TIME"},
     "--until": {"TIME"},
     "--jobs": {"N"},
