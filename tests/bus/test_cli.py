@@ -52,7 +52,7 @@ MEANINGS = {
     "--name": {"NAME"},
     "--out": {"PATH"},
     "--png": {"PATH"},
-    "--port": {"P"},
+    "--port": {"P", "N"},  # of a board; TCP port of what serves a page or a viewer
     "--rate": {"HZ"},
     "--reach": {"NAME", "N"},  # its name on the bus; in a log, its number
     "--scene": {"SCENE"},

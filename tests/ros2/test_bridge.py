@@ -384,7 +384,7 @@ def bridge_process(bus: Any, router: str, *words: str) -> subprocess.Popen[str]:
     [
         (("--domain", "500"), "expected 0 to 232"),
         (("--namespace", "/9lives"), "invalid namespace"),
-        (("--node", "my node"), "invalid node name"),
+        (("--node-name", "my node"), "invalid node name"),
         (("--accept", "everything"), "allowed: goals, twist, wrench"),
     ],
 )

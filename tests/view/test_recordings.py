@@ -40,7 +40,7 @@ def test_one_at_a_time_whole_and_never_over_another(
     with board.record("whole") as path:
         with pytest.raises(tr.RefusedError, match=r"already recording to .*whole\.mcap"):
             board.start_recording("other")
-        until(lambda: board.status()["recording"]["messages"] > 50)
+        until(lambda: board.status()["recording"]["messages"] > 500)
     log = tr.read_log(rig.folder / path)
     assert log.closed
     parts = log.board("pad")

@@ -467,7 +467,7 @@ def _fill_board_check(parser: Parser) -> None:
     parser.add_argument(
         "--node",
         type=whole(most=126),
-        metavar="N",
+        metavar="ID",
         help="number of the board on the bus, 0 to 126 (default: the only one that answers)",
     )
     parser.set_defaults(func=later("tactile_tools.board_check:run"))

@@ -64,7 +64,12 @@ def _fill_bridge(bridge: Parser) -> None:
         help="ROS namespace that topics are put into",
     )
     bridge.add_argument(
-        "--node", type=_node, default="tactile_bridge", metavar="NAME", help="name of the ROS node"
+        "--node-name",
+        dest="node",
+        type=_node,
+        default="tactile_bridge",
+        metavar="NAME",
+        help="name of the ROS node",
     )
     bridge.add_argument(
         "--accept",

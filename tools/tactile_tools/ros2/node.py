@@ -174,10 +174,14 @@ class RosNode:
         """Take everything back and leave; a router that does not answer is not waited for."""
 
         def leave() -> None:
+            # zenoh raises RuntimeError where another thread is in the middle of a put: what is left
+            # then ends with the process, or with the session.
             for endpoint in self._endpoints:
-                endpoint.close()
-            with contextlib.suppress(zenoh.ZError):
+                with contextlib.suppress(zenoh.ZError, RuntimeError):
+                    endpoint.close()
+            with contextlib.suppress(zenoh.ZError, RuntimeError):
                 self._token.undeclare()
+            with contextlib.suppress(zenoh.ZError, RuntimeError):
                 self._session.close()
 
         thread = threading.Thread(target=leave, name="ros2-close", daemon=True)
