@@ -7,7 +7,7 @@ SOAK_MINUTES ?= 60
 KILLS ?= 1000
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-random test-loaded lint demo demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage hostile recordings stress soak fuzz-pipeline kills firmware-test docs docs-reference pictures clean
+.PHONY: help setup test test-random test-loaded lint demo demo-ur arms demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage hostile recordings stress soak fuzz-pipeline kills firmware-test docs docs-reference pictures clean
 
 help:  ## list the targets (what `make` alone does)
 	@echo "make TARGET, where TARGET is one of:"
@@ -49,6 +49,14 @@ docs-reference: setup  ## the reference of configuration files, from the code
 
 demo: setup  ## reach into a simulated cupboard, leave a log and a picture
 	$(BIN)/tactile demo
+
+# Such a reach with an emulated robot of Universal Robots, through armd and its vendor's client.
+demo-ur: setup  ## the same with an emulated robot of Universal Robots
+	$(BIN)/tactile demo --arm ur --seed 36
+
+# Every driver against every fault, ten times over; some minutes.
+arms: setup  ## every driver of a robot against every fault
+	ARMS_RUNS=10 $(BIN)/python -m pytest -q tests/arms
 
 demo-skin: setup  ## press simulated boards, leave a log and a picture
 	$(BIN)/tactile demo-skin

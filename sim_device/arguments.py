@@ -55,6 +55,13 @@ COMMANDS = {
         "simulate a cupboard with an arm and its finger boards",
         "sim_device.arguments:_fill_cupboard",
     ),
+    "ur": Command(
+        "emulate a robot of Universal Robots that holds the finger",
+        "sim_device.arguments:_fill_ur",
+    ),
+    "xarm": Command(
+        "emulate an xArm of UFACTORY that holds the finger", "sim_device.arguments:_fill_xarm"
+    ),
     "replay": Command(
         "send a recording of a real board again", "sim_device.arguments:_fill_replay"
     ),
@@ -254,6 +261,72 @@ def _fill_cupboard(cupboard: Parser) -> None:
     add("--arm-fault", default="", metavar="SPEC", help="faults to inject, see below")
     add_bus(cupboard, "arm")
     _add_duration(cupboard)
+
+
+def _fill_ur(robot: Parser) -> None:
+    _fill_robot(robot, "ur", "a robot of Universal Robots")
+
+
+def _fill_xarm(robot: Parser) -> None:
+    _fill_robot(robot, "xarm", "an xArm of UFACTORY")
+
+
+def _fill_robot(robot: Parser, kind: str, words: str) -> None:
+    _describe(
+        robot,
+        "robot",
+        f"Emulate the controller of {words}, as its vendor's client sees it on the network, for "
+        "armd to drive. It holds the finger, whose taxels are on --pty, in the cupboard of --scene "
+        "or in free air. It proves nothing about the safety of a real robot.",
+        "With --control a line on standard input lets something happen: freeze S (of the network), "
+        "mirror, true, place X Y H, mark, and what the answer to help lists. Each is answered with "
+        "the robot's time.",
+    )
+    robot.set_defaults(kind=kind)
+    group = robot.add_argument_group("robot")
+    group.add_argument(
+        "--config", type=Path, required=True, metavar="FILE",
+        help="that of armd: tool, payload and where the cupboard is",
+    )  # fmt: skip
+    group.add_argument(
+        "--address", default="127.0.0.1", metavar="IP",
+        help="loopback address to listen at: 127.0.0.2 and so on for more (default 127.0.0.1)",
+    )  # fmt: skip
+    group.add_argument(
+        "--latency", type=number("s", least=0, most=1), default=0.0, metavar="S",
+        help="s a message takes each way (default 0)",
+    )  # fmt: skip
+    group.add_argument(
+        "--loss", type=number(least=0, most=0.5), default=0.0, metavar="P",
+        help="share of messages that are lost and sent again 0.2 s later (default 0)",
+    )  # fmt: skip
+    group.add_argument(
+        "--stop-force", type=number("N", least=1, most=1000), default=100.0, metavar="N",
+        help="N at which it stops for protection (default 100)",
+    )  # fmt: skip
+    add_path(group, "--truth", "file: where the tool really was is written to it, each cycle")
+    group.add_argument("--control", action="store_true", help="take faults from standard input")
+    world = robot.add_argument_group("world")
+    world.add_argument(
+        "--scene", metavar="SCENE",
+        help="authors_sim, hardware, recorded:FILE.json.gz or FILE.json (default: free air)",
+    )  # fmt: skip
+    add_seeds(world, what="of boards, board number k has N + k")
+    world.add_argument(
+        "--engine", choices=ENGINES, default=ENGINES[0],
+        help=f"physics engine (default {ENGINES[0]})",
+    )  # fmt: skip
+    world.add_argument(
+        "--world", metavar="WORLD",
+        help="publish its objects on the bus, as world/WORLD/objects (default: no bus is joined)",
+    )  # fmt: skip
+    boards = robot.add_argument_group("boards of the finger, each more than once")
+    boards.add_argument(
+        "--pty", action="append", default=[], type=Path, metavar="LINK",
+        help="board on a pseudo-terminal; LINK becomes a symbolic link to it",
+    )  # fmt: skip
+    add_bus(robot, "tool")
+    _add_duration(robot)
 
 
 def _fill_replay(replay: argparse.ArgumentParser) -> None:

@@ -125,6 +125,43 @@ def _cupboard_request(arguments: argparse.Namespace) -> CupboardRequest:
     )
 
 
+def robot(arguments: argparse.Namespace) -> int:
+    """``simdevice ur`` and ``simdevice xarm``."""
+    from sim_device.ports_plan import BoardsRequest
+    from sim_device.robots.plan import RobotRequest, plan_robot
+    from sim_device.world.base import WorldError
+    from tactile_core.options import BusTable, bus_config
+
+    scene_seed, seed = seeds_of(arguments)
+    request = RobotRequest(
+        kind=arguments.kind,
+        config=arguments.config,
+        address=arguments.address,
+        scene=arguments.scene,
+        seed=scene_seed,
+        engine=arguments.engine,
+        world=arguments.world or "world",
+        latency=arguments.latency,
+        loss=arguments.loss,
+        stop_force=arguments.stop_force,
+        truth=arguments.truth,
+        control=arguments.control,
+        boards=BoardsRequest(ptys=tuple(arguments.pty), seed=seed),
+        bus=bus_config(arguments, BusTable(), "tool") if arguments.world else None,
+    )
+    try:
+        planned = plan_robot(request)
+    except WorldError as error:
+        raise CommandError(str(error), REFUSED) from error
+    except ValueError as error:
+        raise CommandError(str(error)) from error
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    try:
+        return _serve(planned, arguments)
+    except WorldError as error:
+        raise CommandError(str(error), REFUSED) from error
+
+
 def replay(arguments: argparse.Namespace) -> int:
     """``simdevice replay``."""
     from sim_device.board.recorded import RecordingError, ReplayBoard, load
@@ -217,12 +254,13 @@ def _serve(planned: Sequence[Planned], arguments: argparse.Namespace) -> int:
 
 def _open(runner: Runner) -> None:
     from sim_device.ports import LinkRefused
+    from sim_device.robots.sockets import SocketError
     from tactile_core.bus.session import BusError
     from tactile_core.can_bus import CanUnavailable, Trouble
 
     try:
         runner.open()
-    except BusError as error:
+    except (BusError, SocketError) as error:
         raise CommandError(str(error), REFUSED) from error
     except LinkRefused as error:
         remedy = "give another path, or remove it yourself" if error.foreign else "end that one"

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from armd.cli import main as armd_main
 from reachd import arguments as reachd_arguments
 from reachd.cli import main as reachd_main
 from reachd.strategies.parameters import SETS
@@ -35,6 +36,7 @@ EVERY = [each for root in ROOTS for each in cli.load_all(root)]
 MEANINGS = {
     "--board": {"NAME"},
     "--kind": {"KIND", "finger, anyskin"},
+    "--arm": {"NAME", "simulated, ur"},
     "--at": {"TIME"},
     "--calibration": {"FILE", "PATH"},
     "--config": {"FILE"},
@@ -74,6 +76,7 @@ MAINS = {
     "tactile": tactile_main,
     "tactiled": tactiled_main,
     "reachd": reachd_main,
+    "armd": armd_main,
     "simdevice": simdevice_main,
 }
 
@@ -190,6 +193,7 @@ def test_alone_it_lists_its_commands(line: str, capsys: pytest.CaptureFixture[st
         ("tactile log cat x.mcap --topik a", "unknown option --topik; did you mean --topic?"),
         ("tactiled --prot /dev/x", "did you mean --port?"),
         ("tactiled --port x --compensation consenus", "did you mean consensus?"),
+        ("armd --driver urr", "did you mean ur?"),
         ("simdevice cupboard --engine mujocco", "did you mean mujoco?"),
         ("reachd --home --target 0.1,0", "--home: expected one argument"),
         ("tactile calibrate record --out x.mcap --board anyskin", "give it with --kind"),

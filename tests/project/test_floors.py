@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[2]
 ROOMS = {
     "sensor_proto": ROOT / "sensor_proto",
     "tactile_core": ROOT / "host" / "tactile_core",
+    "armd": ROOT / "host" / "armd",
     "tactile_reach": ROOT / "host" / "tactile_reach",
     "tactiled": ROOT / "host" / "tactiled",
     "reachd": ROOT / "host" / "reachd",
@@ -22,14 +23,16 @@ ROOMS = {
 MAY_IMPORT = {
     "sensor_proto": set(),
     "tactile_core": {"sensor_proto"},
+    "armd": {"sensor_proto", "tactile_core"},
     "tactile_reach": {"sensor_proto", "tactile_core"},
     "tactiled": {"sensor_proto", "tactile_core"},
     "reachd": {"sensor_proto", "tactile_core"},
-    "sim_device": {"sensor_proto", "tactile_core"},
+    "sim_device": {"sensor_proto", "tactile_core", "armd"},
     "tactile_tools": {
         "sensor_proto",
         "tactile_core",
         "tactile_reach",
+        "armd",
         "tactiled",
         "reachd",
         "sim_device",

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-COMMANDS = ("tactiled", "reachd", "simdevice", "tactile")
+COMMANDS = ("tactiled", "reachd", "armd", "simdevice", "tactile")
 TOP_LEVEL = {
-    "sensor_proto", "sim_device", "tactile_core", "tactile_reach", "tactiled", "reachd",
+    "sensor_proto", "sim_device", "tactile_core", "tactile_reach", "armd", "tactiled", "reachd",
     "tactile_tools",
 }  # fmt: skip
 

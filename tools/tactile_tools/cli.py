@@ -288,6 +288,13 @@ def _fill_demo(parser: Parser) -> None:
     add_scene(parser)
     add_seeds(parser, default=35)
     parser.add_argument(
+        "--arm",
+        choices=("simulated", "ur"),
+        default="simulated",
+        help="what moves the finger: the simulated arm, or an emulated robot of Universal Robots "
+        "through armd and its vendor's client (default simulated)",
+    )
+    parser.add_argument(
         "--view-port",
         type=whole(most=65_535),
         default=8420,

@@ -9,13 +9,15 @@ from tactile_core.cli import DONE, load_all, require
 
 
 def parsers() -> list[argparse.ArgumentParser]:
-    """Parsers of all four commands, with every subcommand loaded."""
+    """Parsers of all five commands, with every subcommand loaded."""
+    from armd.cli import serve_parser as armd
     from reachd.arguments import make_parser as reachd
     from sim_device.arguments import make_parser as simdevice
+    from tactile_core.daemon import Ending
     from tactile_tools.cli import make_parser as tactile
     from tactiled.arguments import make_parser as tactiled
 
-    roots = [tactile(), tactiled(), reachd(), simdevice()]
+    roots = [tactile(), tactiled(), reachd(), armd(Ending()), simdevice()]
     for root in roots:
         load_all(root)
     return roots

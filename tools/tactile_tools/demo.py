@@ -34,6 +34,28 @@ VIEW_PORT = 8420
 PAGE_S = 20.0
 """For the live page to answer, on a busy machine."""
 
+PROCESSES = {"simulated": "three processes", "ur": "four processes and a robot's own client"}
+
+UR_ADDRESS = "127.0.0.23"
+"""Ports of these robots are fixed; this loopback address is hardly ever somebody else's."""
+
+UR_CONFIG = f"""\
+[robot]
+address = "{UR_ADDRESS}"
+
+[tool]
+payload = 0.8
+position = [0.0, 0.0, 0.1]
+pivot = [0.0, 0.03, 0.02]
+pivot_rotation = [0.0, -1.5707963, 0.0]
+
+[frame]
+origin = [0.4, -0.2, 0.3]
+inside = [0.4, -0.5, 0.3]
+left = [0.6, -0.2, 0.3]
+"""
+"""A cupboard that stands to the robot's right, and a finger across its flange."""
+
 TIME_LIMIT_S = 30.0
 """The authors' 20 s, and what a busy machine takes: whatever is stale there holds the arm."""
 
@@ -140,23 +162,24 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
     options.log.unlink(missing_ok=True)
     arm, skin, reach = (socket_at(folder, n) for n in ("arm", "tactiled", "reachd"))
     cupboard = [
-        simdevice,
-        "cupboard",
-        *scene,
-        "--seed",
-        str(options.seed),
-        "--pty",
-        str(board),
-        "--listen",
-        arm,
+        *(simdevice, "cupboard", *scene, "--seed", str(options.seed), "--pty", str(board)),
+        *("--listen", arm, "--connect", skin),
     ]
+    if options.arm == "ur":
+        config = folder / "arm.toml"
+        config.write_text(UR_CONFIG, encoding="utf-8")
+        cupboard = [
+            *(simdevice, "ur", "--config", str(config), "--address", UR_ADDRESS, *scene),
+            *("--seed", str(options.seed), "--pty", str(board), "--world", "world"),
+            *("--connect", arm),
+        ]
     sensing = [
         *(tactiled, "--port", str(board), "--name", BOARD, "--calibration", str(calibration)),
         *("--listen", skin, "--connect", arm, "--no-log"),
     ]
     print(
-        f"A cupboard ({options.scene} {options.scene_seed}), the target at {goal} m, three "
-        "processes.",
+        f"A cupboard ({options.scene} {options.scene_seed}), the target at {goal} m, "
+        f"{PROCESSES[options.arm]}.",
         flush=True,
     )
     with contextlib.ExitStack() as stack:
@@ -172,8 +195,12 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
             else:
                 print(f"The live page could not be opened: {said.read_text()[-300:]}", flush=True)
         said = folder / "cupboard.txt"
-        first = stack.enter_context(running([*cupboard, "--connect", skin], said))
+        first = stack.enter_context(running(cupboard, said))
         wait_for(board, first, said)
+        if options.arm == "ur":
+            served = [command("armd"), "--driver", "ur", "--config", str(config)]
+            served += ["--listen", arm, "--connect", skin]
+            stack.enter_context(running(served, folder / "armd.txt"))
         stack.enter_context(running(sensing, folder / "tactiled.txt"))
         reaching = subprocess.Popen(
             [
@@ -186,8 +213,14 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
             env=os.environ | {"TACTILE_RUNTIME_DIR": str(folder)},
         )
         code = _ended(reaching)
+        if code == 1 and options.arm == "ur":
+            said = folder / "armd.txt"
+            lines = said.read_text(errors="replace").splitlines()
+            print(*(line for line in lines if " ERROR " in line), sep="\n")
         if code == 3:
-            for name in ("cupboard.txt", "tactiled.txt"):
+            for name in ("cupboard.txt", "tactiled.txt", "armd.txt"):
+                if not (folder / name).exists():
+                    continue
                 print(f"--- {name}\n{(folder / name).read_text(errors='replace')[-1500:]}")
     return code
 

@@ -136,7 +136,8 @@ HEAD = (
 
 FLOORS = (
     ("tactile_tools",),
-    ("tactiled", "reachd", "armd", "sim_device", "tactile_reach"),
+    ("tactiled", "reachd", "sim_device", "tactile_reach"),
+    ("armd",),
     ("tactile_core",),
     ("sensor_proto",),
 )

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from armd.config import ArmConfig
 from reachd.gate.workspace import Region
 from reachd.settings import ConfigFile as ReachFile
 from reachd.strategies.parameters import SETS
@@ -41,6 +42,11 @@ FILES: tuple[tuple[str, str, type], ...] = (
         f"`[parameters]` are those of the sets {' / '.join(SETS)}; the reason for each is beside "
         "it in `host/reachd/strategies/parameters.py`.",
         ReachFile,
+    ),
+    (
+        "armd",
+        "`armd --config FILE`, and `simdevice ur --config FILE`; see [arm.md](arm.md).",
+        ArmConfig,
     ),
     (
         "Folder of keys",
