@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -13,6 +14,10 @@ import pytest
 
 from armd.cli import main
 from armd.config import load_config
+
+pytestmark = pytest.mark.skipif(
+    "ARMS_RUNS" not in os.environ, reason="drives emulated robots in real time: `make arms`"
+)
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -14,6 +14,10 @@ import pytest
 from tactile_core.bus.services import ServiceError
 from tactile_core.types import ArmLimits, Twist
 
+pytestmark = pytest.mark.skipif(
+    "ARMS_RUNS" not in os.environ, reason="drives emulated robots in real time: `make arms`"
+)
+
 WITHIN = 0.1
 """s of the robot's time."""
 
