@@ -143,7 +143,7 @@ def what_next(log: Path, png: Path) -> str:
     return (
         f"wrote {log} and {png}\n"
         f"Next: open {png}; `tactile log info {log}` says what the log holds, `tactile plot {log} "
-        "--what forces` draws it otherwise, `tactile view {log}` plays it."
+        f"--what forces` draws it otherwise, `tactile view {log}` plays it."
     )
 
 
