@@ -56,7 +56,7 @@ demo-ur: setup  ## the same with an emulated robot of Universal Robots
 
 # Every driver against every fault, ten times over; some minutes.
 arms: setup  ## every driver of a robot against every fault
-	ARMS_RUNS=10 $(BIN)/python -m pytest -q tests/arms
+	ARMS_RUNS=10 $(BIN)/python -m pytest -q tests/armd
 
 demo-skin: setup  ## press simulated boards, leave a log and a picture
 	$(BIN)/tactile demo-skin
@@ -79,19 +79,19 @@ mutation: setup  ## mutate the safety gate
 
 # A million random inputs through the safety gate.
 gate-random: setup  ## a million random inputs through the safety gate
-	REACH_RANDOM_INPUTS=1000000 REACH_RANDOM_JSON=docs/results/gate.json $(BIN)/python -m pytest -q tests/reach/test_gate_random.py
+	REACH_RANDOM_INPUTS=1000000 REACH_RANDOM_JSON=docs/results/gate.json $(BIN)/python -m pytest -q tests/reachd/gate/test_gate_random.py
 
 # A hundred thousand hostile items through the recorder and through tactiled's pipeline.
 hostile: setup  ## 100,000 hostile items through recorder and pipeline
-	HOSTILE_ITEMS=100000 $(BIN)/python -m pytest -q tests/bus/test_recorder_hostile.py tests/daemon/test_hostile.py -k hostile_items
+	HOSTILE_ITEMS=100000 $(BIN)/python -m pytest -q tests/tactile_core/log/test_recorder_hostile.py tests/tactiled/test_hostile.py -k hostile_items
 
 # Every frame of every recording, none of which may be masked.
 recordings: setup  ## every frame of every recording of a real board
-	RECORDED_FRAMES=1000000000 $(BIN)/python -m pytest -q tests/sensing/test_played_readings.py -k never_masked
+	RECORDED_FRAMES=1000000000 $(BIN)/python -m pytest -q tests/tactiled/sensing/test_played_readings.py -k never_masked
 
 # Every branch of the safety gate is taken by its tests, or this fails.
 gate-coverage: setup  ## every branch of the safety gate is taken by its tests
-	REACH_RANDOM_INPUTS=4000 $(BIN)/python -m coverage run --branch --source=host/reachd -m pytest -q tests/reach -k gate
+	REACH_RANDOM_INPUTS=4000 $(BIN)/python -m coverage run --branch --source=host/reachd -m pytest -q tests/reachd/gate tests/reachd/test_supervisor.py
 	$(BIN)/python -m coverage report -m --fail-under=100 --include='*/gate/*.py'
 
 # An hour of reaching while the machine is loaded and its memory churned.
@@ -123,7 +123,7 @@ pictures: setup  ## pages and pictures that are made from the code
 # The C headers: compilers, sanitizers, a million inputs of the fuzzer, emulators. Nothing is installed;
 # what is not here is skipped, saying what to install (docs/firmware.md).
 firmware-test: setup  ## the C headers: compilers, sanitizers, fuzzer, emulators
-	TACTILE_FIRMWARE=full TACTILE_FIRMWARE_JSON=docs/results/firmware.json $(BIN)/python -m pytest -q -rs -n 0 --timeout 900 tests/firmware
+	TACTILE_FIRMWARE=full TACTILE_FIRMWARE_JSON=docs/results/firmware.json $(BIN)/python -m pytest -q -rs -n 0 --timeout 900 tests/sensor_proto/c
 
 clean:  ## delete .venv and what tools leave
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -8,8 +8,9 @@ import pytest
 
 from tactile_core.config import describe
 from tactile_tools.dev.config_reference import FILES, main
+from tests.support.paths import ROOT
 
-PAGE = Path(__file__).parents[2] / "docs" / "configuration.md"
+PAGE = ROOT / "docs" / "configuration.md"
 
 
 def test_the_page_is_up_to_date(capsys: pytest.CaptureFixture[str]) -> None:

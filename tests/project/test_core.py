@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from pathlib import Path
 
 from tactile_core.cli import EXTRAS
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 WHEELS = json.loads((ROOT / "tests/data/core_wheels.json").read_text(encoding="utf-8"))["wheels"]
 CORE = {

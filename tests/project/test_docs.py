@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from tactile_tools.dev import architecture, topics_page
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).parents[2]
 DOCUMENTS = sorted(
     path
     for path in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("*/**/README.md"))

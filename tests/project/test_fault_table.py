@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import ast
 import re
-from pathlib import Path
 
 import pytest
 
-TESTS = Path(__file__).parents[1]
+from tests.support.paths import TESTS
+
 ROW = re.compile(r"\| (\d+) \|")
-NAMED = re.compile(r"`([a-z_]+/test_\w+\.py)(?:::(test_\w+))?`")
+NAMED = re.compile(r"`((?:[a-z_0-9]+/)+test_\w+\.py)(?:::(test_\w+))?`")
 ROWS = 54
 """Rows that there must be."""
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.support.paths import ROOT
+
 ROOMS = {
     "sensor_proto": ROOT / "sensor_proto",
     "tactile_core": ROOT / "host" / "tactile_core",

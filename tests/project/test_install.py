@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.support.paths import ROOT
+
 COMMANDS = ("tactiled", "reachd", "armd", "simdevice", "tactile")
 TOP_LEVEL = {
     "sensor_proto", "sim_device", "tactile_core", "tactile_reach", "armd", "tactiled", "reachd",

@@ -15,8 +15,9 @@ from tactile_core.config import ConfigError, load_toml
 from tactiled.arguments import make_parser as skin_parser
 from tactiled.settings import ConfigFile
 from tactiled.settings import make_settings as skin_settings
+from tests.support.paths import DATA
 
-OLD = Path(__file__).parents[1] / "data" / "version_0_1"
+OLD = DATA / "version_0_1"
 
 HASHES = {
     "anyskin.cal.toml": "3fdb0c82db68e3ea66911a8d80c851d2bd9232958c1c19d7d65ab0e4ef43e8fd",

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
-from support.waiting import wait_until
 from tactile_core.bus.messages import codec
 from tactile_core.bus.topics import REACH_EVENT
+from tests.support.waiting import wait_until
 
 NEAR = ("--strategy", "straight", "--target", "0.04,0.0", "--seed", "1")
 FAR = ("--strategy", "straight", "--target", "0.36,0.0", "--seed", "1")

@@ -11,13 +11,13 @@ from typing import Any
 import pytest
 
 from reachd.inputs import FEATURES, Input, make_arm_state, make_touch
-from support.waiting import wait_until
 from tactile_core.bus.messages import MSG, codec, header
 from tactile_core.bus.services import ServiceError
 from tactile_core.bus.streams import ATTACHMENT, BusSample
 from tactile_core.bus.topics import ARM_STATE, TF
 from tactile_core.log.info import info
 from tactile_core.types import NS_PER_S, Instant
+from tests.support.waiting import wait_until
 
 NEAR = ("--strategy", "straight", "--target", "0.04,0.0", "--seed", "1")
 

@@ -15,8 +15,8 @@ from reachd.interfaces import ZERO, Twist
 from reachd.strategies import load_strategy
 from reachd.strategies.parameters import HARDWARE
 from reachd.trial import Supervisor
-from support.waiting import wait_until
 from tactile_core.types import NS_PER_S, Instant, after
+from tests.support.waiting import wait_until
 
 START = Instant(7 * NS_PER_S)
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from support.waiting import wait_until
 from tactile_core.bus.messages import codec
 from tactile_core.bus.services import ServiceError, declare_service
 from tactile_core.bus.streams import declare_publisher
@@ -18,6 +17,7 @@ from tactile_core.bus.topics import FEATURES, service_key
 from tactile_core.log.info import info
 from tactile_core.log.recovery import recover
 from tactile_core.types import ArmLimits
+from tests.support.waiting import wait_until
 
 NEAR = ("--strategy", "straight", "--target", "0.04,0.0", "--seed", "1")
 FAR = ("--strategy", "straight", "--target", "0.36,0.0", "--seed", "1")

@@ -10,6 +10,7 @@ import pytest
 from sim_device.skin.indenter import load_script
 from tactile_core.config import ConfigError
 from tactile_core.geometry import anyskin, finger
+from tests.support.paths import ROOT
 
 PRESS = """
 [[press]]
@@ -83,13 +84,13 @@ def test_script_for_another_skin(script) -> None:
 
 
 def test_example_script_works() -> None:
-    example = Path(__file__).resolve().parents[2] / "docs" / "press.toml"
+    example = ROOT / "docs" / "press.toml"
     indenter = load_script(example)
     assert any(indenter.contacts(t / 10) for t in range(120))
 
 
 def test_example_for_five_chips_leaves_time_to_tare() -> None:
-    example = Path(__file__).resolve().parents[2] / "docs" / "press-anyskin.toml"
+    example = ROOT / "docs" / "press-anyskin.toml"
     indenter = load_script(example, anyskin())
     assert not any(indenter.contacts(t / 10) for t in range(50))
     pressed = [sum(-c.force[0] for c in indenter.contacts(t / 10)) for t in range(200)]

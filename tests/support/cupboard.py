@@ -15,8 +15,6 @@ import msgspec
 import zenoh
 
 from sim_device.world.scenes import Pose, Scene, SceneObject, Shape
-from support.network import free_port
-from support.waiting import wait_until
 from tactile_core.bus.commanding import ClaimRequest, Grant, Signer, clock_domain
 from tactile_core.bus.messages import codec
 from tactile_core.bus.services import ServiceError, call
@@ -24,6 +22,8 @@ from tactile_core.bus.session import BusConfig, close_session, open_session
 from tactile_core.bus.streams import BusSample, Publisher, Tap, declare_publisher
 from tactile_core.bus.topics import ARM_STATE, COMMAND, service_key
 from tactile_core.types import NS_PER_S, Twist, WallClock, monotonic_now
+from tests.support.network import free_port
+from tests.support.waiting import wait_until
 
 RADIUS = 0.04
 DISC_X = 0.02

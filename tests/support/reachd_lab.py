@@ -9,14 +9,14 @@ from typing import Any
 
 import zenoh
 
-from support.fake_arm import FakeArm
-from support.network import free_endpoint
-from support.processes import Program
-from support.waiting import PATIENCE_S, wait_until
-from support.wire import Wire
 from tactile_core.bus.messages import codec
 from tactile_core.bus.services import ServiceError, call
 from tactile_core.bus.topics import REACH_EVENT, REACH_STATE, service_key
+from tests.support.fake_arm import FakeArm
+from tests.support.network import free_endpoint
+from tests.support.processes import Program
+from tests.support.waiting import PATIENCE_S, wait_until
+from tests.support.wire import Wire
 
 
 class ReachdLab:

@@ -10,12 +10,12 @@ from typing import Any
 
 import zenoh
 
-from support.network import free_endpoint
-from support.processes import Program, command
-from support.waiting import wait_until
 from tactile_core.bus.messages import codec
 from tactile_core.bus.session import BusConfig, close_session, open_session
 from tactile_core.bus.topics import FEATURES
+from tests.support.network import free_endpoint
+from tests.support.processes import Program, command
+from tests.support.waiting import wait_until
 
 
 class TactiledLab:

@@ -8,7 +8,7 @@ import socket
 import threading
 import time
 
-from support.waiting import PATIENCE_S
+from tests.support.waiting import PATIENCE_S
 
 
 class Wire:

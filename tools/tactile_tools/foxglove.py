@@ -119,9 +119,8 @@ class Live:
     """
 
     def __init__(self, bus: zenoh.Session, port: int = DEFAULT_PORT, *, control: bool = False):
-        from foxglove.websocket import Capability
-
         import foxglove
+        from foxglove.websocket import Capability
 
         self.counts: Counter[str] = Counter()
         self._bus = bus

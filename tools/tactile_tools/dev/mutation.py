@@ -192,7 +192,7 @@ def _copy(source: Path, target: Path) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Judge every mutant, several at a time, and report the survivors."""
-    folder = ROOT / "tests" / "reach"
+    folder = ROOT / "tests" / "reachd"
     if not folder.is_dir() or not PACKAGE.is_dir():
         print(
             f"no tests at {folder}: run this in a checkout of the project, not in an installation",
@@ -203,8 +203,9 @@ def run(options: argparse.Namespace) -> int:
         # Copies, so that work on the checkout does not disturb a run of many minutes.
         package, tests = Path(frozen) / "reachd", Path(frozen) / "tests"
         _copy(PACKAGE, package)
-        _copy(folder, tests)
-        return _judge_all(package, [str(tests / name) for name in TESTS], options)
+        _copy(folder / "gate", tests / "gate")
+        shutil.copy(folder / "conftest.py", tests)
+        return _judge_all(package, [str(tests / "gate" / name) for name in TESTS], options)
 
 
 def _judge_all(package: Path, tests: Sequence[str], options: argparse.Namespace) -> int:
