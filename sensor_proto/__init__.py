@@ -1,4 +1,4 @@
-"""The wire between a taxel board and its host: messages and codecs, with no I/O, clock or thread.
+"""Wire protocol between taxel boards and their host: messages and codecs. No I/O, clock or threads.
 
 ``PROTOCOL.md`` beside this file is normative.
 """

@@ -1,7 +1,7 @@
-"""AnySkin, ReSkin and eFlesh boards: n × (float32 t °C, x, y, z µT), then CR LF, and no more.
+"""Frames of AnySkin, ReSkin and eFlesh boards: n × (float32 t in °C, x, y, z in µT), then CR LF.
 
-The frames carry no header, check or sequence: their boundary is inferred (`anyskin_search`) and
-doubted again when it stops to fit.
+The frames have no header, check or sequence number, so the decoder infers where they begin (see
+`Search`) and searches again when the data stops fitting.
 """
 
 from __future__ import annotations
@@ -30,21 +30,22 @@ from sensor_proto.packets import (
     TaxelStatus,
 )
 
-# Where the frames of an unframed float stream begin, and how many magnetometers they hold.
+# Search for the frame boundary and the number of magnetometers in an unframed float stream.
 #
-# CR LF ends every frame but occurs inside the floats as well, so that it is trusted only at the
-# right distance and together with temperatures that a chip can have. Among overlapping claims the
-# better supported wins. All claims of one search are judged at once: noise full of CR LF is cheap.
+# CR LF ends every frame but also occurs inside the floats. It is trusted only at the right distance
+# and where the temperatures are plausible for the chip. Among overlapping candidates the better
+# supported one wins. All candidates of one search are judged at once, so that noise full of CR LF
+# stays cheap.
 
 
 MAX_MAGNETOMETERS = 20
-"""Four boards of five on one controller, the largest assembly on sale."""
+"""Largest assembly on sale: four boards of five magnetometers on one controller."""
 
 LOCK_FRAMES = 3
-"""Consecutive frames that must fit before a count of magnetometers is believed."""
+"""Consecutive frames that must fit before a number of magnetometers is accepted."""
 
 SURE_FRAMES = 8
-"""Frames that show whether a column moves as a temperature does."""
+"""Frames needed to tell whether a column varies as slowly as a temperature."""
 
 READING = 16
 """Bytes of one magnetometer: t, x, y, z as float32."""
@@ -53,19 +54,19 @@ END = b"\r\n"
 FLOAT = np.dtype("<f4")
 
 AFTER_END = 0.04
-"""Worth of CR LF right before a frame: decides only between claims whose temperatures are equally
-good, of which the least difference is one in twenty."""
+"""Score for a CR LF right before a frame. It only breaks ties: the temperature scores of two
+candidates differ by at least 1/20."""
 
 Flags = NDArray[np.bool_]
 
 
 def frame_size(magnetometers: int) -> int:
-    """Bytes of one frame."""
+    """Size of one frame in bytes."""
     return READING * magnetometers + len(END)
 
 
 class Search:
-    """One look at the bytes since the last frame (or since the beginning)."""
+    """One search for a frame boundary in the bytes received since the last frame."""
 
     def __init__(self, data: bytes) -> None:
         values = np.frombuffer(data, np.uint8)
@@ -77,14 +78,16 @@ class Search:
         self._values = values
 
     def known(self, count: int) -> int | None:
-        """Start of the first frame of ``count`` magnetometers after a lost boundary.
+        """Offset of the first frame of ``count`` magnetometers after the boundary was lost.
 
-        One frame is enough when all of its temperatures are plausible, or more than that.
+        One frame is enough if all its temperatures are plausible, or most of them are and it
+        directly follows the end of a frame.
         """
         return self._first(count, 2)
 
     def new(self, counts: Iterable[int]) -> tuple[int, int] | None:
-        """Start of the first of `LOCK_FRAMES` consecutive frames, and their magnetometers."""
+        """Offset of the first of `LOCK_FRAMES` consecutive frames, and their number of
+        magnetometers."""
         if not len(self._ends) or not self._warm.any():
             return None
         for count in counts:
@@ -99,10 +102,10 @@ class Search:
         return None
 
     def _sure(self, start: int, count: int) -> bool | None:
-        """Whether what stands where t should be is a temperature; None: more must come to tell.
+        """Whether the first column holds temperatures; None when more data is needed to tell.
 
-        Fields of a bare board are as small as temperatures. Then numbers in the order x, y, z, t
-        would pass for t, x, y, z, and so would four chips without temperatures for three with.
+        The fields of a bare board are as small as temperatures. Data in the order x, y, z, t could
+        then pass for t, x, y, z, and four chips without temperatures for three chips with them.
         """
         size = frame_size(count)
         whole = 0
@@ -122,7 +125,7 @@ class Search:
         return None if first.likely and whole < SURE_FRAMES else False
 
     def _first(self, count: int, depth: int) -> int | None:
-        """Best supported of the first claims that overlap; None while support may yet come."""
+        """Best supported of the first overlapping candidates; None when more data may change it."""
         size = frame_size(count)
         starts = self._ends + len(END) - size
         starts = starts[(starts >= 0) & (starts + depth * size <= self._size)]
@@ -137,7 +140,7 @@ class Search:
         shares = self._shares(starts, count, depth)
         after_end = (starts >= len(END)) & self._mark[starts - len(END)]
         if known:
-            # What comes before was taken up to the end of a frame.
+            # The bytes before were consumed up to the end of a frame.
             after_end |= starts == 0
         likely = np.where(np.arange(depth) < fits[:, None], shares, 0.0).sum(axis=1) / fits
         score = fits + likely + AFTER_END * after_end
@@ -145,7 +148,8 @@ class Search:
             enough = (fits > 1) | (likely == 1.0) | (after_end & (likely > 0.5))
         else:
             enough = shares.min(axis=1) > 0.5
-        # Part of a damaged frame can end like a whole one; its first readings give it away.
+        # The tail of a damaged frame can end like a whole one, but its first readings are
+        # implausible.
         enough &= after_end | (shares[:, 0] == 1.0)
         chosen = np.flatnonzero(enough)
         if not len(chosen):
@@ -156,7 +160,7 @@ class Search:
 
     @cached_property
     def _warm(self) -> Flags:
-        """(bytes,): whether the float that begins there is a plausible temperature."""
+        """(bytes,): whether the float that starts at each byte is a plausible temperature."""
         words = np.zeros(self._size, dtype="<u4")
         whole = max(0, self._size - 3)
         for byte in range(4):
@@ -167,31 +171,33 @@ class Search:
         return warm
 
     def _shares(self, starts: NDArray[np.intp], count: int, depth: int) -> NDArray[np.float64]:
-        """Share of plausible temperatures in each of ``depth`` frames from each start."""
+        """Fraction of plausible temperatures in each of the ``depth`` frames after each start."""
         nth = np.arange(depth)[:, None] * frame_size(count) + np.arange(count) * READING
         shares: NDArray[np.float64] = self._warm[starts[:, None, None] + nth].mean(axis=2)
         return shares
 
 
 SUSPECT_FRAMES = 3
-"""Consecutive frames with mostly impossible temperatures after which the boundary is doubted."""
+"""Consecutive frames with mostly implausible temperatures after which the boundary is searched
+again."""
 
 RELOCK_FRAMES = 8
-"""Frames' worth of bytes without a boundary after which another count is tried."""
+"""Bytes without a boundary, in frames, after which another number of magnetometers is tried."""
 
 MAX_BUFFER = RELOCK_FRAMES * frame_size(MAX_MAGNETOMETERS)
-"""Bytes held while looking for a boundary: enough to try another count after the longest frames,
-and twice what shows `LOCK_FRAMES` of them wherever they begin."""
+"""Most bytes held while searching: enough to try another count after the longest frames, and twice
+what `LOCK_FRAMES` of them need wherever they begin."""
 
 PIECE = 4096
-"""Bytes taken at a time, as many as a pty returns at once: bounds the work of one search."""
+"""Bytes processed at a time (a pty returns at most as many). Bounds the work of one search."""
 
 MAX_FIELD_UT = 1e6
-"""No int16 count times the coarsest scale of the chip (9.7 µT) comes near this."""
+"""Field limit in µT: above any int16 count times the chip's coarsest scale (9.7 µT)."""
 
 
 def encode_anyskin(samples: FloatSamples) -> bytes:
-    """One frame; ValueError unless 1 to 20 magnetometers with a temperature each."""
+    """Encode one frame. Raises ValueError unless it has 1 to 20 magnetometers, each with a
+    temperature."""
     n = len(samples.temperature_c)
     if not 1 <= n <= MAX_MAGNETOMETERS or samples.field_ut.shape != (n, 3):
         raise ValueError(
@@ -203,7 +209,10 @@ def encode_anyskin(samples: FloatSamples) -> bytes:
 
 
 class AnySkinDecoder:
-    """Unframed floats to `FloatSamples`; finds the number of magnetometers unless it is given."""
+    """Decodes an unframed float stream to `FloatSamples`.
+
+    It infers the number of magnetometers unless ``magnetometers`` gives it.
+    """
 
     def __init__(self, magnetometers: int | None = None) -> None:
         if magnetometers is not None and not 1 <= magnetometers <= MAX_MAGNETOMETERS:
@@ -214,27 +223,28 @@ class AnySkinDecoder:
 
     @property
     def magnetometers(self) -> int | None:
-        """Count that frames were last locked on; None before the first lock."""
+        """Number of magnetometers of the last lock; None before the first lock."""
         return self._count
 
     @property
     def counters(self) -> dict[str, int]:
-        """Frames accepted, times the boundary was lost, bytes that belonged to no frame."""
+        """Frames accepted, times the boundary was lost, and bytes that belonged to no frame."""
         return self._tally.snapshot()
 
     def reset(self) -> None:
-        """Forget boundary, count and unfinished input: another board may follow."""
+        """Forget the boundary, the count and unfinished input, as another board may follow."""
         self._buffer = b""
         self._count: int | None = None
         self._locked = False
         self._suspect = 0
 
     def feed(self, data: bytes, /) -> list[Received]:
-        """Frames that ``data`` completed; on a fresh lock also those held back until then.
+        """Frames completed by ``data``. The first call after a lock also returns the frames held
+        back.
 
         ``trailing`` of frames held back is at most the length of ``data``.
         """
-        # Iterating over arrays makes the views of single frames at half the cost of indexing.
+        # Iterating over the arrays creates the views of single frames at half the cost of indexing.
         return [
             Received(FloatSamples(field_ut, temperature_c, bits), 0, after)
             for burst in self.feed_bursts(data)
@@ -248,7 +258,7 @@ class AnySkinDecoder:
         ]
 
     def feed_bursts(self, data: bytes, /) -> list[FloatBurst]:
-        """Same frames as `feed`, as arrays: a tenth of the cost where many come at once."""
+        """Return the same frames as `feed`, as arrays: a tenth of the cost for many at once."""
         bursts: list[FloatBurst] = []
         size = len(data)
         for begin in range(0, size, PIECE):
@@ -256,7 +266,8 @@ class AnySkinDecoder:
         return bursts
 
     def _feed(self, piece: bytes, fed: int, later: int, bursts: list[FloatBurst]) -> None:
-        """Take one piece; ``fed``: bytes of the whole chunk, ``later``: those after the piece."""
+        """Process one piece. ``fed``: bytes of the whole chunk; ``later``: those of them after the
+        piece."""
         buffer = self._buffer + piece
         at = 0
         while True:
@@ -279,7 +290,8 @@ class AnySkinDecoder:
         self._buffer = buffer[at:]
 
     def _search(self, data: bytes) -> tuple[int, int] | None:
-        """Start of a frame in ``data`` and its magnetometers; None: wait for more."""
+        """Offset of a frame in ``data`` and its number of magnetometers; None to wait for more
+        data."""
         search = Search(data)
         if self._count is not None:
             start = search.known(self._count)
@@ -291,7 +303,8 @@ class AnySkinDecoder:
         return search.new(counts)
 
     def _take(self, buffer: bytes, at: int, later: int, fed: int, bursts: list[FloatBurst]) -> int:
-        """Append the frames from ``at`` on, and unlock where they cease to fit; bytes taken."""
+        """Append the frames from ``at`` on and return the bytes consumed. Unlock where they stop
+        fitting."""
         n = self._count or 0
         size = frame_size(n)
         whole = (len(buffer) - at) // size
@@ -324,7 +337,8 @@ class AnySkinDecoder:
         return fitting * size
 
     def _trusted(self, temperature_c: NDArray[np.float32]) -> int:
-        """Frames up to the one, if any, at which (k, n) °C put the boundary in doubt."""
+        """Number of frames up to the one at which the temperatures, (k, n) °C, cast doubt on the
+        boundary."""
         with np.errstate(invalid="ignore"):
             likely = plausible(temperature_c).mean(axis=1) >= 0.5
         for i, good in enumerate(likely.tolist()):
@@ -336,7 +350,7 @@ class AnySkinDecoder:
 
 
 def _all_good(values: NDArray[np.float32]) -> bool:
-    """Whether no reading of (k, n, 4) needs a closer look; False for any NaN."""
+    """Whether every reading of (k, n, 4) is plausible without a closer look; False for any NaN."""
     temperature_c = values[:, :, 0]
     return bool(
         temperature_c.min() >= TINY_C
@@ -346,7 +360,7 @@ def _all_good(values: NDArray[np.float32]) -> bool:
 
 
 def _status(values: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """(k, n) of `TaxelStatus` for readings (k, n, 4) of t, x, y, z."""
+    """`TaxelStatus` of each reading, (k, n), from readings (k, n, 4) of t, x, y, z."""
     with np.errstate(invalid="ignore"):
         temperature_c, field_ut = values[:, :, 0], values[:, :, 1:]
         good = (temperature_c >= COLDEST_C) & (temperature_c <= HOTTEST_C)

@@ -1,7 +1,7 @@
-"""CAN 2.0B and CAN FD: packets as multi-frame transfers, much as Cyphal/CAN segments them.
+"""Packets as multi-frame transfers on CAN 2.0B and CAN FD, segmented much as in Cyphal/CAN.
 
-Identifier (29 bits): priority 28–26, mark 25–16, message type 15–8, zero 7, board 6–0.
-Last byte of each frame (tail): start 0x80, end 0x40, toggle 0x20, transfer id 0x1F.
+Identifier (29 bits): priority 28–26, mark 25–16, message type 15–8, zero 7, board 6–0. Last byte of
+each frame (tail): start 0x80, end 0x40, toggle 0x20, transfer id 0x1F.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from sensor_proto.packets import (
     request_number,
 )
 
-# CAN error frames in the layout of SocketCAN (linux/can/error.h): what they mean, and making them.
+# CAN error frames in the layout of SocketCAN (linux/can/error.h).
 #
-# Every medium's way of telling an error (SocketCAN frames, the ``s`` and ``e`` lines of slcan
-# adapters) is brought into this one layout, so that there is one place that gives it a name.
+# SocketCAN frames and the ``s`` and ``e`` lines of slcan adapters are all converted to this layout,
+# so that errors get their names in one place.
 
 
 class BusState(StrEnum):
-    """Fault confinement of ISO 11898-1, as the adapter tells; a serial line is always ACTIVE."""
+    """Fault confinement state (ISO 11898-1) as reported by the adapter; ACTIVE on a serial line."""
 
     ACTIVE = "active"
     WARNING = "error-warning"
@@ -81,7 +81,7 @@ _CONTROLLER_STATE = {
 
 
 def error_frame(error_class: int, controller: int = 0, protocol: int = 0) -> CanFrame:
-    """Error frame of these class bits; ``controller`` is its data[1], ``protocol`` its data[2]."""
+    """Error frame with these class bits. ``controller`` becomes data[1], ``protocol`` data[2]."""
     return CanFrame(error_class, bytes([0, controller, protocol, 0, 0, 0, 0, 0]), error=True)
 
 
@@ -93,7 +93,7 @@ def state_frame(state: BusState) -> CanFrame:
 
 
 def names(frame: CanFrame) -> tuple[str, ...]:
-    """Names of everything an error frame tells; never empty."""
+    """Names of all errors and states in an error frame; never empty."""
     told = [name for bit, name in _CLASSES.items() if frame.identifier & bit]
     if frame.identifier & CONTROLLER:
         told += [name for bits, name in _CONTROLLER_BITS.items() if _controller(frame) & bits]
@@ -101,7 +101,7 @@ def names(frame: CanFrame) -> tuple[str, ...]:
 
 
 def told_state(frame: CanFrame) -> BusState | None:
-    """State that an error frame announces; None when it tells of none."""
+    """Bus state announced by an error frame; None if it announces none."""
     if frame.identifier & BUS_OFF:
         return BusState.BUS_OFF
     if frame.identifier & RESTARTED:
@@ -122,17 +122,17 @@ def _controller(frame: CanFrame) -> int:
 
 
 MARK = 0x2A5
-"""Bits 25–16 of every identifier: tells this protocol from other traffic on the bus."""
+"""Bits 25–16 of every identifier: separate this protocol from other traffic on the bus."""
 
 BROADCAST = 127
-"""Board number that a host uses for every board at once; no board has it."""
+"""Board number with which the host addresses all boards at once; no board has it."""
 
 CLASSIC_SIZE = 8
 FD_SIZE = 64
 _FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 _FD_UP = tuple(next(n for n in _FD_LENGTHS if n >= size) for size in range(FD_SIZE + 1))
 _FD_PADDING = 15
-"""Most bytes that the step from 48 to 64 pads."""
+"""Largest padding in bytes: a CAN FD frame of 48 bytes and one more is padded to 64."""
 
 _START, _END, _TOGGLE, _ID = 0x80, 0x40, 0x20, 0x1F
 _KNOWN = frozenset(int(kind) for kind in MessageType)
@@ -144,7 +144,8 @@ PRIORITY: dict[MessageType, int] = {
     MessageType.STATUS: 5,
     MessageType.LOG: 6,
 }
-"""0 wins the bus. Clock frames go first, for their stamps must not wait; log text last."""
+"""Priority of each message type; 0 wins arbitration. Clock frames come first, as their time stamps
+must not wait; log text comes last."""
 
 _COMMAND_PRIORITY = 2
 
@@ -170,7 +171,7 @@ _REASONS = (
 
 @dataclass(frozen=True, slots=True)
 class CanFrame:
-    """One frame with a 29-bit identifier. ``error``: the controller's report, not data."""
+    """One CAN frame with a 29-bit identifier. ``error``: a report of the controller, not data."""
 
     identifier: int
     data: bytes
@@ -179,13 +180,16 @@ class CanFrame:
 
 
 def identifier(kind: MessageType, board: int) -> int:
-    """Identifier of messages of type ``kind`` from or to ``board``."""
+    """CAN identifier of messages of type ``kind`` from or to ``board``."""
     priority = PRIORITY.get(kind, _COMMAND_PRIORITY)
     return priority << 26 | MARK << 16 | kind << 8 | board
 
 
 class CanEncoder:
-    """Messages from ``board`` (or, on the host, to it; `BROADCAST` for all) to CAN frames."""
+    """Encodes messages to CAN frames.
+
+    ``board``: the sender on a board, the receiver on the host (`BROADCAST` for all boards).
+    """
 
     def __init__(self, board: int, fd: bool) -> None:
         if not 0 <= board <= BROADCAST:
@@ -195,7 +199,8 @@ class CanEncoder:
         self._next: dict[MessageType, int] = {}
 
     def encode(self, message: Message) -> tuple[CanFrame, ...]:
-        """Transfer of ``message``; ValueError for values that do not fit."""
+        """Frames of the transfer that carries ``message``. Raises ValueError if a value does not
+        fit."""
         kind = message_type(message)
         raw = pack(message, self._board)
         transfer = self._next.get(kind, 0)
@@ -204,7 +209,7 @@ class CanEncoder:
 
 
 def segment(raw: bytes, can_id: int, transfer: int, fd: bool) -> tuple[CanFrame, ...]:
-    """Frames that carry the packet ``raw`` as transfer number ``transfer`` (0 to 31)."""
+    """Split the packet ``raw`` into the frames of transfer number ``transfer`` (0 to 31)."""
     step = (FD_SIZE if fd else CLASSIC_SIZE) - 1
     frames = []
     toggle = _TOGGLE
@@ -223,7 +228,7 @@ def segment(raw: bytes, can_id: int, transfer: int, fd: bool) -> tuple[CanFrame,
 
 
 class _Transfer:
-    """What came so far of one transfer, and the last frame for telling a repetition."""
+    """Received part of one transfer, and its last frame to detect repetitions."""
 
     __slots__ = ("expected", "fd", "last", "parts", "size")
 
@@ -241,10 +246,10 @@ class _Transfer:
 
 
 class CanDecoder:
-    """CAN frames of any number of boards to messages.
+    """Decodes CAN frames of any number of boards to messages.
 
-    A transfer in the making exists once per board and known type: at most 128 × 13 of them, of
-    at most `packet.MAX_PACKET` bytes plus one frame each.
+    It holds one unfinished transfer per board and known type: at most 128 × 13, each of at most
+    `packets.MAX_PACKET` bytes plus one frame.
     """
 
     def __init__(self) -> None:
@@ -253,14 +258,14 @@ class CanDecoder:
         self._unknown: deque[tuple[int, int]] = deque(maxlen=MAX_UNKNOWN)
 
     def take_unknown(self) -> list[tuple[int, int]]:
-        """Type and request number of the messages skipped as unknown since the last call."""
+        """Return type and request number of the unknown messages skipped since the last call."""
         unknown = list(self._unknown)
         self._unknown.clear()
         return unknown
 
     @property
     def counters(self) -> dict[str, int]:
-        """Messages accepted; frames or transfers refused, by reason."""
+        """Messages accepted, and frames or transfers refused, by reason."""
         return self._tally.snapshot()
 
     def reset(self) -> None:
@@ -268,7 +273,7 @@ class CanDecoder:
         self._transfers.clear()
 
     def feed(self, frames: Iterable[CanFrame], /) -> list[Received]:
-        """Messages whose transfers ended in ``frames``."""
+        """Return the messages whose transfers ended in ``frames``."""
         packets: list[bytes] = []
         keys: list[int] = []
         for frame in frames:
@@ -279,7 +284,7 @@ class CanDecoder:
         return self._read(packets, keys) if packets else []
 
     def _take(self, frame: CanFrame) -> bytes | None:
-        """Packet that ``frame`` completes, cut to its length; None when there is none."""
+        """Packet completed by ``frame``, without padding; None if it completes none."""
         can_id, data = frame.identifier, frame.data
         tally = self._tally
         if frame.error:
@@ -302,7 +307,7 @@ class CanDecoder:
         if transfer is None:
             transfer = self._transfers[key] = _Transfer()
         if data == transfer.last:
-            # A sender that missed the acknowledgement repeats its frame (ISO 11898-1, 10.7).
+            # A sender that misses the acknowledgement repeats its frame (ISO 11898-1, 10.7).
             tally[Reject.DUPLICATE] += 1
             return None
         transfer.last = data
@@ -345,7 +350,7 @@ class CanDecoder:
         return self._trim(raw, frame.fd)
 
     def _trim(self, raw: bytes, fd: bool) -> bytes | None:
-        """Packet without the padding of CAN FD; None, counted, when its length is impossible."""
+        """Packet without the padding of CAN FD; None, and counted, if its length is impossible."""
         if len(raw) < OVERHEAD:
             self._tally[Reject.RUNT] += 1
             return None

@@ -1,22 +1,22 @@
-"""Consistent overhead byte stuffing (Cheshire & Baker 1999): no zero inside, at most 1 in 254 more.
+"""Consistent overhead byte stuffing (Cheshire & Baker 1999): removes zeros, adds at most 1 in 254.
 
-Frames are without their ending zero here; `framing` adds and removes it.
+Frames here lack their ending zero; `framing` adds and removes it.
 """
 
 from __future__ import annotations
 
 _CODES = tuple(bytes([n]) for n in range(256))
-_RUN = b"\1" * 8  # as many zeros, stuffed: shorter runs cost more to look for than to step through
-_FULL = 254  # data bytes of the longest block; its code 255 stands for no zero after them
+_RUN = b"\1" * 8  # eight stuffed zeros; a search for shorter runs costs more than it saves
+_FULL = 254  # data bytes of the longest block; its code 255 means that no zero follows them
 
 
 def max_encoded(size: int) -> int:
-    """Longest encoding of ``size`` bytes."""
+    """Largest encoded size of ``size`` bytes."""
     return size + 1 + size // _FULL
 
 
 def encode(data: bytes) -> bytes:
-    """Stuffed form of ``data``, free of zeros."""
+    """Encode ``data``; the result contains no zeros."""
     out: list[bytes] = []
     blocks = data.split(b"\0")
     for block in blocks:
@@ -27,21 +27,21 @@ def encode(data: bytes) -> bytes:
         out += (_CODES[len(rest) + 1], rest)
     last = blocks[-1]
     if last and len(last) % _FULL == 0:
-        # Data that ends in a full block needs no further, empty one.
+        # Data that ends in a full block needs no empty block after it.
         del out[-2:]
     return b"".join(out)
 
 
 def decode(frame: bytes) -> bytes | None:
-    """Data of a frame that holds no zero; None when its blocks do not end where it ends.
+    """Decode a frame without zeros; None if its last block does not end where the frame ends.
 
-    Works in place: a block's code byte is where the zero before that block belongs.
+    Works in place: a block's code byte stands where the zero before that block belongs.
     """
     size = len(frame)
     out = bytearray(frame)
     at = 0
     if size <= _FULL + 1:
-        # A full block cannot be followed by another here, so that no code needs removing.
+        # No block can follow a full one in a frame this short, so no code byte needs removing.
         run = frame.find(_RUN)
         stop = size if run < 0 else run
         while at < stop:
@@ -49,7 +49,7 @@ def decode(frame: bytes) -> bytes | None:
             out[at] = 0
             at += code
         if at < size:
-            # Clear status bits make a long run of zeros: where a code is 1, so are those after it.
+            # Clear status bits give long runs of zeros: if one code is 1, so are those after it.
             ones = size - at - len(frame[at:].lstrip(b"\1"))
             out[at : at + ones] = bytes(ones)
             at += ones

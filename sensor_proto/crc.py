@@ -1,8 +1,9 @@
-"""CRC-32C (Castagnoli) by numpy, one packet at a time or many at once.
+"""CRC-32C (Castagnoli) with numpy, for one packet or many at once.
 
-Reflected polynomial 0x82F63B78, register seeded with ones and inverted at the end (RFC 3720,
-appendix B.4). The CRC is linear: it is the xor of what each byte contributes at its distance from
-the end, and of a constant for the length, so that a table lookup and a reduction replace the loop.
+Reflected polynomial 0x82F63B78, register initialised with ones and inverted at the end (RFC 3720,
+appendix B.4). The CRC is linear: it is the xor of a contribution of each byte, which depends on the
+byte's distance from the end, and of a constant for the length. A table lookup and a reduction
+replace the loop.
 """
 
 from __future__ import annotations
@@ -14,15 +15,15 @@ from numpy.typing import NDArray
 
 POLYNOMIAL = 0x82F63B78
 RESIDUE = 0x48674BC7
-"""CRC of any packet followed by its own CRC, least significant byte first."""
+"""Result for any packet that is followed by its own CRC, least significant byte first."""
 
 BLOCK = 1040
-"""Distances from the end that the table covers: a whole packet (`packet.MAX_PACKET`) in one go,
-in 1 MB. Longer data is taken in several blocks."""
+"""Distances from the end covered by the table (1 MB): a whole packet (`packets.MAX_PACKET`). Longer
+data is processed in several blocks."""
 
 
 def _byte_table() -> NDArray[np.uint32]:
-    """What the last byte contributes: (256,)."""
+    """Contribution of the last byte, (256,)."""
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         table = np.where(table & 1, (table >> 1) ^ np.uint32(POLYNOMIAL), table >> 1)
@@ -30,9 +31,10 @@ def _byte_table() -> NDArray[np.uint32]:
 
 
 def _tables() -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
-    """Contributions (BLOCK × 256,), flat, by distance and byte; registers (BLOCK + 1,) by length.
+    """Contributions by distance and byte, flat (BLOCK × 256,), and registers by length, (BLOCK +
+    1,).
 
-    The second is the register after so many zero bytes from a seed of ones.
+    A register is the state after that many zero bytes, initialised with ones.
     """
     last = _byte_table()
     table = np.empty((BLOCK, 256), dtype=np.uint32)
@@ -67,7 +69,7 @@ def crc32c(data: bytes | bytearray | memoryview) -> int:
     if first:
         register ^= int(np.bitwise_xor.reduce(_TABLE.take(values[:first] + _OFFSETS[-first:])))
     for start in range(first, size, BLOCK):
-        # Running on from a register is the same as xoring it into the next four bytes.
+        # Continuing from a register equals xoring it into the next four bytes.
         block = values[start : start + BLOCK].copy()
         block[:4] ^= np.frombuffer(register.to_bytes(4, "little"), dtype=np.uint8)
         register = int(np.bitwise_xor.reduce(_TABLE.take(block + _OFFSETS)))
@@ -75,7 +77,8 @@ def crc32c(data: bytes | bytearray | memoryview) -> int:
 
 
 def crc32c_each(packets: Sequence[bytes]) -> NDArray[np.uint32]:
-    """CRC-32C of each packet, (k,); ValueError for an empty packet or one longer than `BLOCK`."""
+    """CRC-32C of each packet, (k,). Raises ValueError for an empty packet or one longer than
+    `BLOCK`."""
     sizes = np.fromiter(map(len, packets), dtype=np.intp, count=len(packets))
     if not len(sizes):
         return np.empty(0, dtype=np.uint32)

@@ -1,4 +1,4 @@
-"""Serial line: packets as COBS frames, each ended by a zero byte."""
+"""Packets on a serial line: COBS frames, each ended by a zero byte."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sensor_proto.packets import (
 )
 
 MAX_FRAME = cobs.max_encoded(MAX_PACKET)
-"""Bytes of the longest frame without its zero: the most that is held of an unfinished one."""
+"""Size of the longest frame without its zero, and the most bytes held of an unfinished one."""
 
 _RUN = re.compile(rb"[^\0]+")
 _REASONS = (
@@ -41,12 +41,12 @@ _REASONS = (
 
 
 def encode_serial(message: Message) -> bytes:
-    """Frame of ``message`` with the ending zero; ValueError for values that do not fit."""
+    """Frame of ``message`` with its ending zero. Raises ValueError if a value does not fit."""
     return cobs.encode(pack(message)) + b"\0"
 
 
 class SerialDecoder:
-    """Bytes of one serial line in any chunks to messages; holds at most `MAX_FRAME` bytes."""
+    """Decodes the bytes of one serial line, in any chunks; holds at most `MAX_FRAME` bytes."""
 
     def __init__(self) -> None:
         self._partial = b""
@@ -55,14 +55,14 @@ class SerialDecoder:
         self._unknown: deque[tuple[int, int]] = deque(maxlen=MAX_UNKNOWN)
 
     def take_unknown(self) -> list[tuple[int, int]]:
-        """Type and request number of the whole messages skipped as unknown since the last call."""
+        """Return type and request number of the unknown messages skipped since the last call."""
         unknown = list(self._unknown)
         self._unknown.clear()
         return unknown
 
     @property
     def counters(self) -> dict[str, int]:
-        """Frames accepted and refused, by reason. A frame too long counts once."""
+        """Frames accepted and refused, by reason. An oversized frame counts once."""
         return self._tally.snapshot()
 
     def reset(self) -> None:
@@ -71,7 +71,7 @@ class SerialDecoder:
         self._discarding = False
 
     def feed(self, data: bytes, /) -> list[Received]:
-        """Messages whose frames ended in ``data``."""
+        """Return the messages whose frames ended in ``data``."""
         last = data.rfind(0)
         if last < 0:
             self._hold(data)
@@ -91,14 +91,14 @@ class SerialDecoder:
         for run in _RUN.finditer(data, first + 1, last):
             frames += 1
             self._open(run[0], size - run.end() - 1, packets, trailing)
-        # Counted for the whole chunk at once: a flood of zeros costs nothing per zero.
+        # Counted once per chunk, so that a flood of zeros costs nothing per zero.
         self._tally[Reject.EMPTY] += data.count(0) - frames
         self._partial = b""
         self._hold(data[last + 1 :])
         return self._read(packets, trailing) if packets else []
 
     def _hold(self, data: bytes) -> None:
-        """Keep the beginning of a frame, unless it is already too long to be one."""
+        """Keep the beginning of a frame unless it is already too long."""
         if self._discarding:
             return
         if len(self._partial) + len(data) > MAX_FRAME:
@@ -109,7 +109,7 @@ class SerialDecoder:
             self._partial += data
 
     def _open(self, frame: bytes, after: int, packets: list[bytes], trailing: list[int]) -> None:
-        """Append the packet in ``frame`` if its size is right, else count why not."""
+        """Append the packet in ``frame`` if its size is right; otherwise count the reason."""
         if len(frame) > MAX_FRAME:
             self._tally[Reject.OVERSIZED] += 1
             return

@@ -1,4 +1,7 @@
-"""Binary frames of a known layout to samples: the boundary is found, kept, and found again."""
+"""Layouts of boards without a protocol: syntax, decoders of text and binary frames, temperatures.
+
+The decoders find the frame boundary, keep it, and search again after a loss.
+"""
 
 from __future__ import annotations
 
@@ -12,43 +15,45 @@ from numpy.typing import NDArray
 
 from sensor_proto.packets import ACCEPTED, FloatSamples, Received, Reject, Tally, TaxelStatus
 
-# Whether a column of numbers is the temperature of a chip: what tells apart how boards write.
+# Recognising the temperature column of a chip, which tells layouts apart.
 #
-# Frames of four numbers a chip hold a temperature, frames of three do not, and twelve numbers may
+# Frames of four numbers per chip hold a temperature, frames of three do not, and twelve numbers may
 # be either. A temperature is within what a chip survives, nearly the same on all chips of a board,
-# and quiet: its noise is a few hundredths of a kelvin, a field's some microtesla.
+# and quiet: its noise is a few hundredths of a kelvin, that of a field some microtesla.
 
 
 COLDEST_C, HOTTEST_C = -45.0, 130.0
-"""MLX90393 works from −40 to 85 °C; some room for self-heating and trim."""
+"""Plausible temperatures. The MLX90393 works from −40 to 85 °C; the rest allows for self-heating
+and trim."""
 
 FAILED_C = (-998.1, 451.8)
-"""What its temperature formula gives for raw 0 and 0xFFFF: the chip did not answer."""
+"""Result of its temperature formula for raw 0 and 0xFFFF: the chip did not answer."""
 
 TINY_C = 1e-3
-"""Half of all bit patterns are floats below 1; a temperature in steps of 1/45.2 °C never is this
-close to nought, save nought itself."""
+"""Smallest plausible size except exactly 0. Half of all float bit patterns are below 1, but a
+temperature in steps of 1/45.2 °C is never this close to 0."""
 
 STEPS_PER_K = 45.2
-"""Steps of the chip's temperature in a kelvin (MLX90393 datasheet)."""
+"""Resolution of the chip's temperature, steps per kelvin (MLX90393 datasheet)."""
 
 ON_STEP = 0.02
-"""Part of a step by which a float may miss it."""
+"""Tolerance, in steps, by which a float may miss a step."""
 
 ALIKE_K = 25.0
-"""K between the chips of one board, one of them beside a hot regulator."""
+"""Largest difference in K between the chips of one board, one of them beside a hot regulator."""
 
 QUIET_K = 0.5
-"""K between two frames; a chip's noise is a tenth of that, its warming still less."""
+"""Largest median change in K between two frames. A chip's noise is a tenth of that; it warms more
+slowly still."""
 
 QUIETER = 3.0
-"""Times that a field moves more than a temperature, in microtesla and kelvin."""
+"""How many times more a field (µT) varies than a temperature (K)."""
 
 Float = NDArray[np.floating]
 
 
 def plausible(temperature_c: Float) -> NDArray[np.bool_]:
-    """Whether each can come from a chip, working or dead; same shape."""
+    """Whether each value can come from a chip, working or dead; same shape as the input."""
     size = np.abs(temperature_c)
     usual = (temperature_c >= COLDEST_C) & (temperature_c <= HOTTEST_C)
     usual &= (size >= TINY_C) | (size == 0)
@@ -59,10 +64,10 @@ def plausible(temperature_c: Float) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What speaks for one column a chip being its temperature.
+    """Evidence that one column per chip is its temperature.
 
-    ``likely``: it can be. ``stepped``: every value is on the steps of the chip's thermometer, which
-    no field is. ``quieter``: it moves much less than the other columns do.
+    ``likely``: it can be. ``stepped``: every value is on a step of the chip's thermometer, which
+    fields are not. ``quieter``: it varies much less than the other columns.
     """
 
     likely: bool
@@ -71,12 +76,12 @@ class Evidence:
 
     @property
     def sure(self) -> bool:
-        """Whether it can hardly be a field."""
+        """Whether the column is hardly a field."""
         return self.likely and (self.stepped or self.quieter)
 
 
 def evidence(values: Float, column: int) -> Evidence:
-    """Judge one column of (frames, chips, numbers a chip)."""
+    """Assess one column of ``values``, shape (frames, chips, numbers per chip)."""
     with np.errstate(invalid="ignore", over="ignore"):
         seen = np.asarray(values[:, :, column], np.float64)
         good = plausible(seen)
@@ -84,7 +89,7 @@ def evidence(values: Float, column: int) -> Evidence:
         if good.mean() < 0.8:
             return Evidence(False)
         if not alive.any():
-            return Evidence(True, stepped=True)  # all dead, and each says so
+            return Evidence(True, stepped=True)  # all chips are dead and report it
         warm = np.where(alive, seen, np.nan)
         used = warm[alive.any(axis=1)]
         if (np.nanmax(used, axis=1) - np.nanmin(used, axis=1)).max() > ALIKE_K:
@@ -103,7 +108,7 @@ def evidence(values: Float, column: int) -> Evidence:
 
 
 def temperature_first(values: Float) -> bool | None:
-    """Whether t comes first in (frames, chips, 4), or last (False); None: that cannot be told."""
+    """Whether t is first in (frames, chips, 4), or last (False); None if that cannot be told."""
     first, last = evidence(values, 0), evidence(values, 3)
     if first.likely != last.likely:
         return first.likely
@@ -113,9 +118,9 @@ def temperature_first(values: Float) -> bool | None:
 
 
 def with_or_without(values: Float) -> str | None:
-    """Order of the numbers of each chip, ``txyz``, ``xyzt`` or ``xyz``, of (frames, numbers).
+    """Order of the numbers of each chip in (frames, numbers): ``txyz``, ``xyzt`` or ``xyz``.
 
-    None where that cannot be told, as with twelve numbers that hardly move.
+    None if that cannot be told, as with twelve numbers that hardly vary.
     """
     count = values.shape[1]
     threes, fours = count % 3 == 0, count % 4 == 0
@@ -131,33 +136,33 @@ def with_or_without(values: Float) -> str | None:
 
 # How a board without a protocol writes its samples: kind of number, chips, order, framing.
 #
-# A layout is written ``KIND:nFIELDS[,OPTION…]``, as in ``floats:5xyz`` or
+# The syntax is ``KIND:nFIELDS[,OPTION…]``, as in ``floats:5xyz`` or
 # ``int16:5xyz,big,scale=0.15/0.242,start=aa55,check=sum``; PROTOCOL.md section 9 has the grammar.
 
 
 MAX_CHIPS = 20
-"""Four boards of five on one controller, the largest assembly on sale."""
+"""Largest assembly on sale: four boards of five chips on one controller."""
 
 MAX_EXTRA = 16
-"""Bytes or numbers beside those of the chips that a frame may have."""
+"""Most bytes or numbers per frame that do not belong to a chip."""
 
 MAX_LINES = 64
-"""Lines of text that one frame may take."""
+"""Most lines of text per frame."""
 
 STEPS_PER_K, RAW_AT_25_C = 45.2, 46244
-"""T = 25 + (raw − 46244) / 45.2 °C, MLX90393 datasheet: temperatures of layouts of integers."""
+"""Temperature of integer layouts: T = 25 + (raw − 46244) / 45.2 °C (MLX90393 datasheet)."""
 
 COUNT_UT = (0.15, 0.15, 0.242)
-"""µT for one count where a layout of integers does not say it: MLX90393 at gain 7, resolution 0."""
+"""Default µT per count (x, y, z) of integer layouts: MLX90393 at gain 7, resolution 0."""
 
 UNSIGNED_ZERO = 32768
-"""Count of no field in ``uint16``."""
+"""Count at zero field in ``uint16``."""
 
 ENDS = {"crlf": b"\r\n", "lf": b"\n", "cr": b"\r", "none": b""}
 
 
 class Kind(StrEnum):
-    """How numbers are written."""
+    """Number format."""
 
     FLOATS = "floats"
     DOUBLES = "doubles"
@@ -175,10 +180,10 @@ _DTYPES = {
     Kind.INT32: "i4",
 }
 COUNTS = (Kind.INT16, Kind.UINT16, Kind.INT32)
-"""Kinds whose fields are counts of the chip."""
+"""Kinds whose fields are raw counts of the chip."""
 
 CHECKS = ("", "xor", "sum")
-"""Checks of one byte over everything between ``start`` and the check."""
+"""Supported one-byte checks; they cover everything between ``start`` and the check."""
 
 FORM = (
     "KIND:nFIELDS[,OPTION...], as in floats:5xyz, text:5txyz or int16:5xyz,big,start=aa55,check=sum"
@@ -193,11 +198,11 @@ _FORM = re.compile(r"(?P<kind>[a-z0-9]+):(?P<chips>[0-9]{1,3})(?P<fields>[xyzt_]
 
 @dataclass(frozen=True, slots=True)
 class Framing:
-    """What stands round the numbers of a binary frame.
+    """Bytes around the numbers of a binary frame.
 
-    ``start`` and ``end``: bytes that every frame has. ``skip``: bytes behind ``start`` that are not
-    looked at, such as a counter. ``check``: one of `CHECKS`, behind the numbers. ``tail``: bytes
-    behind the numbers (and the check) that are not looked at.
+    ``start`` and ``end``: constant bytes of every frame. ``skip``: number of ignored bytes after
+    ``start``, such as a counter. ``check``: one of `CHECKS`, after the numbers. ``tail``: number of
+    ignored bytes after the numbers and the check.
     """
 
     start: bytes = b""
@@ -208,7 +213,7 @@ class Framing:
 
     @property
     def extra(self) -> int:
-        """Bytes beside the numbers."""
+        """Bytes of a frame that are not numbers."""
         return self.before + bool(self.check) + self.tail + len(self.end)
 
     @property
@@ -219,12 +224,12 @@ class Framing:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """One way to write the samples of ``chips`` magnetometers.
+    """Layout of the samples of ``chips`` magnetometers.
 
-    ``fields``: letters x, y, z, t (each at most once; t may be left out) and _, in their order in
-    each chip's numbers. ``scale``: µT for one unit of x, y, z. ``framing``: None for text, and for
-    binary frames whose framing is to be found out. ``lead``: numbers before those of the first
-    chip, ``lines``: lines a frame, both of text.
+    ``fields``: the letters x, y, z (once each), t (at most once) and _ (unused), in the order of
+    each chip's numbers. ``scale``: µT per unit of x, y, z. ``framing``: None for text and for
+    binary frames whose framing is yet to be found. ``lead``: numbers before those of the first
+    chip; ``lines``: lines per frame; both for text only.
     """
 
     kind: Kind
@@ -238,7 +243,7 @@ class Layout:
 
     @classmethod
     def parse(cls, text: str) -> Layout:
-        """Layout as users write it; ValueError names what is allowed."""
+        """Parse the syntax that users write. The ValueError it raises names what is allowed."""
         match = _FORM.fullmatch(text)
         if match is None or match["kind"] not in tuple(Kind):
             raise ValueError(f"{text!r} is not a layout; allowed: {FORM}")
@@ -287,7 +292,7 @@ class Layout:
         raise ValueError(f"{text!r}: {option!r} is not an option of {self.kind}; allowed: {FORM}")
 
     def __str__(self) -> str:
-        """The layout as users write it."""
+        """Return the syntax that users write."""
         words = [f"{self.kind}:{self.chips}{self.fields}"]
         if self.big:
             words.append("big")
@@ -311,30 +316,31 @@ class Layout:
 
     @property
     def numbers(self) -> int:
-        """Numbers of all chips in a frame."""
+        """Numbers per frame, of all chips."""
         return self.chips * len(self.fields)
 
     @property
     def dtype(self) -> np.dtype[np.generic]:
-        """Type of a number in a binary frame."""
+        """Data type of one number in a binary frame."""
         return np.dtype((">" if self.big else "<") + _DTYPES[self.kind])
 
     @property
     def payload(self) -> int:
-        """Bytes of the numbers of a binary frame."""
+        """Size in bytes of the numbers of a binary frame."""
         return self.numbers * self.dtype.itemsize
 
     @property
     def size(self) -> int:
-        """Bytes of a binary frame; its framing must be known."""
+        """Size in bytes of a binary frame with its known framing."""
         return self.payload + (self.framing or Framing()).extra
 
     def samples(
         self, values: NDArray[np.generic]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Field (k, chips, 3) µT and temperature (k, chips) °C of (k, numbers) as written.
+        """Convert raw numbers (k, numbers) to field (k, chips, 3) in µT and temperature (k, chips)
+        in °C.
 
-        NaN for temperatures that frames do not hold.
+        The temperature is NaN if the layout has none.
         """
         grouped = values.reshape(len(values), self.chips, len(self.fields)).astype(np.float64)
         counted = self.kind in COUNTS
@@ -352,9 +358,9 @@ class Layout:
             return field, raw.astype(np.float32)
 
     def encode(self, samples: FloatSamples, number: int = 0) -> bytes:
-        """Frame of ``samples`` (one line of text, tabs between numbers), for simulated boards.
+        """Encode a frame of ``samples`` (for text, one line with tabs), for simulated boards.
 
-        ``number``: counts frames; its last byte is the first of the bytes that are skipped.
+        ``number``: frame counter; its low byte becomes the first of the skipped bytes.
         """
         if len(samples.temperature_c) != self.chips:
             raise ValueError(f"{len(samples.temperature_c)} chips, the layout has {self.chips}")
@@ -375,7 +381,7 @@ class Layout:
         if self.kind is Kind.TEXT:
             values = [float(number)] * self.lead + grouped.ravel().tolist()
             return "\t".join(f"{value:.2f}" for value in values).encode() + b"\r\n"
-        if counted:  # what does not fit wraps, as in a chip's register
+        if counted:  # values that do not fit wrap, as in a chip's register
             bits = 8 * self.dtype.itemsize
             unsigned = self.dtype.str.replace("i", "u")
             body = (np.round(grouped).astype(np.int64) % (1 << bits)).astype(unsigned)
@@ -389,7 +395,7 @@ class Layout:
 
 
 def check_of(check: str, data: bytes) -> int:
-    """Byte that ``check`` gives for ``data``."""
+    """Check byte of ``data``."""
     if check == "xor":
         return reduce(lambda value, byte: value ^ byte, data, 0)
     return sum(data) % 256
@@ -422,19 +428,21 @@ def _scale(text: str) -> tuple[float, float, float]:
     return (xy, values[1] if len(values) == 3 else xy, z)
 
 
-# Lines of text to samples: what numbers a line holds, and lines of a known layout.
+# Text lines: the numbers in a line, and the decoder for a known layout.
 #
-# Sketches print their numbers with tabs, commas or blanks between them, with labels such as ``X0:``
-# or none, sometimes with nothing at all between two numbers of two decimals each.
+# Sketches separate their numbers by tabs, commas or spaces, with labels such as ``X0:`` or without,
+# sometimes with nothing at all between two numbers of two decimals each.
 
 
 MAX_LINE = 4096
-"""Bytes of a line; a longer one is none."""
+"""Longest line in bytes; a longer one is discarded."""
 
 MAX_FIELD_UT = 1e6
+"""Field limit in µT: far above any count times a chip's coarsest scale."""
 
 FORGET_AFTER = 20
-"""Lines in a row that do not fit after which decimals are learnt anew: firmware was replaced."""
+"""Consecutive lines that do not fit after which the decimals are learnt again, as the firmware may
+have changed."""
 
 _END = re.compile(rb"[\r\n]+")
 _MISSING = rb"(?:nan|inf|ovf|null|none|err(?:or)?|fail(?:ed)?)(?![A-Za-z])"
@@ -447,10 +455,10 @@ _GLUED = re.compile(rb"[0-9]\.[0-9]+\.[0-9]")
 
 @dataclass(frozen=True, slots=True)
 class Tokens:
-    """Numbers of a record. ``between``: text before each number and behind the last, words and all.
+    """Numbers of one record.
 
-    ``decimals``: of each number, −1 for one that is no number (nan, ERR) and stands for a reading
-    that failed.
+    ``between``: text before each number and after the last, including words. ``decimals``: decimal
+    places of each number; −1 for a failed reading (nan, ERR).
     """
 
     numbers: tuple[float, ...]
@@ -459,12 +467,13 @@ class Tokens:
 
     @property
     def gone(self) -> int:
-        """How many are no numbers."""
+        """Number of failed readings."""
         return self.decimals.count(-1)
 
 
 def tokens(line: bytes) -> Tokens:
-    """Take a line apart. Numbers with nothing between them are told by their equal decimals."""
+    """Split a line into tokens. Adjoining numbers are separated by their equal number of
+    decimals."""
     pattern = _TOKEN
     if _GLUED.search(line):
         places = len(line.rstrip(b" \t,;]").rpartition(b".")[2])
@@ -494,7 +503,7 @@ def tokens(line: bytes) -> Tokens:
 
 
 def join(parts: list[Tokens]) -> Tokens:
-    """One record of several lines."""
+    """Join the tokens of several lines into one record."""
     between: list[bytes] = [b""]
     for part in parts:
         between[-1] += b"\n" + part.between[0]
@@ -507,7 +516,7 @@ def join(parts: list[Tokens]) -> Tokens:
 
 
 def axis_of(before: bytes) -> str:
-    """Axis that the text before a number names: x, y, z, t (temperature), or empty for none."""
+    """Axis named by the text before a number: x, y, z, t (temperature), or empty."""
     words: list[bytes] = re.findall(_WORD, before)
     for word in reversed(words):
         name = word.rstrip(b"0123456789_").decode("latin-1")
@@ -523,10 +532,10 @@ def axis_of(before: bytes) -> str:
 
 
 class TextDecoder:
-    """Lines of ``layout`` (numbers of all chips, in order) to `FloatSamples`.
+    """Decodes text lines of ``layout`` (numbers of all chips, in order) to `FloatSamples`.
 
-    Whatever stands between the numbers is passed over; how many decimals each has is learnt from
-    the first lines and demanded of the others, so that a line with a piece missing is dropped.
+    Text between the numbers is ignored. The number of decimals of each number is learnt from the
+    first lines and required of later ones, so that lines with a missing piece are dropped.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -539,21 +548,22 @@ class TextDecoder:
 
     @property
     def counters(self) -> dict[str, int]:
-        """Lines accepted (frames), times their form was lost, bytes of lines that did not fit."""
+        """Lines (frames) accepted, times their form was lost, and bytes of lines that did not
+        fit."""
         return self._tally.snapshot()
 
     def reset(self) -> None:
-        """Forget the unfinished line and what was learnt."""
+        """Forget the unfinished line and the learnt form."""
         self._buffer = b""
-        self._whole = False  # whether a line has been seen to begin
+        self._whole = False  # whether the start of a line has been seen
         self._record: list[Tokens] = []
         self._record_bytes = 0
         self._form: tuple[tuple[int, ...], int] | None = None
         self._wrong = 0
-        self._label = b""  # before the first number of a frame of several lines
+        self._label = b""  # text before the first number of a multi-line frame
 
     def feed(self, data: bytes, /) -> list[Received]:
-        """Frames that ``data`` completed."""
+        """Return the frames that ``data`` completed."""
         buffer = self._buffer + data
         out: list[Received] = []
         at = 0
@@ -576,7 +586,7 @@ class TextDecoder:
         part = tokens(line)
         if self.layout.lines > 1:
             if not part.numbers:
-                return  # a rule between two frames
+                return  # a separator between two frames
             if self._begins(part):
                 self._drop_record()
             elif not self._record:
@@ -602,9 +612,9 @@ class TextDecoder:
         out.append(Received(FloatSamples(field[0], temperature[0], status[0]), 0, trailing))
 
     def _begins(self, part: Tokens) -> bool:
-        """Whether a line is the first of a frame: it names the first axis, of the first chip.
+        """Whether a line starts a frame: it names the first axis of the first chip.
 
-        Where lines name no axis, any line may be.
+        If the lines name no axis, any line may start one.
         """
         label = part.between[0].strip()
         axis = axis_of(label)
@@ -621,11 +631,11 @@ class TextDecoder:
         self._record, self._record_bytes = [], 0
 
     def _fitting(self, part: Tokens) -> tuple[float, ...] | None:
-        """Numbers of a record that has as many as the layout, in the form learnt; else None."""
+        """Numbers of a record, if their count and decimals match the layout; otherwise None."""
         numbers, decimals = part.numbers, part.decimals
         missing = self._wanted - len(numbers)
         if missing > 0 and part.gone and missing % part.gone == 0:
-            each = 1 + missing // part.gone  # one word in the place of a chip's numbers
+            each = 1 + missing // part.gone  # one word replaces all numbers of a chip
             numbers = tuple(n for n, d in zip(numbers, decimals, strict=True)
                             for _ in range(each if d < 0 else 1))  # fmt: skip
             decimals = tuple(d for d in decimals for _ in range(each if d < 0 else 1))
@@ -642,7 +652,7 @@ class TextDecoder:
         if all(d in (-1, own) for d, own in zip(decimals, learnt, strict=True)):
             self._form, self._wrong = (learnt, seen + 1), 0
             return numbers
-        if seen < 2:  # the first line may have been the odd one
+        if seen < 2:  # the first line may have been the damaged one
             self._form = decimals, 1
             return None
         self._note_wrong_form()
@@ -665,27 +675,26 @@ class TextDecoder:
 
 
 LOCK_FRAMES = 3
-"""Consecutive frames that must fit before a boundary is believed."""
+"""Consecutive frames that must fit before a boundary is accepted."""
 
 SURE_BYTES = 2
-"""Bytes of start, check and end that make one frame by itself believable, after a loss."""
+"""Bytes of start, check and end that make a single frame credible after a loss."""
 
 SUSPECT_FRAMES = 3
-"""Consecutive frames with mostly impossible numbers after which the boundary is doubted."""
-"""No count times the coarsest scale of a chip comes near this."""
+"""Consecutive frames with mostly implausible numbers after which the boundary is searched again."""
 
 LEAST_UT = 1e-6
-"""A float closer to nought that is not nought is made of bytes that are none."""
+"""Smallest plausible size of a field except exactly 0; smaller floats are misread bytes."""
 
 PIECE = 4096
-"""Bytes taken at a time: bounds the work of one search."""
+"""Bytes processed at a time; bounds the work of one search."""
 
 
 class LayoutDecoder:
-    """Frames of ``layout`` to `FloatSamples`, temperatures NaN where the frames have none.
+    """Decodes binary frames of ``layout`` to `FloatSamples`.
 
-    A layout without start, check and end is told by reads that each hold whole frames, as a board
-    that pauses between its frames brings them about.
+    Temperatures are NaN if the frames have none. A layout without start, check and end is
+    synchronised by reads that hold whole frames, as from a board that pauses between frames.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -705,21 +714,22 @@ class LayoutDecoder:
 
     @property
     def counters(self) -> dict[str, int]:
-        """Frames accepted, times the boundary was lost, bytes of no frame, wrong checks."""
+        """Frames accepted, times the boundary was lost, bytes outside frames, and wrong checks."""
         return self._tally.snapshot()
 
     def reset(self) -> None:
-        """Forget boundary and unfinished input."""
+        """Forget the boundary and unfinished input."""
         self._buffer = b""
         self._locked = self._known = False
         self._suspect = self._astray = 0
 
     def feed(self, data: bytes, /) -> list[Received]:
-        """Frames that ``data`` completed; on a fresh lock also those held back until then."""
+        """Return the frames completed by ``data``; the first after a lock also include those held
+        back."""
         out: list[Received] = []
         if self._bare or self._weak:
             self._look_at_read(data)
-        step = max(len(data), 1) if self._bare else PIECE  # only whole reads tell anything
+        step = max(len(data), 1) if self._bare else PIECE  # only whole reads show the boundary
         for begin in range(0, len(data), step):
             piece = data[begin : begin + step]
             self._feed(piece, max(0, len(data) - begin - step), len(data), out)
@@ -747,10 +757,10 @@ class LayoutDecoder:
         self._buffer = buffer[at:]
 
     def _look_at_read(self, data: bytes) -> None:
-        """Let reads that hold whole frames tell where these begin, where marks do not.
+        """Synchronise on reads that hold whole frames, where the marks do not suffice.
 
-        Without marks one is enough: what came before it has lost bytes. With one byte of marks,
-        which the numbers may hold as well, some in a row are.
+        Without marks, one such read is enough: data before it was lost. With one byte of marks,
+        which may also occur in the numbers, several in a row are needed.
         """
         whole = bool(data) and len(data) % self._size == 0
         astray = whole and len(self._buffer) % self._size > 0
@@ -762,7 +772,8 @@ class LayoutDecoder:
             self._buffer, self._locked = b"", False
 
     def _take(self, buffer: bytes, at: int, later: int, fed: int, out: list[Received]) -> int:
-        """Append the frames from ``at`` on, and unlock where they cease to fit; bytes taken."""
+        """Append the frames from ``at`` on and return the bytes consumed. Unlock where they stop
+        fitting."""
         size = self._size
         whole = (len(buffer) - at) // size
         if not whole:
@@ -770,7 +781,7 @@ class LayoutDecoder:
         raw = np.frombuffer(buffer, np.uint8, whole * size, at).reshape(whole, size)
         fits = self._marked(raw)
         if self._open_ended:
-            # Only what follows tells that no byte of the last frame is missing.
+            # Only the bytes after the last frame show that none of its bytes is missing.
             fits &= np.append(self._begins(raw[1:]), self._may_begin(buffer, at + whole * size))
         fitting = whole if fits.all() else int(fits.argmin())
         if fitting < whole:
@@ -793,18 +804,18 @@ class LayoutDecoder:
             self._tally[Reject.CRC] += 1
 
     def _begins(self, raw: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Which of (k, size) bytes have the start."""
+        """Which rows of (k, size) bytes begin with the start."""
         start = np.frombuffer(self._framing.start, np.uint8)
         begun: NDArray[np.bool_] = (raw[:, : len(start)] == start).all(axis=1)
         return begun
 
     def _may_begin(self, buffer: bytes, at: int) -> bool:
-        """Whether a frame may begin at ``at``, where the buffer may end."""
+        """Whether a frame may begin at ``at``; the buffer may end there."""
         start = self._framing.start
         return start.startswith(buffer[at : at + len(start)])
 
     def _marked(self, raw: NDArray[np.uint8], check: bool = True) -> NDArray[np.bool_]:
-        """Which of (k, size) bytes have start, end and check where they belong."""
+        """Which rows of (k, size) bytes have start, end and check in place."""
         framing = self._framing
         fits = np.ones(len(raw), np.bool_)
         for i, byte in enumerate(framing.start):
@@ -833,7 +844,7 @@ class LayoutDecoder:
     def _likely(
         self, temperature: NDArray[np.float32], values: NDArray[np.generic]
     ) -> NDArray[np.bool_]:
-        """Which of k frames hold mostly numbers that a chip can give."""
+        """Which of k frames hold mostly numbers that a chip can produce."""
         if "t" in self.layout.fields:
             with np.errstate(invalid="ignore"):
                 likely: NDArray[np.bool_] = plausible(temperature).mean(axis=1) >= 0.5
@@ -847,7 +858,7 @@ class LayoutDecoder:
         return mostly
 
     def _trusted(self, temperature: NDArray[np.float32], values: NDArray[np.generic]) -> int:
-        """Frames up to the one, if any, that puts the boundary in doubt."""
+        """Number of frames up to the one, if any, that casts doubt on the boundary."""
         likely = self._likely(temperature, values).tolist()
         for i, good in enumerate(likely):
             self._suspect = 0 if good else self._suspect + 1
@@ -860,7 +871,7 @@ class LayoutDecoder:
     def _status(
         self, field: NDArray[np.float32], temperature: NDArray[np.float32]
     ) -> NDArray[np.uint8]:
-        """(k, n) of `TaxelStatus`."""
+        """`TaxelStatus` of each reading, (k, n)."""
         with np.errstate(invalid="ignore"):
             good = (np.abs(field) <= MAX_FIELD_UT).all(axis=2)
             if "t" in self.layout.fields:
@@ -868,10 +879,11 @@ class LayoutDecoder:
         return np.where(good, TaxelStatus.OK, TaxelStatus.READ_FAILED).astype(np.uint8)
 
     def _search(self, buffer: bytes, at: int, whole_read: bool) -> int | None:
-        """Where the first believable frame begins; None: wait for more.
+        """Offset of the first credible frame; None to wait for more data.
 
-        Among frames that overlap the best supported wins: by those that follow it, by the end of
-        one before it, and by the end of the read where the buffer ends with it (``whole_read``).
+        Among overlapping candidates the best supported wins. Support comes from the frames after
+        it, the end of a frame before it, and the end of the read if the buffer ends with it
+        (``whole_read``).
         """
         size = self._size
         if self._bare:
@@ -901,14 +913,15 @@ class LayoutDecoder:
                 continue
             closes = whole_read and (len(buffer) - start) % size == 0
             if self._weak and not closes and run < 2 * LOCK_FRAMES:
-                continue  # a byte of the numbers may be like the end
+                continue  # a byte of the numbers may equal the end
             score = run + 0.5 * follows + 0.75 * closes
             if best is None or score > best[0]:
                 best = score, start
         return None if best is None else best[1]
 
     def _run(self, buffer: bytes, start: int) -> int:
-        """Consecutive frames from ``start`` on that fit and are likely, so many as matter."""
+        """Number of consecutive frames from ``start`` on that fit and are plausible, up to a
+        maximum."""
         most = 2 * LOCK_FRAMES if self._weak else LOCK_FRAMES
         whole = min((len(buffer) - start) // self._size, most)
         if not whole:

@@ -1,7 +1,7 @@
-"""Payload of every message to and from bytes, exactly as ``PROTOCOL.md`` lays them out.
+"""Messages of the protocol, and their payloads and packets, exactly as in ``PROTOCOL.md``.
 
-Everything is little-endian and packed. Encoding refuses local misuse with ValueError or
-TypeError; decoding never raises: it returns a `Reject` for what makes no sense.
+Everything is little-endian and packed. Encoding raises ValueError or TypeError on misuse; decoding
+never raises: it returns a `Reject` for invalid input.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sensor_proto.crc import RESIDUE, crc32c, crc32c_each
 
-# Every message of the protocol as a frozen dataclass; layouts are in ``PROTOCOL.md``.
+# Messages as frozen dataclasses; ``PROTOCOL.md`` has their layouts.
 
 
 PROTOCOL_MAJOR = 1
@@ -25,7 +25,7 @@ PROTOCOL_MINOR = 0
 
 
 class MessageType(IntEnum):
-    """One byte on the wire; the high bit is set on everything the host sends."""
+    """Type byte of a message; the high bit is set on everything the host sends."""
 
     DESCRIPTOR = 0x01
     SAMPLES = 0x02
@@ -43,7 +43,7 @@ class MessageType(IntEnum):
 
 
 class ChipType(IntEnum):
-    """Magnetometer behind each taxel of an array."""
+    """Magnetometer type of the taxels of an array."""
 
     UNKNOWN = 0
     MLX90393 = 1
@@ -89,7 +89,7 @@ class ArrayDescriptor:
 
 @dataclass(frozen=True, slots=True)
 class Descriptor:
-    """What a board says of itself in answer to `Identify`."""
+    """Description of a board, in answer to `Identify`."""
 
     major: int
     minor: int
@@ -126,12 +126,12 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """Health of a board, sent once a second. Counters are 32 bits and never reset but by reboot."""
+    """Health of a board, sent once a second. Counters have 32 bits; only a reboot resets them."""
 
     uptime_ms: int
     cycles: int  # sampling cycles completed
     overruns: int  # cycles whose samples the board had to drop before sending
-    rx_errors: int  # frames from the host it rejected
+    rx_errors: int  # rejected frames from the host
     chip_errors: int  # failed chip reads
     rate_mhz: int  # present sample rate, millihertz; 0 when stopped
     reset_cause: int  # 0 power-on, 1 command, 2 watchdog, 3 brown-out
@@ -139,7 +139,7 @@ class Status:
 
 @dataclass(frozen=True, slots=True)
 class ClockReply:
-    """Board clock at the receipt of a `ClockPoll` and at the sending of this reply."""
+    """Board clock when it received a `ClockPoll` and when it sent this reply."""
 
     token: int
     ticks_received: int
@@ -159,14 +159,14 @@ class Log:
 class Ack:
     """Answer to the command ``command`` that carried ``request``."""
 
-    command: int  # a MessageType value; unknown ones are echoed as they came
+    command: int  # a MessageType value; unknown ones are echoed
     request: int
     result: AckResult
 
 
 @dataclass(frozen=True, slots=True)
 class Identify:
-    """Ask for the `Descriptor`. Carries the host's protocol version."""
+    """Request the `Descriptor`. Carries the host's protocol version."""
 
     request: int
     major: int = PROTOCOL_MAJOR
@@ -175,14 +175,14 @@ class Identify:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Begin streaming samples."""
+    """Start streaming samples."""
 
     request: int
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Cease streaming samples."""
+    """Stop streaming samples."""
 
     request: int
 
@@ -209,7 +209,7 @@ class SetGain:
 
 @dataclass(frozen=True, slots=True)
 class ClockPoll:
-    """Ask for the board clock; the token comes back in the reply."""
+    """Request the board clock; the reply repeats the token."""
 
     token: int
 
@@ -241,7 +241,7 @@ class FloatSamples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FloatBurst:
-    """k consecutive frames of a board that sends floats, as arrays: for whoever reads many at once.
+    """k consecutive frames of a board that sends floats, as arrays, for efficient bulk processing.
 
     ``values``: (k, n, 4) float32 t °C, x, y, z µT. ``status``: (k, n) uint8 of `TaxelStatus`.
     ``trailing``: per frame, as in `Received`.
@@ -254,11 +254,11 @@ class FloatBurst:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Received:
-    """A message and where it came from.
+    """A message and its origin.
 
-    ``board``: 7-bit node id (0 on a serial line). ``trailing``: bytes of the same chunk that came
-    after the end of this frame, so that the receiver can take their time on the wire off its
-    stamp; 0 on CAN.
+    ``board``: 7-bit node id (0 on a serial line). ``trailing``: bytes of the same chunk after the
+    end of this frame, whose time on the wire the receiver subtracts from the chunk's time stamp; 0
+    on CAN.
     """
 
     message: Message | FloatSamples
@@ -266,45 +266,45 @@ class Received:
     trailing: int = field(default=0)
 
 
-# What every decoder is, and the reasons for which wire input is refused.
+# Interface of all decoders, and the reasons for rejecting input.
 
 
 Input = TypeVar("Input", contravariant=True)
 
 ACCEPTED = "accepted"
-"""Key of the count of accepted messages in every ``counters``."""
+"""Key of the number of accepted messages in every ``counters``."""
 
 
 class Reject(StrEnum):
     """Why input was refused; the value is the key in ``counters``."""
 
     COBS = "cobs"  # the blocks of a serial frame do not end where the frame ends
-    OVERSIZED = "oversized"  # more bytes than the longest frame or transfer: dropped to its end
+    OVERSIZED = "oversized"  # longer than the longest frame or transfer; dropped to its end
     RUNT = "runt"  # too short for header and CRC
-    LENGTH = "length"  # the header's length is not what came
+    LENGTH = "length"  # the length in the header does not match
     CRC = "crc"
-    BOARD = "board"  # header names another board than the medium does
-    TYPE_MISMATCH = "type_mismatch"  # header names another type than the CAN identifier does
+    BOARD = "board"  # header and medium name different boards
+    TYPE_MISMATCH = "type_mismatch"  # header and CAN identifier name different types
     UNKNOWN_TYPE = "unknown_type"  # a whole message of a newer peer, skipped
     SHORT_PAYLOAD = "short_payload"  # a known message with fewer bytes than its layout
     BAD_VALUE = "bad_value"  # a known message whose values make no sense
     EMPTY = "empty"  # surplus delimiters: an idle line, or a port that floods zeros
-    FOREIGN = "foreign"  # a CAN frame that is not of this protocol
+    FOREIGN = "foreign"  # a CAN frame of another protocol
     ERROR_FRAME = "error_frame"  # the CAN controller reports an error
     BAD_FRAME = "bad_frame"  # a CAN frame of impossible length
-    NO_START = "no_start"  # CAN frame of a transfer whose start was not seen
-    INTERRUPTED = "interrupted"  # a CAN transfer begun before the last one ended
+    NO_START = "no_start"  # CAN frame of a transfer whose start was missed
+    INTERRUPTED = "interrupted"  # a CAN transfer started before the previous one ended
     OUT_OF_ORDER = "out_of_order"  # toggle, transfer id or kind of a CAN frame does not follow
-    LOST_LOCK = "lost_lock"  # an unframed stream no longer ends its frames where expected
-    DISCARDED_BYTES = "discarded_bytes"  # bytes, not frames, that belong to no frame
-    DUPLICATE = "duplicate"  # a CAN frame came twice running; the second was ignored
+    LOST_LOCK = "lost_lock"  # frames of an unframed stream no longer end where expected
+    DISCARDED_BYTES = "discarded_bytes"  # bytes (not frames) that belong to no frame
+    DUPLICATE = "duplicate"  # a CAN frame repeated directly; the second was ignored
 
 
 class Decoder(Protocol[Input]):
-    """Bytes or CAN frames in, messages out. Never raises on wire input; counts what it refuses."""
+    """Converts bytes or CAN frames to messages. Never raises on input; counts what it rejects."""
 
     def feed(self, data: Input, /) -> list[Received]:
-        """Messages that ``data`` completed, in the order in which they ended."""
+        """Return the messages that ``data`` completed, in the order in which they ended."""
         ...
 
     @property
@@ -313,7 +313,7 @@ class Decoder(Protocol[Input]):
         ...
 
     def reset(self) -> None:
-        """Forget unfinished input (after a reconnection); the counters go on."""
+        """Forget unfinished input, after a reconnection; the counters continue."""
         ...
 
 
@@ -329,19 +329,20 @@ class Tally(dict[str, int]):
 
 
 MAX_PAYLOAD = 1024
-"""Bytes. The longest message, samples of 128 taxels, is 908; the rest is room for newer minors."""
+"""Largest payload in bytes. The longest message, samples of 128 taxels, has 908; the rest is room
+for newer minor versions."""
 
 MAX_TAXELS = 128
-"""Taxels of one array."""
+"""Most taxels of one array."""
 
 MAX_ARRAYS = 16
-"""Arrays of one board; their descriptor is 564 bytes."""
+"""Most arrays of one board; their descriptor has 564 bytes."""
 
 MAX_TEXT = 255
-"""Bytes of UTF-8 in a log line: its length is one byte."""
+"""Most bytes of UTF-8 in a log line: its length is one byte."""
 
 NAME_SIZE = 16
-"""Bytes of a name on the wire: at most 15 of printable ASCII, then zeros."""
+"""Size of a name on the wire in bytes: at most 15 of printable ASCII, then zeros."""
 
 _DESCRIPTOR_FROZEN = struct.Struct("<BB8s16s")
 _DESCRIPTOR = struct.Struct("<BB8s16s16sIIBB")
@@ -382,7 +383,7 @@ _TYPES: dict[type, MessageType] = {
 
 
 def message_type(message: Message) -> MessageType:
-    """Type byte of ``message``; TypeError for what is no message of this protocol."""
+    """Type of ``message``. Raises TypeError for anything but a message of this protocol."""
     kind = _TYPES.get(type(message))
     if kind is None:
         raise TypeError(f"{type(message).__name__} is no message of this protocol")
@@ -390,7 +391,7 @@ def message_type(message: Message) -> MessageType:
 
 
 def encode_payload(message: Message) -> bytes:
-    """Payload of ``message``; ValueError for a value that its field cannot hold."""
+    """Encode the payload of ``message``. Raises ValueError if a field cannot hold its value."""
     message_type(message)
     try:
         return _ENCODERS[type(message)](message)
@@ -399,7 +400,7 @@ def encode_payload(message: Message) -> bytes:
 
 
 def decode_payload(kind: int, packet: bytes, start: int, end: int) -> Message | Reject:
-    """Message of type ``kind`` whose payload is ``packet[start:end]``."""
+    """Decode the message of type ``kind`` whose payload is ``packet[start:end]``."""
     decoder = _DECODERS.get(kind)
     if decoder is None:
         return Reject.UNKNOWN_TYPE
@@ -407,14 +408,14 @@ def decode_payload(kind: int, packet: bytes, start: int, end: int) -> Message | 
 
 
 def _name(label: str, text: str) -> bytes:
-    """Name for the wire; ValueError unless it is at most 15 bytes of printable ASCII."""
+    """Encode a name. Raises ValueError unless it is at most 15 bytes of printable ASCII."""
     if len(text) >= NAME_SIZE or not (text.isascii() and text.isprintable()):
         raise ValueError(f"{label} {text!r}: at most {NAME_SIZE - 1} printable ASCII characters")
     return text.encode("ascii")
 
 
 def _read_name(raw: bytes) -> str | None:
-    """Name from the wire; None unless it is printable ASCII and ended by zeros."""
+    """Decode a name; None unless it is printable ASCII padded with zeros."""
     name, _, padding = raw.partition(b"\0")
     if len(name) == NAME_SIZE or padding.strip(b"\0") or not name.isascii():
         return None
@@ -464,7 +465,7 @@ def _decode_descriptor(packet: bytes, start: int, end: int) -> Descriptor | Reje
     if model is None:
         return Reject.BAD_VALUE
     if major != PROTOCOL_MAJOR:
-        # Only these fields are the same in every major version: enough to refuse it by name.
+        # Only these fields are the same in every major version; they suffice to reject it by name.
         return Descriptor(major, minor, unique_id, model, "", 0, 0, ())
     if end - start < _DESCRIPTOR.size:
         return Reject.SHORT_PAYLOAD
@@ -516,7 +517,7 @@ def _decode_samples(packet: bytes, start: int, end: int) -> Samples | Reject:
     bits = body + 6 * n
     if end < bits + n:
         return Reject.SHORT_PAYLOAD
-    # Views of the packet: bytes never change, so numpy makes them read-only.
+    # Views of the packet; numpy makes them read-only as bytes are immutable.
     field = np.ndarray((n, 3), _COUNTS, packet, body)
     status = np.ndarray(n, _BITS, packet, bits)
     return Samples(array, sequence, ticks, temperature, field, status)
@@ -553,7 +554,7 @@ def _decode_log(packet: bytes, start: int, end: int) -> Log | Reject:
         return Reject.SHORT_PAYLOAD
     text = packet[body : body + size].decode("utf-8", errors="replace")
     if not text.isprintable():
-        # What a board says ends up in terminals and logs: no control character may pass.
+        # A board's text ends up in terminals and logs, so control characters are replaced.
         text = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
     return Log(level, ticks, text)
 
@@ -566,7 +567,7 @@ def _decode_ack(packet: bytes, start: int, end: int) -> Ack | Reject:
 
 
 def _plain(layout: struct.Struct, make: Callable[..., Message]) -> _Decode:
-    """Decoder of a message whose fields are those of ``layout`` in the same order."""
+    """Decoder for a message whose fields are those of ``layout`` in the same order."""
     size = layout.size
 
     def decode(packet: bytes, start: int, end: int) -> Message | Reject:
@@ -622,7 +623,7 @@ _DECODERS: dict[int, _Decode] = {
 }
 
 
-# The packet that both media carry: header, payload, CRC-32C.
+# Packets, the same on both media: header, payload, CRC-32C.
 #
 # Header: type (1 byte), board (1), payload length (2, little-endian). The CRC covers header and
 # payload and follows them, least significant byte first.
@@ -633,19 +634,19 @@ _CRC = struct.Struct("<I")
 HEADER_SIZE = _HEADER.size
 OVERHEAD = HEADER_SIZE + _CRC.size
 MAX_PACKET = MAX_PAYLOAD + OVERHEAD
-"""Bytes of the longest packet; decoders hold no more than this of one that is not yet whole."""
+"""Size of the longest packet in bytes; decoders hold at most this much of an unfinished one."""
 
 MAX_UNKNOWN = 8
-"""Messages of unknown type that a decoder remembers so that a board can refuse them by number."""
+"""Unknown messages that a decoder remembers, so that a board can refuse them by number."""
 
 
 def request_number(packet: bytes) -> int:
-    """Request that the command in ``packet`` carries, for every command begins with it; else 0."""
+    """Request number of the command in ``packet`` (every command begins with it)."""
     return int.from_bytes(packet[HEADER_SIZE : HEADER_SIZE + 2], "little")
 
 
 def pack(message: Message, board: int = 0) -> bytes:
-    """Packet of ``message`` from or to ``board``; ValueError for values that do not fit."""
+    """Packet of ``message`` from or to ``board``. Raises ValueError if a value does not fit."""
     payload = encode_payload(message)
     if len(payload) > MAX_PAYLOAD:
         raise ValueError(f"payload of {len(payload)} bytes; at most {MAX_PAYLOAD}")
@@ -654,7 +655,8 @@ def pack(message: Message, board: int = 0) -> bytes:
 
 
 def shape_error(packet: bytes) -> Reject | None:
-    """Reason to refuse ``packet`` by its size alone, before its CRC is worked out."""
+    """Reason to reject ``packet`` by its size alone, before its CRC is computed; None if there is
+    none."""
     size = len(packet)
     if size < OVERHEAD:
         return Reject.RUNT
@@ -666,7 +668,8 @@ def shape_error(packet: bytes) -> Reject | None:
 
 
 def intact(packets: Sequence[bytes]) -> list[bool]:
-    """Whether the CRC of each packet (8 to `MAX_PACKET` bytes) is right; cheapest for many."""
+    """Whether the CRC of each packet (8 to `MAX_PACKET` bytes) is right; cheapest for many at
+    once."""
     if len(packets) == 1:
         return [crc32c(packets[0]) == RESIDUE]
     good: list[bool] = (crc32c_each(packets) == RESIDUE).tolist()

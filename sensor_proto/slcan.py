@@ -1,9 +1,10 @@
-"""The text lines of USB-CAN adapters that speak slcan; the host's half of the dialogue.
+"""Host side of the text protocol of USB-CAN adapters (slcan).
 
-Frames and answers as in the LAWICEL CAN232/CANUSB manual; FD lines (``d D b B``) as the CANable 2.0
-firmware adds them; ``s`` and ``e`` lines as the Linux slcan driver reads them; ``E``, ``L`` and
-``#`` lines of CANable 2.5 firmware. A frame is ``T`` + 8 hex digits of identifier + 1 hex digit of
-length code + 2 hex digits a byte + CR; CANdapter writes ``x`` for ``T``. PROTOCOL.md has it all.
+Frames and answers are as in the LAWICEL CAN232/CANUSB manual; FD lines (``d D b B``) as in the
+CANable 2.0 firmware; ``s`` and ``e`` lines as the Linux slcan driver reads them; ``E``, ``L`` and
+``#`` lines as in the CANable 2.5 firmware. A frame is ``T``, 8 hex digits of identifier, 1 hex
+digit of length code, 2 hex digits per byte, and CR; CANdapter writes ``x`` for ``T``. PROTOCOL.md
+has the details.
 """
 
 from __future__ import annotations
@@ -32,8 +33,9 @@ BITRATES = {
     800_000: b"S7",
     1_000_000: b"S8",
 }
-"""bit/s → command, LAWICEL CAN232 manual; S9 (83.3 kbit/s) as CANable and Seeed add it. S7 is
-800 kbit/s by that manual and 750 with CANable's firmware: the adapter makes of it what it does."""
+"""Command for each bit rate in bit/s (LAWICEL CAN232 manual); S9 (83.3 kbit/s) as in CANable and
+Seeed adapters. S7 is 800 kbit/s in that manual but 750 kbit/s with CANable firmware; which one
+applies depends on the adapter."""
 
 DATA_BITRATES = {
     500_000: b"Y0",
@@ -44,20 +46,21 @@ DATA_BITRATES = {
     5_000_000: b"Y5",
     8_000_000: b"Y8",
 }
-"""bit/s of the data phase → command, CANable 2.0 and its successors; few adapters have all."""
+"""Command for each data-phase bit rate in bit/s (CANable 2.0 and successors); few adapters support
+all of them."""
 
 LENGTH_OF_CODE = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
-"""Data bytes for each length code of CAN FD, ISO 11898-1."""
+"""Data bytes for each CAN FD length code (ISO 11898-1)."""
 
 CODE_OF_LENGTH = {length: code for code, length in enumerate(LENGTH_OF_CODE)}
 
 MAX_LINE = 1 + 8 + 1 + 2 * 64 + 4
-"""Characters of the longest line: an FD frame with a time stamp. A longer one is noise."""
+"""Longest line in characters: an FD frame with a time stamp. A longer one is noise."""
 
 MAX_ANSWERS = 64
-"""Answers kept for whoever asked; each command brings one, and few are asked at once."""
+"""Most answers kept. Each command gets one, and few commands are pending at once."""
 
-_TIMESTAMP_DIGITS = 4  # Z1 puts milliseconds behind every frame
+_TIMESTAMP_DIGITS = 4  # with Z1, milliseconds follow every frame
 _ENDS = re.compile(rb"(\r\n?|\n|\a(?:\r\n)?)")
 _STATES = {
     ord("a"): BusState.ACTIVE,
@@ -68,19 +71,22 @@ _STATES = {
 _FRAME_LETTERS = b"TtRrDdBbx"
 _EXTENDED = b"TRDBx"
 ACK, NAK = b"\x06", b"\x15"
-"""What CANdapter answers instead of an empty line and BEL."""
+"""Answers of CANdapter instead of an empty line and BEL."""
 
 
 class Rejected(StrEnum):
-    """Why a frame line gave no frame."""
+    """Why a frame line was rejected."""
 
-    STANDARD_ID = "standard_id"  # 11-bit identifiers are other people's traffic
+    STANDARD_ID = "standard_id"  # 11-bit identifiers belong to other protocols
     REMOTE = "remote_frame"  # the protocol has none
     MALFORMED = "malformed_line"
 
 
 def encode_frame(frame: CanFrame) -> bytes:
-    """Line for a data frame, CR included; FD frames switch bit rate. ValueError: no such frame."""
+    """Encode a data frame as a line with CR; FD frames use the data bit rate.
+
+    Raises ValueError for an invalid frame.
+    """
     code = CODE_OF_LENGTH.get(len(frame.data))
     if code is None or (code > 8 and not frame.fd):
         raise ValueError(f"no CAN frame has {len(frame.data)} data bytes (fd={frame.fd})")
@@ -91,7 +97,8 @@ def encode_frame(frame: CanFrame) -> bytes:
 
 
 def decode_frame(line: bytes) -> CanFrame | Rejected:
-    """Frame of a line without its CR, or why there is none. A time stamp behind it is ignored."""
+    """Decode a line without its CR: the frame, or why it was rejected. Ignores a time stamp at the
+    end."""
     letter = line[:1]
     if letter not in _EXTENDED or not letter:
         return Rejected.STANDARD_ID if letter and letter in b"tdb" else _not_data(letter)
@@ -105,7 +112,7 @@ def decode_frame(line: bytes) -> CanFrame | Rejected:
         if len(digits) == 2 * length + _TIMESTAMP_DIGITS:
             digits = digits[: 2 * length]
         data = bytes.fromhex(digits.decode("ascii"))
-    except ValueError:  # UnicodeDecodeError is one
+    except ValueError:  # includes UnicodeDecodeError
         return Rejected.MALFORMED
     if len(data) != length or len(digits) != 2 * length or identifier >> 29:
         return Rejected.MALFORMED
@@ -119,7 +126,8 @@ def _not_data(letter: bytes) -> Rejected:
 
 
 class SlcanDecoder:
-    """What an adapter sends, any chunking: frames, error frames and answers. Never raises."""
+    """Decodes an adapter's output, in any chunks, to frames, error frames and answers. Never
+    raises."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -128,26 +136,26 @@ class SlcanDecoder:
         self._ends_crlf = False
         self._errors_told = 0
         self.answers: deque[bytes] = deque(maxlen=MAX_ANSWERS)
-        """Lines that answer commands, without their CR; a refusal is a single BEL."""
+        """Answers to commands, without their CR; a refusal is a single BEL."""
 
     @property
     def counters(self) -> dict[str, int]:
-        """Rejected lines, one counter per reason."""
+        """Rejected lines by reason."""
         return dict(self._counts)
 
     def reset(self) -> None:
-        """Forget a broken line and all answers; counters stay."""
+        """Forget an unfinished line and all answers; the counters continue."""
         self._buffer.clear()
         self._last_end, self._ends_crlf, self._errors_told = b"", False, 0
         self.answers.clear()
 
     def feed(self, data: bytes) -> list[CanFrame]:
-        """Frames completed by ``data``, in order.
+        """Return the frames completed by ``data``, in order.
 
-        Errors, states and answers to ``F`` are SocketCAN error frames among them.
+        They include error frames (SocketCAN layout) for errors, states and answers to ``F``.
         """
         if self._last_end == b"\r" and not self._buffer and data.startswith(b"\n"):
-            data = data[1:]  # the other half of the last line's end
+            data = data[1:]  # second half of the previous line end
             self._ends_crlf = True
         parts = _ENDS.split(bytes(self._buffer) + data)
         frames: list[CanFrame] = []
@@ -155,7 +163,7 @@ class SlcanDecoder:
             refused, self._last_end = self._last_end[:1] == BEL, end
             self._ends_crlf |= end.endswith(b"\r\n")
             if refused and not line and self._ends_crlf and end[:1] == CR:
-                continue  # a refusal printed as a line of its own
+                continue  # some adapters end a refusal (BEL) with CR LF
             self._line(line, end[:1], frames)
         self._buffer = bytearray(parts[-1])
         if len(self._buffer) > MAX_LINE:
@@ -179,20 +187,20 @@ class SlcanDecoder:
         elif _REPORT.fullmatch(line):
             frames += _report_of(line)
         elif line in (b"z", b"Z") or _BUS_LOAD.fullmatch(line):
-            pass  # "sent", of adapters with automatic polling; load of the bus in percent
+            pass  # "sent", from adapters with automatic polling; or bus load in percent
         elif line in (ACK, b"#"):
             self.answers.append(b"")
         elif line == NAK or (line[:1] == b"#" and len(line) < 4):
             self.answers.append(BEL)
         elif not line or line[:1] in b"VvNF":
             self.answers.append(line)
-            # In their place among the lines, or an old answer would undo news.
+            # Keep the order of the lines, or an old answer would override newer state.
             frames += self._flags_of(line)
         else:
             self._counts[Rejected.MALFORMED] += 1
 
     def _flags_of(self, answer: bytes) -> list[CanFrame]:
-        """State and errors that the answer to ``F`` tells; errors only once while they stay."""
+        """Error frames for the answer to ``F``: the state, and errors once while they persist."""
         flags = flags_of(answer)
         state = state_of_flags(answer)
         if flags is None or state is None:
@@ -220,10 +228,11 @@ _REPORT_PROTOCOL = (
 
 
 def _report_of(line: bytes) -> list[CanFrame]:
-    """Error frames for ``E`` + state, last protocol error, two digits of firmware errors, counts.
+    """Error frames for an ``E`` line of CANable 2.5.
 
-    As CANable 2.5 sends it: protocol errors 1 stuff, 2 form, 3 no acknowledgement, 4 recessive bit,
-    5 dominant bit, 6 CRC; firmware errors 0x04 transmit and 0x08 receive overflow.
+    ``E`` is followed by one digit of state, one of the last protocol error, two of firmware errors,
+    and counts. Protocol errors: 1 stuff, 2 form, 3 no acknowledgement, 4 recessive bit, 5 dominant
+    bit, 6 CRC. Firmware errors: 0x04 transmit and 0x08 receive overflow.
     """
     state, last, firmware = int(line[1:2], 16), int(line[2:3], 16), int(line[3:5], 16)
     frames = []
@@ -244,8 +253,11 @@ def _report_of(line: bytes) -> list[CanFrame]:
 
 
 def _error_of(line: bytes) -> CanFrame:
-    """Error frame for ``e`` + count + one letter each: a ack, b/B bit 0/1, c CRC, f form, s stuff,
-    o/O receive/transmit overrun (Linux slcan driver)."""
+    """Error frame for an ``e`` line (Linux slcan driver): ``e``, a count, then one letter per
+    error.
+
+    Letters: a acknowledgement, b/B bit 0/1, c CRC, f form, s stuff, o/O receive/transmit overrun.
+    """
     error_class = controller = protocol = 0
     for letter in line[2:].decode("ascii", "replace"):
         if letter == "a":
@@ -266,17 +278,17 @@ FLAG_OVERRUN = 0x08
 FLAG_PASSIVE = 0x20
 FLAG_ARBITRATION = 0x40
 FLAG_BUS_ERROR = 0x80
-"""Bits of the answer to ``F``, LAWICEL CAN232 manual; 0x10 is not used."""
+"""Bits of the answer to ``F`` (LAWICEL CAN232 manual); 0x10 is unused."""
 
 ERROR_FLAGS = FLAG_RX_FULL | FLAG_TX_FULL | FLAG_OVERRUN | FLAG_ARBITRATION | FLAG_BUS_ERROR
-"""Those that tell of errors, as the others tell a state."""
+"""Flags that report errors; the others report a state."""
 
 BUS_OFF_FLAGS = FLAG_WARNING | FLAG_PASSIVE | FLAG_BUS_ERROR
-"""The flags have no bit for bus-off; a controller in it shows these three together."""
+"""Bus-off: it has no flag of its own, but a controller in it sets these three."""
 
 
 def flags_of(answer: bytes) -> int | None:
-    """Flags of the answer ``Fxx`` to the command ``F``; None when it is none."""
+    """Flags in the answer ``Fxx`` to the command ``F``; None for any other answer."""
     try:
         return int(answer[1:3], 16) if answer[:1] == b"F" and len(answer) == 3 else None
     except ValueError:
@@ -284,7 +296,7 @@ def flags_of(answer: bytes) -> int | None:
 
 
 def state_of_flags(answer: bytes) -> BusState | None:
-    """State told by the answer ``Fxx`` to the command ``F``; None when it is none."""
+    """Bus state in the answer ``Fxx`` to the command ``F``; None for any other answer."""
     flags = flags_of(answer)
     if flags is None:
         return None
@@ -296,7 +308,7 @@ def state_of_flags(answer: bytes) -> BusState | None:
 
 
 def _errors_of_flags(errors: int) -> CanFrame:
-    """Error frame for the `ERROR_FLAGS` among the flags."""
+    """Error frame for these `ERROR_FLAGS`."""
     error_class = controller = 0
     if errors & (FLAG_RX_FULL | FLAG_OVERRUN):
         controller |= 0x01

@@ -1,9 +1,9 @@
-"""What a port carries when no frame is known: the layout where it is plain, else its looks.
+"""Survey of a port whose frames are not known: infer the layout, or describe the bytes.
 
-Frames repeat, so bytes at the distance of a frame are often equal; what stands still in every frame
-is its start or its end; numbers read with the wrong width, order of bytes or offset are absurd; and
-a temperature is told from a field (`temperature`). Where one of these leaves two readings, nothing
-is read: both are named.
+Frames repeat, so bytes one frame apart are often equal; bytes that are constant in every frame are
+its start or end; numbers read with the wrong width, byte order or offset are absurd; and a
+temperature can be told from a field (`layouts.evidence`). Where this leaves two readings, neither
+is used and both are named.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ from sensor_proto.layouts import (
     with_or_without,
 )
 
-# What lines of text hold: chips, order and labels, where they can be told.
+# Text lines: chips, order and labels, where they can be told.
 
 
 LEAST_LINES = 4
-"""Records of the same form from which a form is believed."""
+"""Records of the same form needed to accept the form."""
 
 MOST = 0.7
-"""Share of the lines that must have it: banners and remarks come between."""
+"""Fraction of the lines that must have it; banners and remarks come between."""
 
 WEAKEST_UT = 15.0
-"""µT: the earth's field is 22 to 67; numbers labelled x, y, z that stay below are of something
-else, such as an accelerometer."""
+"""Smallest credible median field in µT: the earth's is 22 to 67. Smaller numbers labelled x, y, z
+come from something else, such as an accelerometer."""
 
 UNITS_UT = {"ut": 1.0, "µt": 1.0, "mt": 1000.0, "gauss": 100.0, "g": 100.0}
-"""µT for one of the units that sketches print behind a number."""
+"""µT per unit, for the units that sketches print after a number."""
 
 
 @dataclass(frozen=True, slots=True)
 class TextFinding:
-    """See `survey.Finding`."""
+    """What lines of text hold; fields as in `Finding`."""
 
     layout: Layout | None
     what: str
@@ -58,7 +58,7 @@ class TextFinding:
 
 
 def read_text(data: bytes) -> TextFinding | None:
-    """What whole lines in ``data`` are; None: no numbers that repeat."""
+    """Assess the whole lines in ``data``; None if they hold no repeating numbers."""
     lines = [line for line in re.split(rb"[\r\n]+", data)[1:-1] if line.strip()]
     taken = [tokens(line) for line in lines]
     records, count = _records(taken)
@@ -75,7 +75,7 @@ def _form(record: Tokens) -> tuple[int, tuple[bytes, ...]]:
 
 
 def _records(taken: list[Tokens]) -> tuple[list[Tokens], int]:
-    """Records of the usual form, and the lines that one takes; none for text without form."""
+    """Records of the most common form and their number of lines; empty for text without a form."""
     with_numbers = [t for t in taken if t.numbers]
     forms = Counter(_form(t) for t in with_numbers if not t.gone)
     if not forms:
@@ -101,7 +101,8 @@ def _records(taken: list[Tokens]) -> tuple[list[Tokens], int]:
 
 
 def _lead(values: np.ndarray) -> tuple[int, int]:
-    """Numbers before those of the chips: a clock or counter that only grows; and those left."""
+    """Count of numbers before those of the chips (a growing clock or counter), and of the
+    others."""
     count = values.shape[1]
     first = values[:, 0]
     grows = bool((np.diff(first) > 0).all() and (first == np.round(first)).all())
@@ -168,7 +169,7 @@ def _of(
 
 
 def _labelled(axes: list[str]) -> str:
-    """Fields of a chip where every number has a label, the same for all chips; else empty."""
+    """Fields per chip if every number has a label, the same for all chips; otherwise empty."""
     for width in (3, 4):
         fields = "".join(axes[:width])
         whole = len(axes) % width == 0 and axes == list(fields) * (len(axes) // width)
@@ -178,7 +179,7 @@ def _labelled(axes: list[str]) -> str:
 
 
 def _unit(between: tuple[bytes, ...]) -> float:
-    """µT for the unit printed behind the first number, 1 where none is."""
+    """µT per unit, for the unit printed after the first number; 1 if there is none."""
     match = re.match(rb"\s*([A-Za-z\xc2\xb5]+)", between[1])
     word = match[1].decode("utf-8", "replace").lower() if match else ""
     return UNITS_UT.get(word, 1.0)
@@ -188,8 +189,10 @@ def _grouped(
     between: tuple[bytes, ...],
     values: np.ndarray,
 ) -> tuple[int, int] | None:
-    """Numbers of a group where other marks stand between groups than within, and how many of them
-    only number the chips (0 or 1); None where no groups are to be seen."""
+    """Numbers per group, and how many of them (0 or 1) only number the chips.
+
+    Groups are recognised by separators that differ between and within groups; None without groups.
+    """
     inner = [b"".join(re.split(rb"[0-9]+", text.strip(b" "))) for text in between[1:-1]]
     count = values.shape[1]
     for width in (3, 4, 5):
@@ -207,22 +210,22 @@ def _grouped(
 
 
 KEEP = 8192
-"""Bytes looked at: six of the longest frames, and some lines of text of the widest."""
+"""Bytes assessed: six of the longest frames, or some of the widest lines of text."""
 
 LEAST_FRAMES = 6
-"""Frames that must repeat."""
+"""Repeating frames needed."""
 
 ROWS = 8
-"""Frames compared; more would more often hold one that lost a byte."""
+"""Frames compared. A larger number would more often include one with lost bytes."""
 
 LONGEST = MAX_CHIPS * 4 * 8 + 32
-"""Bytes of the longest frame: doubles of the largest board."""
+"""Size of the longest frame in bytes: doubles of the largest board."""
 
 REPEATS = 0.2
-"""Share of equal bytes at the distance of a frame: of noise it is 1/256."""
+"""Fraction of equal bytes at the distance of a frame; in noise it is 1/256."""
 
 ALMOST = 0.85
-"""Of the best share that the right distance has at least, where the best is a multiple of it."""
+"""Fraction of the best share that the right distance reaches if the best is a multiple of it."""
 
 STARTS = tuple(
     bytes.fromhex(word)
@@ -231,19 +234,20 @@ STARTS = tuple(
         *("aa", "55", "a5", "5a", "ff", "fe", "02", "24", "3c", "7e"),
     )
 )
-"""What firmware begins its frames with."""
+"""Common first bytes of frames."""
 
 MOSTLY = 0.9
-"""Share of printable characters from which it is text."""
+"""Fraction of printable characters that makes it text."""
 
 MOST_COUNTS = 1 << 20
-"""No chip of these boards gives more; 16-bit integers in pairs nearly always make more."""
+"""Limit of credible 32-bit counts: the chips give no larger ones, and pairs of 16-bit integers read
+as one nearly always do."""
 
 UNSIGNED_FROM = 24_000
-"""Median size from which 16-bit integers are not fields with a sign."""
+"""Median size from which 16-bit integers are taken as unsigned."""
 
 MOST_UT, LEAST_UT = 1e5, 1e-3
-"""Floats beyond these are no fields in microtesla, save nought."""
+"""Range of credible sizes of floats in µT; 0 is credible too."""
 
 _PRINTABLE = np.zeros(256, bool)
 _PRINTABLE[32:127] = True
@@ -252,9 +256,10 @@ _PRINTABLE[[9, 10, 13, 0xB0, 0xB5, 0xC2]] = True
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What comes, in words (``what``).
+    """Result of a survey.
 
-    ``layout``: None unless it is plain. ``declare``: what it may be, as ``--board`` takes it.
+    ``what``: the data in words. ``layout``: None unless it is certain. ``declare``: possible
+    layouts, as ``--board`` takes them.
     """
 
     layout: Layout | None
@@ -264,7 +269,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class _Frame:
-    """Repeating frames: (k, size) bytes, each row one frame as far as ``framing`` tells."""
+    """Repeating frames, (k, size) bytes. Each row is one frame as far as ``framing`` tells."""
 
     rows: NDArray[np.uint8]
     framing: Framing
@@ -280,27 +285,30 @@ class _Frame:
 
 
 class Survey:
-    """Keeps the last bytes of a port and judges them. ``declared``: what the user said of them."""
+    """Keeps the last bytes of a port and assesses them.
+
+    ``declared``: the layout that the user declared.
+    """
 
     def __init__(self, declared: Layout | None = None) -> None:
         self._declared = declared
         self.reset()
 
     def reset(self) -> None:
-        """Forget what came."""
+        """Forget all bytes."""
         self._data = b""
 
     def feed(self, data: bytes) -> None:
-        """Take what one read returned."""
+        """Add the bytes of one read."""
         self._data = (self._data + data)[-KEEP:]
 
     @property
     def full(self) -> bool:
-        """Whether as many bytes came as are looked at."""
+        """Whether as many bytes were received as are assessed."""
         return len(self._data) >= KEEP
 
     def judge(self) -> Finding | None:
-        """What the bytes are; None: nothing that repeats, or not enough yet."""
+        """Assess the bytes; None if nothing repeats, or too little was received yet."""
         values = np.frombuffer(self._data, np.uint8)
         declared = self._declared
         if not len(values):
@@ -316,7 +324,7 @@ class Survey:
         return Finding(None, f"{found.what}, not {declared} as declared", tuple(other))
 
     def _free(self, values: NDArray[np.uint8]) -> Finding | None:
-        """What the bytes are, whatever was declared."""
+        """Assess the bytes without the declared layout."""
         if _PRINTABLE[values].mean() >= MOSTLY:
             return _of_text(read_text(self._data))
         size = _period(values, None)
@@ -326,7 +334,7 @@ class Survey:
         return None if (rows == rows[0, 0]).all() else _of_frames(rows)
 
     def _place(self, values: NDArray[np.uint8], declared: Layout) -> Finding | None:
-        """Framing round the numbers that were declared; None where they find no place."""
+        """Find the framing around the declared numbers; None if they do not fit anywhere."""
         size = _period(values, declared.payload)
         if size is None:
             return None
@@ -342,7 +350,7 @@ class Survey:
 
 
 def _period(values: NDArray[np.uint8], payload: int | None) -> int | None:
-    """Distance in bytes at which bytes are equal most often."""
+    """Distance at which bytes are most often equal, in bytes; None if nothing repeats."""
     recent = values[-4 * LONGEST :] if len(values) > 4 * LONGEST else values
     longest = min(LONGEST, len(recent) // LEAST_FRAMES)
     if longest < 8:
@@ -362,9 +370,9 @@ def _period(values: NDArray[np.uint8], payload: int | None) -> int | None:
 
 
 def _rows(values: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
-    """Consecutive frames that are most alike: the others may have lost bytes.
+    """The most similar consecutive frames, (k, size); others may have lost bytes.
 
-    They end where a read may have ended: whole frames before the last byte.
+    They end where a read may have ended: a whole number of frames before the last byte.
     """
     count = min(ROWS, len(values) // size)
     same = np.concatenate([[0], np.cumsum(values[size:] == values[:-size])])
@@ -375,14 +383,14 @@ def _rows(values: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
 
 
 def _framed(rows: NDArray[np.uint8]) -> list[_Frame]:
-    """Frames cut at whatever may be their start or end, the most telling first."""
+    """Frames cut at every possible start or end, the most significant first."""
     still = (rows == rows[0]).all(axis=0)
     modes = rows[0]
     size = rows.shape[1]
-    out: list[tuple[int, bool, _Frame]] = []  # how telling, and whether it breaks up a read
+    out: list[tuple[int, bool, _Frame]] = []  # significance, and whether it splits a read
 
     def cut(at: int) -> NDArray[np.uint8]:
-        """Rows that begin at column ``at``; the wrap costs one frame."""
+        """Rows that begin at column ``at``; wrapping costs one frame."""
         flat = rows.reshape(-1)[at : at + (len(rows) - 1) * size] if at else rows.reshape(-1)
         return flat.reshape(-1, size)
 
@@ -407,7 +415,7 @@ def _framed(rows: NDArray[np.uint8]) -> list[_Frame]:
 
 
 def _around(frame: _Frame, payload: int | None = None) -> list[_Frame]:
-    """Frames with what is not a number before and behind the numbers left out."""
+    """Variants of a frame with leading and trailing bytes that are not numbers excluded."""
     rows, plain = frame.rows, frame.framing
     room = frame.size - len(plain.start) - len(plain.end)
     begin = len(plain.start)
@@ -429,13 +437,13 @@ def _around(frame: _Frame, payload: int | None = None) -> list[_Frame]:
                         framing = replace(plain, skip=skip, check=check)
                         break
             out.append(_Frame(rows, framing))
-    # What is explained comes first.
+    # The best explained variants come first.
     out.sort(key=lambda f: (f.framing.tail, f.framing.skip if not f.framing.check else 0))
     return out
 
 
 def _idle(columns: NDArray[np.uint8]) -> bool:
-    """Whether every column stands still or counts frames."""
+    """Whether every column is constant or counts frames."""
     for column in columns.T:
         steps = np.diff(column.astype(np.int16)) % 256
         if not ((steps == 0).all() or (steps == 1).all()):
@@ -444,7 +452,7 @@ def _idle(columns: NDArray[np.uint8]) -> bool:
 
 
 def _sensible(layout: Layout, values: NDArray[np.generic]) -> bool:
-    """Whether the numbers can be those of a board."""
+    """Whether the numbers are credible for a board."""
     if layout.kind in (Kind.FLOATS, Kind.DOUBLES):
         return _floats(values)
     return True
@@ -458,7 +466,7 @@ def _floats(values: NDArray[np.generic]) -> bool:
 
 
 def _of_frames(rows: NDArray[np.uint8]) -> Finding | None:
-    """What frames hold, with the first reading that makes sense."""
+    """Assess frames with the first kind of number that makes sense."""
     frames = _framed(rows)
     for kind, big in ((Kind.FLOATS, False), (Kind.DOUBLES, False), (Kind.FLOATS, True)):
         for frame in frames:
@@ -483,7 +491,7 @@ def _of_floats(frame: _Frame, kind: Kind, big: bool, values: NDArray[np.generic]
     name = "floats" if kind is Kind.FLOATS else "doubles"
     number = f"{count} {'big-endian ' if big else ''}{name}"
     marked = framing.start or framing.end or framing.check
-    # A framing that would be found again by itself need not be declared.
+    # A framing that the survey would find again need not be declared.
     declared = framing if framing.tail or not marked else None
 
     def layout(fields: str) -> Layout:
@@ -506,7 +514,8 @@ def _of_floats(frame: _Frame, kind: Kind, big: bool, values: NDArray[np.generic]
 
 
 def _of_counts(frames: list[_Frame]) -> Finding | None:
-    """Frames of integers: of 32 bits where these are small, of 16 in the order that moves least."""
+    """Assess frames of integers: 32 bits if they are small, else 16 bits in the byte order that
+    varies least."""
     wide = _of_wide_counts(frames)
     if wide is not None:
         return wide
@@ -534,13 +543,13 @@ def _of_counts(frames: list[_Frame]) -> Finding | None:
         return Finding(None, _words(frames[0], "numbers of a kind that is not known"))
     _, frame, big, count = best
     values = frame.body(Layout(Kind.INT16, 1, "x" * count, big)).astype(np.int32)
-    # Fields about 32768 are of a converter that knows no sign.
+    # Values around 32768 come from a converter with unsigned output.
     kind = Kind.UINT16 if float(np.median(np.abs(values))) > UNSIGNED_FROM else Kind.INT16
     return _named_counts(frame, kind, big, count)
 
 
 def _of_wide_counts(frames: list[_Frame]) -> Finding | None:
-    """Frames of 32-bit integers: read as such all are small, which pairs of 16 bits never are."""
+    """Assess frames of 32-bit integers: all are small, which pairs of 16-bit integers never are."""
     for frame in frames:
         for around in _around(frame):
             count, rest = divmod(around.size - around.framing.extra, 4)
@@ -563,7 +572,7 @@ def _named_counts(frame: _Frame, kind: Kind, big: bool, count: int) -> Finding:
 
 
 def _words(frame: _Frame, numbers: str) -> str:
-    """Frames in words."""
+    """Describe frames in words."""
     framing = frame.framing
     words = []
     if framing.start:

@@ -1,30 +1,30 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /**
- * A whole taxel board behind a handful of port functions: PROTOCOL.md section 5 in C99.
+ * A complete taxel board on a handful of port functions: PROTOCOL.md section 5 in C99.
  *
- * The author of a board says who the board is (`struct board_config`), writes the functions of
- * `struct board_port` for the microcontroller, and calls
+ * The author of a board describes it (`struct board_config`), writes the functions of `struct
+ * board_port` for the microcontroller, and calls
  *
  *     if (board_begin(&board, &config, &port, TP_POWER_ON))
  *       for (;;) board_poll(&board);
  *
- * `board_poll` never waits: it takes what the host sent, samples when a cycle is due, and writes
- * what the line has room for. Call it at least ten times in a sampling period. Nothing is lost
- * unnoticed: cycles that could not be sent, or were not even begun in time, are overruns of the
- * status message, and refused frames are its rx_errors.
+ * `board_poll` never waits: it reads what the host sent, samples when a cycle is due, and writes
+ * what the line has room for. Call it at least ten times per sampling period. Every loss is
+ * counted: cycles that could not be sent or were not started in time are overruns in the status
+ * message, rejected frames are rx_errors.
  *
- * Include it in one source file, after setting what does not suit:
+ * Include it in one source file, after defining what should differ from the defaults:
  *
  *     BOARD_MAX_ARRAYS    arrays of the board (1)
  *     BOARD_MAX_TAXELS    taxels of all its arrays together (16)
  *     BOARD_ARRAY_TAXELS  taxels of its largest array (BOARD_MAX_TAXELS)
- *     BOARD_CYCLES        sampling cycles held, one being filled; 3 or more (4)
+ *     BOARD_CYCLES        sampling cycles held, including the one being filled; 3 or more (4)
  *     BOARD_LOG_TEXT      bytes of a log line, 1 to 255 (32)
- *     BOARD_REPLIES       acks, and as many clock replies, that may wait: 2, 4, 8 … (4)
+ *     BOARD_REPLIES       queued acks, and as many queued clock replies: 2, 4, 8 … (4)
  *     BOARD_CAN           1: on a CAN bus; 0: on a serial line (0)
- *     BOARD_CAN_SLOTS     commands that may come in interleaved, CAN only (4)
+ *     BOARD_CAN_SLOTS     commands that may arrive interleaved, CAN only (4)
  *
- * `tactile board-check` proves a board against the protocol.
+ * `tactile board-check` tests a board against the protocol.
  */
 #ifndef TACTILE_BOARD_H
 #define TACTILE_BOARD_H
@@ -75,17 +75,17 @@
 
 #define BOARD_ALL_ARRAYS 255
 
-/* The longest payload that this board sends. */
+/* Longest payload that this board sends. */
 #define BOARD_MORE_(a, b) ((a) > (b) ? (a) : (b))
 #define BOARD_PAYLOAD                                        \
   BOARD_MORE_(TP_DESCRIPTOR_BYTES(BOARD_MAX_ARRAYS),         \
               BOARD_MORE_(TP_SAMPLES_BYTES(BOARD_ARRAY_TAXELS), TP_LOG_BYTES(BOARD_LOG_TEXT)))
-#define BOARD_HOLD 12 /* bytes of a command that are looked at: header, and 7 of Set gain */
+#define BOARD_HOLD 12 /* bytes of a command that are read: header, and 7 of Set gain */
 
-/** One array: `rows` times `columns` taxels. Scales are those after a reset. */
+/** One array of `rows` times `columns` taxels. Scales are those after a reset. */
 struct board_array {
   const char *name; /* at most 15 printable ASCII characters */
-  uint8_t chip;     /* 1 MLX90393, 0 another */
+  uint8_t chip;     /* 1 MLX90393, 0 any other */
   uint8_t rows;
   uint8_t columns;
   uint32_t pitch_um;
@@ -93,14 +93,14 @@ struct board_array {
   uint32_t lsb_z_nt;
 };
 
-/** Who the board is. Arrays are numbered from 0 in this order. */
+/** Description of the board. Arrays are numbered from 0 in this order. */
 struct board_config {
   const uint8_t *unique_id; /* 8 bytes, different on every board made */
   const char *model;
   const char *firmware;
   const struct board_array *arrays;
-  uint8_t count;            /* of arrays */
-  uint32_t tick_hz;         /* of the clock: 10 kHz to 2 MHz */
+  uint8_t count;            /* number of arrays */
+  uint32_t tick_hz;         /* clock rate: 10 kHz to 2 MHz */
   uint32_t max_rate_mhz;    /* after a reset */
   uint32_t default_rate_mhz;
 #if BOARD_CAN
@@ -110,58 +110,58 @@ struct board_config {
 };
 
 /**
- * What a board needs of its microcontroller; `self` comes back in each call. Those that are said
- * to be optional may be NULL. None may wait for longer than a sampling period allows.
+ * Functions that the microcontroller provides; each call gets `self`. Those marked optional may be
+ * NULL. None may wait longer than a sampling period allows.
  */
 struct board_port {
   void *self;
 
 #if BOARD_CAN
-  /** Hand a frame to the controller; false: no mailbox is free. */
+  /** Pass a frame to the controller; false if no mailbox is free. */
   bool (*send)(void *self, const struct tp_can_frame *frame);
-  /** Next frame that came; false: none. */
+  /** Next received frame; false if there is none. */
   bool (*receive)(void *self, struct tp_can_frame *frame);
 #else
-  /** Write as many bytes as fit now and say how many; 0: the line takes nothing. */
+  /** Write as many bytes as fit now and return how many; 0 if the line takes none. */
   size_t (*write)(void *self, const uint8_t *bytes, size_t count);
-  /** Read what has come, at most `count` bytes, and say how many. */
+  /** Read received bytes, at most `count`, and return how many. */
   size_t (*read)(void *self, uint8_t *bytes, size_t count);
 #endif
 
-  /** The free-running clock, `tick_hz`, all 32 bits; it must never run back. */
+  /** Free-running clock at `tick_hz`, all 32 bits; it must never run backwards. */
   uint32_t (*ticks)(void *self);
 
   /**
    * Read array `array`: a value for each of its taxels, and the mean temperature of its chips in
-   * hundredths of a degree C. False: the conversion is not done, ask again. Axes: section 4.
+   * hundredths of a degree C. False: the conversion is not finished, ask again. Axes: section 4.
    */
   bool (*sample)(void *self, uint8_t array, struct tp_taxel *taxels, int16_t *temperature_cc);
 
   /**
-   * Optional: make all chips begin a conversion now, which `sample` then reads. Where it is NULL
-   * `sample` converts by itself, and each array has its own instant.
+   * Optional: start a conversion on all chips now, for `sample` to read. If NULL, `sample` converts
+   * by itself, and each array has its own sampling instant.
    */
   void (*convert)(void *self);
 
   /**
-   * Optional: obey Set gain for array `array` (BOARD_ALL_ARRAYS: all), at the present rate of
-   * `rate_mhz`; TP_OK, or why it is refused, and then nothing may have changed. Where it is NULL
-   * the board refuses every Set gain as a bad argument.
+   * Optional: carry out Set gain for array `array` (BOARD_ALL_ARRAYS: all) at the current rate
+   * `rate_mhz`. Returns TP_OK, or the reason for refusal with nothing changed. If NULL, the board
+   * refuses every Set gain with TP_BAD_ARGUMENT.
    */
   enum tp_answer (*set_gain)(void *self, uint8_t array, const struct tp_set_gain *codes,
                              uint32_t rate_mhz);
 
   /**
-   * Where `set_gain` is given: the present scales of array `array`; the result is the highest
-   * sample rate of the board, mHz.
+   * Needed with `set_gain`: the current scales of array `array`. Returns the highest sample rate of
+   * the board in mHz.
    */
   uint32_t (*scales)(void *self, uint8_t array, uint32_t *lsb_xy_nt, uint32_t *lsb_z_nt);
 
-  /** Reset the microcontroller. Where it returns it must have called `board_begin` again. */
+  /** Reset the microcontroller. If it returns, it must have called `board_begin` again. */
   void (*reboot)(void *self);
 };
 
-/* What the transmit buffer holds, in the order in which things leave. */
+/* Contents of the transmit buffer, in sending order. */
 enum board_item_ {
   BOARD_NONE_,
   BOARD_CLOCK_,
@@ -184,31 +184,32 @@ struct board_poll_ {
   uint32_t ticks;
 };
 
-/* Bytes stand first: a Cortex-M0 reaches them there in one instruction. What ends in _ is private. */
+/* Bytes come first, where a Cortex-M0 reaches them in one instruction. Names ending in _ are
+ * private. */
 struct board {
   bool streaming;
-  uint8_t logs_lost; /* lines that found the place taken; told in the next one */
+  uint8_t logs_lost; /* lines dropped because one was waiting; reported in the next line */
 
   uint8_t cause_;
-  bool rebooting_; /* the ack of Reboot is under way, or has gone */
+  bool rebooting_; /* the ack of Reboot is queued or sent */
   bool reboot_sent_;
   bool status_due_;
   bool converting_;
-  bool greeted_;        /* a zero was put out */
+  bool greeted_;        /* the initial zero was sent */
   uint8_t descriptors_; /* Identifies to answer */
-  uint8_t acks_;        /* waiting, from first_ack_ on */
+  uint8_t acks_;        /* queued, from first_ack_ on */
   uint8_t first_ack_;
   uint8_t polls_;
   uint8_t first_poll_;
   uint8_t log_size_;
   uint8_t log_level_;
-  uint8_t waiting_;    /* whole cycles, from order_[0] on, oldest first; then the one being filled */
-  uint8_t next_array_; /* of the oldest cycle: the next to be sent */
-  uint8_t reading_;    /* of the newest: the next to be read */
+  uint8_t waiting_;    /* whole cycles from order_[0] on, oldest first; then the one being filled */
+  uint8_t next_array_; /* next array of the oldest cycle to be sent */
+  uint8_t reading_;    /* next array of the newest cycle to be read */
   uint8_t item_;       /* what is in tx_ */
   uint8_t order_[BOARD_CYCLES];
   uint16_t tx_size_;
-  uint16_t tx_at_; /* bytes, on CAN frames, that have gone */
+  uint16_t tx_at_; /* bytes (on CAN: frames) already sent */
 
   const struct board_config *config;
   const struct board_port *port;
@@ -219,11 +220,11 @@ struct board {
   uint32_t rate_mhz;
 
   uint32_t sequence_;
-  uint32_t due_;    /* ticks at which the next conversion begins */
-  uint32_t period_; /* ticks, and what is left of their division by the rate */
+  uint32_t due_;    /* ticks at which the next conversion starts */
+  uint32_t period_; /* in ticks, with the remainder of their division by the rate */
   uint32_t period_rest_;
   uint32_t rest_;
-  uint32_t second_; /* ticks at which the present second of uptime began */
+  uint32_t second_; /* ticks at which the current second of uptime began */
   uint32_t uptime_s_;
   uint32_t reboot_from_;
   uint32_t log_ticks_;
@@ -246,7 +247,7 @@ struct board {
   struct board_cycle_ cycle_[BOARD_CYCLES];
 };
 
-/* A thousand times a, in two halves, and divided by c (the result below 2^32), with what is left.
+/* Computes 1000 * a in two halves, and its division by c (result below 2^32) with remainder.
  * Written out so that no 64-bit multiplication or division is linked. */
 static inline void board_thousand_(uint32_t a, uint32_t *high, uint32_t *low) {
   uint32_t lower = (a & 0xFFFFUL) * 1000U;
@@ -290,7 +291,7 @@ static inline uint32_t board_max_rate_(const struct board *b) {
   return b->port->scales ? b->port->scales(b->port->self, 0, &xy, &z) : b->config->max_rate_mhz;
 }
 
-/** Forget the samples that wait and the conversion under way; what waited is counted. */
+/** Discard the queued samples, which are counted, and the conversion in progress. */
 static inline void board_drop_all_(struct board *b) {
   b->overruns += b->waiting_;
   b->waiting_ = 0;
@@ -310,10 +311,10 @@ static inline void board_take_rate_(struct board *b, uint32_t rate_mhz) {
 }
 
 /**
- * Begin as after a reset of cause `cause` (`enum tp_reset_cause`). config, port and what they point
- * to must stay. The settings of the chips must be those of `config`. False: the arrays do not fit
- * BOARD_MAX_ARRAYS, BOARD_MAX_TAXELS or BOARD_ARRAY_TAXELS, or a number of `config` is out of its
- * range; the board must not be polled then.
+ * Start as after a reset with cause `cause` (`enum tp_reset_cause`). config, port and what they
+ * point to must stay valid. The chips must have the settings of `config`. False: the arrays exceed
+ * BOARD_MAX_ARRAYS, BOARD_MAX_TAXELS or BOARD_ARRAY_TAXELS, or a number in `config` is out of
+ * range; the board must then not be polled.
  */
 static inline bool board_begin(struct board *b, const struct board_config *config,
                                const struct board_port *port, uint8_t cause) {
@@ -358,9 +359,9 @@ static inline bool board_begin(struct board *b, const struct board_config *confi
 }
 
 /**
- * Queue a line of text, UTF-8, for the host; `level`: `enum tp_level`. One line waits at a time: a
- * further one is lost and counted in `logs_lost`. What is too long is cut between characters,
- * control characters become '?'.
+ * Queue a line of UTF-8 text for the host; `level`: `enum tp_level`. Only one line can wait: a
+ * further one is dropped and counted in `logs_lost`. A long line is cut between characters; control
+ * characters become '?'.
  */
 static inline void board_log(struct board *b, uint8_t level, const char *text) {
   uint8_t n = 0;
@@ -380,7 +381,8 @@ static inline void board_log(struct board *b, uint8_t level, const char *text) {
   b->log_ticks_ = b->port->ticks(b->port->self);
 }
 
-/* ---- What the host says -------------------------------------------------------------------------- */
+/* ---- Commands from the host
+ * ---------------------------------------------------------------------- */
 
 static inline void board_answer_(struct board *b, uint8_t command, uint16_t request,
                                  enum tp_answer result) {
@@ -404,13 +406,13 @@ static inline enum tp_answer board_set_gain_(struct board *b, const struct tp_se
   return result;
 }
 
-/** Obey a command of type `type`; false: it was refused without an answer. */
+/** Carry out a command of type `type`; false if it was rejected without an answer. */
 static inline bool board_obey_(struct board *b, uint8_t type, const uint8_t *p, uint16_t n,
                                uint32_t now) {
   enum tp_answer result = TP_OK;
   struct board_poll_ *poll;
   uint16_t request;
-  if ((type & 0x80) == 0) return false; /* what boards send, echoed by the line */
+  if ((type & 0x80) == 0) return false; /* messages of boards, echoed by the line */
   if (type == TP_IDENTIFY) {
     if (n < TP_IDENTIFY_BYTES || b->descriptors_ == 255) return false;
     b->descriptors_++;
@@ -459,7 +461,7 @@ static inline bool board_obey_(struct board *b, uint8_t type, const uint8_t *p, 
       b->rebooting_ = true;
       break;
     default:
-      b->rx_errors++; /* skipped and counted, as every type of a newer version is */
+      b->rx_errors++; /* counted, as is every type of a newer version */
       result = TP_UNKNOWN_COMMAND;
   }
   board_answer_(b, type, request, result);
@@ -481,7 +483,7 @@ static inline void board_receive_(struct board *b) {
     uint8_t node = (uint8_t)(frame.identifier & 0x7FUL);
     enum tp_event said;
     if (!tp_can_is_ours(frame.identifier) || (node != b->config->node && node != TP_BROADCAST)) {
-      continue; /* somebody else's */
+      continue; /* for another node or protocol */
     }
     said = tp_can_push(&b->rx_, &frame);
     if (said == TP_PACKET) {
@@ -518,7 +520,7 @@ static inline void board_receive_(struct board *b) {
 
 /* ---- Sampling -------------------------------------------------------------------------------------- */
 
-/** Take waiting cycle number `i` out of the queue; its place becomes that of the last one. */
+/** Remove queued cycle number `i`; its buffer goes to the end of the order. */
 static inline void board_remove_(struct board *b, uint8_t i) {
   for (; i + 1 < BOARD_CYCLES; i++) {
     uint8_t place = b->order_[i];
@@ -528,7 +530,7 @@ static inline void board_remove_(struct board *b, uint8_t i) {
   b->waiting_--;
 }
 
-/** Make room for the cycle that begins: the oldest gives way that has not begun to be sent. */
+/** Make room for the cycle that begins: drop the oldest one of which nothing has been sent. */
 static inline void board_make_room_(struct board *b) {
   if (b->waiting_ < BOARD_CYCLES - 1) return;
   if (b->next_array_ == 0 && b->tx_at_ == 0 && b->item_ == BOARD_SAMPLES_) b->item_ = BOARD_NONE_;
@@ -536,7 +538,7 @@ static inline void board_make_room_(struct board *b) {
   b->overruns++;
 }
 
-/** Let `due_` be the beginning of the next cycle after it. */
+/** Set `due_` to the start of the cycle after it. */
 static inline void board_step_(struct board *b) {
   b->due_ += b->period_;
   b->rest_ += b->period_rest_;
@@ -555,7 +557,7 @@ static inline void board_sample_(struct board *b) {
     uint32_t now = port->ticks(port->self);
     if ((int32_t)(now - b->due_) < 0) return;
     board_step_(b);
-    /* Late by whole periods: those cycles were never begun, and are missing all the same. */
+    /* Late by whole periods: those cycles were never started but count as missing. */
     for (i = 0; i < 100 && (int32_t)(now - b->due_) >= 0; i++) {
       board_step_(b);
       b->sequence_++;
@@ -589,7 +591,8 @@ static inline void board_sample_(struct board *b) {
   b->waiting_++;
 }
 
-/* ---- What the board says ------------------------------------------------------------------------------ */
+/* ---- Messages to the host
+ * ------------------------------------------------------------------------ */
 
 static inline void board_open_(struct board *b, struct tp_writer *w, uint8_t type,
                                uint16_t length) {
@@ -669,7 +672,7 @@ static inline void board_write_samples_(struct board *b, struct tp_writer *w) {
   for (i = 0; i < n; i++) tp_u8(w, taxels[i].status);
 }
 
-/** Write the next thing to be said into the transmit buffer; false: there is nothing. */
+/** Write the next message into the transmit buffer; false if there is none. */
 static inline bool board_compose_(struct board *b) {
   uint32_t now = b->port->ticks(b->port->self);
   struct tp_writer w;
@@ -704,7 +707,7 @@ static inline bool board_compose_(struct board *b) {
   return true;
 }
 
-/** The first byte of what was composed has gone: it need not be kept any longer. */
+/** The first byte of the message was sent: remove it from its queue. */
 static inline void board_gone_(struct board *b) {
   const struct tp_ack *ack = &b->ack_[b->first_ack_];
   switch (b->item_) {
@@ -739,7 +742,7 @@ static inline void board_gone_(struct board *b) {
   }
 }
 
-/** Put out as much of the transmit buffer as the line takes; false: it takes nothing now. */
+/** Send as much of the transmit buffer as the line takes; false if it takes nothing now. */
 static inline bool board_put_(struct board *b) {
 #if BOARD_CAN
   struct tp_can_frame frame;
@@ -764,14 +767,14 @@ static inline bool board_put_(struct board *b) {
 
 static inline void board_transmit_(struct board *b) {
 #if !BOARD_CAN
-  if (!b->greeted_) { /* parts our first frame from garbage on the line */
+  if (!b->greeted_) { /* separates the first frame from garbage on the line */
     static const uint8_t zero = 0;
     if (b->port->write(b->port->self, &zero, 1) == 0) return;
     b->greeted_ = true;
   }
 #endif
   for (;;) {
-    /* A clock reply that waits must not keep an old stamp, nor wait behind what has not begun. */
+    /* A queued clock reply must not keep an old stamp, nor wait for a message not yet started. */
     if (b->tx_at_ == 0 && b->polls_ != 0) b->item_ = BOARD_NONE_;
     if (b->item_ == BOARD_NONE_ && (b->reboot_sent_ || !board_compose_(b))) return;
     if (!board_put_(b)) return;
@@ -782,12 +785,12 @@ static inline void board_transmit_(struct board *b) {
   }
 }
 
-/** Do all that is due now; see the head of this file. */
+/** Do all that is due now; see the top of this file. */
 static inline void board_poll(struct board *b) {
   const struct board_port *port = b->port;
   uint32_t now = port->ticks(port->self);
   if (b->reboot_sent_ && b->item_ == BOARD_NONE_) {
-    /* 16 ms, for the answer to get out. */
+    /* Wait 16 ms for the answer to be sent. */
     if (now - b->reboot_from_ >= b->config->tick_hz >> 6) port->reboot(port->self);
     return;
   }

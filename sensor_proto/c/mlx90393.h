@@ -1,23 +1,23 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /**
- * Driver of Melexis MLX90393 magnetometers over I2C or SPI, several chips on one bus, in C99.
+ * Driver for Melexis MLX90393 magnetometers on I2C or SPI, several chips per bus, in C99.
  *
- * The microcontroller gives one function that moves bytes (`struct mlx_bus`); nothing here waits
- * for a conversion. Two ways to sample:
+ * The microcontroller provides one function that transfers bytes (`struct mlx_bus`); the driver
+ * never waits for a conversion. There are two ways to sample:
  *
- *   single  `mlx_array_convert` makes every chip begin, `mlx_array_read` fetches what they found;
- *           the sampling instant is yours. This is what a board of board.h does.
- *   burst   `mlx_burst` lets a chip convert by itself, `mlx_read` fetches when it is ready.
+ *   single  `mlx_array_convert` starts a conversion on every chip, `mlx_array_read` fetches the
+ *           results; the caller chooses the sampling instant. Boards with board.h do this.
+ *   burst   `mlx_burst` lets a chip convert continuously, `mlx_read` fetches when data is ready.
  *
- * What goes wrong is told taxel by taxel: a chip that does not answer is `TP_READ_FAILED` and is
- * set up again without holding up the others; one that had nothing new is `TP_STALE` and repeats
- * its last values; counts at the end of their range are `TP_SATURATED`. A bus held down is freed
- * by the port's `recover`, once a cycle.
+ * Errors are reported per taxel: a chip that does not answer is `TP_READ_FAILED` and is set up
+ * again without delaying the others; one without new data is `TP_STALE` and repeats its last
+ * values; counts at the end of the range are `TP_SATURATED`. A blocked bus is freed by the port's
+ * `recover`, at most once per cycle.
  *
- * Figures and registers: MLX90393 datasheet; HALLCONF 0xC. In resolutions 0 and 1 the chip wraps
- * beyond its 16 bits without a word, so that only a count at the very end is seen as saturated:
- * choose a gain that leaves room. Resolutions 2 and 3 have room beyond what they can measure, and
- * there every reading out of range is seen.
+ * Figures and registers: MLX90393 datasheet; HALLCONF 0xC. In resolutions 0 and 1 the chip silently
+ * wraps beyond its 16 bits, so that only a count at the very end is recognised as saturated: choose
+ * a gain that leaves room. Resolutions 2 and 3 have room beyond the measuring range, so that every
+ * reading out of range is recognised.
  */
 #ifndef TACTILE_MLX90393_H
 #define TACTILE_MLX90393_H
@@ -26,14 +26,14 @@
 
 enum mlx_result {
   MLX_OK,
-  MLX_NACK,      /* nobody answers at this address */
-  MLX_STUCK,     /* the bus is held down */
+  MLX_NACK,      /* no answer at this address */
+  MLX_STUCK,     /* the bus is blocked */
   MLX_NOT_READY, /* no new conversion */
-  MLX_ERROR,     /* the chip refused the command, or answered otherwise than it must */
+  MLX_ERROR,     /* the chip refused the command or gave a wrong answer */
   MLX_WAS_RESET  /* the chip has lost its settings */
 };
 
-/* Commands; those that name axes take them in the low four bits. */
+/* Commands; the low four bits select the axes. */
 #define MLX_SB 0x10 /* start burst mode */
 #define MLX_SM 0x30 /* start single measurement */
 #define MLX_RM 0x40 /* read measurement */
@@ -50,32 +50,32 @@ enum mlx_result {
 #define MLX_STATUS_RESET 0x04
 
 #define MLX_HALLCONF 0xC
-#define MLX_TRIG_INT 0x8000U /* the INT/TRG pin tells data-ready */
+#define MLX_TRIG_INT 0x8000U /* the INT/TRG pin signals data-ready */
 #define MLX_COMM_SPI 0x4000U
 #define MLX_COMM_I2C 0x6000U
 #define MLX_RESET_US 1600 /* from RT to the first command */
 
-/** What a bus needs of the microcontroller. */
+/** Functions that the microcontroller provides for a bus. */
 struct mlx_bus {
   void *self;
   bool spi;
   /**
-   * Write `out_count` bytes to the chip, then read `in_count` of it. I2C: `address` is the 7-bit
+   * Write `out_count` bytes to the chip, then read `in_count` bytes. I2C: `address` is the 7-bit
    * address; write, repeated start, read, stop. SPI: `address` is the number of a chip select;
-   * select, write, go on clocking to read, deselect (mode 3, most significant bit first). MLX_OK,
-   * MLX_NACK or MLX_STUCK; it must end by itself, whatever the chip does.
+   * select, write, keep clocking to read, deselect (mode 3, most significant bit first). Returns
+   * MLX_OK, MLX_NACK or MLX_STUCK. It must return whatever the chip does.
    */
   enum mlx_result (*transfer)(void *self, uint8_t address, const uint8_t *out, uint8_t out_count,
                               uint8_t *in, uint8_t in_count);
-  /** Optional: free an I2C bus that is held down: nine clocks, then a stop. */
+  /** Optional: free a blocked I2C bus with nine clocks, then a stop. */
   void (*recover)(void *self);
-  /** Optional: level of the chip's INT/TRG pin, which is high while data is ready. */
+  /** Optional: level of the chip's INT/TRG pin, high while data is ready. */
   bool (*data_ready)(void *self, uint8_t address);
-  /** The microcontroller's clock in us; it may wrap at 2^32. */
+  /** Clock of the microcontroller in us; it may wrap at 2^32. */
   uint32_t (*micros)(void *self);
 };
 
-/** Settings in the chip's codes, as in Set gain. */
+/** Settings in the chip's own codes, as in Set gain. */
 struct mlx_setting {
   uint8_t gain;         /* GAIN_SEL, 0 to 7 */
   uint8_t resolution;   /* RES of all axes, 0 to 3 */
@@ -87,22 +87,22 @@ enum mlx_state { MLX_DOWN, MLX_RESETTING, MLX_UP };
 
 struct mlx_chip {
   uint8_t address;
-  /* What follows is the driver's. */
+  /* The rest is private to the driver. */
   uint8_t state; /* enum mlx_state */
   bool converting;
-  uint32_t since; /* micros: reset, or beginning of the conversion */
+  uint32_t since; /* micros: time of the reset or start of the conversion */
   struct tp_taxel last;
   int16_t temperature_cc;
 };
 
-/** Chips that sample together, in the order of their taxels. */
+/** Chips sampled together, in the order of their taxels. */
 struct mlx_array {
   const struct mlx_bus *bus;
   struct mlx_chip *chips;
   uint8_t count;
-  bool flipped; /* z points into the skin: x and z change their signs, as PROTOCOL.md asks */
+  bool flipped; /* z points into the skin: x and z change sign, as PROTOCOL.md requires */
   struct mlx_setting setting;
-  uint32_t recoveries; /* times the bus had to be freed */
+  uint32_t recoveries; /* how often the bus had to be freed */
 };
 
 /* ---- Figures ------------------------------------------------------------------------------------- */
@@ -111,7 +111,7 @@ static inline bool mlx_is_setting(const struct mlx_setting *s) {
   return s->gain <= 7 && s->resolution <= 3 && s->oversampling <= 3 && s->filter <= 7;
 }
 
-/** nT for one count of x and y, and of z. */
+/** nT per count, for x and y, and for z. */
 static inline void mlx_scales(const struct mlx_setting *s, uint32_t *xy_nt, uint32_t *z_nt) {
   static const uint16_t xy[8] = {751, 601, 451, 376, 300, 250, 200, 150};
   static const uint16_t z[8] = {1210, 968, 726, 605, 484, 403, 323, 242};
@@ -119,7 +119,7 @@ static inline void mlx_scales(const struct mlx_setting *s, uint32_t *xy_nt, uint
   *z_nt = (uint32_t)z[s->gain & 7] << s->resolution;
 }
 
-/** us of one conversion of temperature and three axes by a chip whose oscillator is right. */
+/** Duration in us of one conversion of temperature and three axes, with a nominal oscillator. */
 static inline uint32_t mlx_conversion_us(const struct mlx_setting *s) {
   return 688U + 192U * ((uint32_t)(2U + (1U << s->filter)) << s->oversampling);
 }
@@ -130,14 +130,17 @@ static inline uint32_t mlx_slowest_us(const struct mlx_setting *s) {
   return us + us / 10 + 1;
 }
 
-/** Highest rate, mHz, at which the slowest chip is read in time; `bus_us`: to start and read all. */
+/**
+ * Highest rate in mHz at which the slowest chip is read in time; `bus_us`: time to start and read
+ * all.
+ */
 static inline uint32_t mlx_max_rate_mhz(const struct mlx_setting *s, uint32_t bus_us) {
   return 1000000000UL / (mlx_slowest_us(s) + bus_us);
 }
 
 /* ---- One chip -------------------------------------------------------------------------------------- */
 
-/** Send a command and take its status byte. */
+/** Send a command and read its status byte. */
 static inline enum mlx_result mlx_command(const struct mlx_bus *bus, uint8_t address,
                                           const uint8_t *out, uint8_t n, uint8_t *status) {
   enum mlx_result result = bus->transfer(bus->self, address, out, n, status, 1);
@@ -175,7 +178,7 @@ static inline enum mlx_result mlx_read_register(const struct mlx_bus *bus, uint8
   return (in[0] & MLX_STATUS_ERROR) ? MLX_ERROR : MLX_OK;
 }
 
-/** Write one register, its bits outside `mask` as they are, and read it back. */
+/** Write one register, keeping its bits outside `mask`, and verify it. */
 static inline enum mlx_result mlx_change_register(const struct mlx_bus *bus, uint8_t address,
                                                   uint8_t number, uint16_t mask, uint16_t value) {
   uint16_t was;
@@ -189,7 +192,7 @@ static inline enum mlx_result mlx_change_register(const struct mlx_bus *bus, uin
   return (was == value) ? MLX_OK : MLX_ERROR;
 }
 
-/** Begin a reset; the chip takes commands again after MLX_RESET_US. */
+/** Start a reset; the chip accepts commands again after MLX_RESET_US. */
 static inline enum mlx_result mlx_reset(const struct mlx_bus *bus, struct mlx_chip *chip) {
   enum mlx_result result = mlx_order(bus, chip->address, MLX_EX);
   chip->state = MLX_DOWN;
@@ -202,7 +205,7 @@ static inline enum mlx_result mlx_reset(const struct mlx_bus *bus, struct mlx_ch
   return MLX_OK;
 }
 
-/** Write the settings and check that they were taken. The chip must neither convert nor burst. */
+/** Write the settings and verify them. The chip must neither convert nor burst. */
 static inline enum mlx_result mlx_configure(const struct mlx_bus *bus, struct mlx_chip *chip,
                                             const struct mlx_setting *s) {
   uint8_t a = chip->address;
@@ -223,7 +226,7 @@ static inline enum mlx_result mlx_configure(const struct mlx_bus *bus, struct ml
   return result;
 }
 
-/** Begin one conversion of temperature and all axes. */
+/** Start one conversion of temperature and all axes. */
 static inline enum mlx_result mlx_convert(const struct mlx_bus *bus, struct mlx_chip *chip) {
   static const uint8_t command = MLX_SM | MLX_TXYZ;
   uint8_t status;
@@ -235,8 +238,8 @@ static inline enum mlx_result mlx_convert(const struct mlx_bus *bus, struct mlx_
 }
 
 /**
- * Let the chip convert on and on: `interval` times 20 ms from one beginning to the next (0: without
- * a pause, 1 to 63). `mlx_exit` ends it.
+ * Let the chip convert continuously, every `interval` times 20 ms (1 to 63; 0: without a pause).
+ * `mlx_exit` ends it.
  */
 static inline enum mlx_result mlx_burst(const struct mlx_bus *bus, struct mlx_chip *chip,
                                         uint8_t interval) {
@@ -254,7 +257,9 @@ static inline enum mlx_result mlx_exit(const struct mlx_bus *bus, struct mlx_chi
   return mlx_order(bus, chip->address, MLX_EX);
 }
 
-/** Count of one axis; `saturated` becomes true out of range. Zero is 0, 8000h or 4000h by RES. */
+/**
+ * Count of one axis; sets `saturated` if out of range. Zero is 0, 8000h or 4000h, depending on RES.
+ */
 static inline int16_t mlx_axis_(uint16_t raw, uint8_t resolution, bool *saturated) {
   int32_t count = (int16_t)raw;
   int32_t limit = 32767;
@@ -270,7 +275,7 @@ static inline int16_t mlx_axis_(uint16_t raw, uint8_t resolution, bool *saturate
   return (int16_t)count;
 }
 
-/** Hundredths of a degree C of the thermometer's 16 bits: 25 + (raw - 46244) / 45.2. */
+/** Temperature in hundredths of a degree C from the raw 16 bits: 25 + (raw - 46244) / 45.2. */
 static inline int16_t mlx_temperature_cc(uint16_t raw) {
   int32_t cc = 2500 + ((int32_t)raw - 46244) * 1000 / 452;
   if (cc > 32767) cc = 32767;
@@ -279,8 +284,8 @@ static inline int16_t mlx_temperature_cc(uint16_t raw) {
 }
 
 /**
- * Read what was converted. MLX_OK: `chip->last` and `chip->temperature_cc` are new. Otherwise they
- * stay; MLX_WAS_RESET asks for `mlx_configure`.
+ * Read the conversion. MLX_OK: `chip->last` and `chip->temperature_cc` are new; otherwise they are
+ * unchanged. MLX_WAS_RESET requires `mlx_configure`.
  */
 static inline enum mlx_result mlx_read(const struct mlx_bus *bus, struct mlx_chip *chip,
                                        const struct mlx_setting *s, bool flipped) {
@@ -294,9 +299,9 @@ static inline enum mlx_result mlx_read(const struct mlx_bus *bus, struct mlx_chi
   result = bus->transfer(bus->self, chip->address, &command, 1, in, 9);
   if (result != MLX_OK) return result;
   if (in[0] & MLX_STATUS_RESET) return MLX_WAS_RESET;
-  if (in[0] & MLX_STATUS_ERROR) return MLX_NOT_READY; /* RM before the end is refused so */
+  if (in[0] & MLX_STATUS_ERROR) return MLX_NOT_READY; /* RM before the end is refused in this way */
   for (i = 0; i < 4; i++) raw[i] = (uint16_t)((uint16_t)in[1 + 2 * i] << 8 | in[2 + 2 * i]);
-  if (raw[0] == 0 || raw[0] == 0xFFFF) return MLX_ERROR; /* -998 or 452 C: lines, not a chip */
+  if (raw[0] == 0 || raw[0] == 0xFFFF) return MLX_ERROR; /* -998 or 452 C: idle lines, not a chip */
   chip->converting = (in[0] & MLX_STATUS_BURST) != 0;
   chip->temperature_cc = mlx_temperature_cc(raw[0]);
   chip->last.x = mlx_axis_(raw[1], s->resolution, &saturated);
@@ -312,7 +317,7 @@ static inline enum mlx_result mlx_read(const struct mlx_bus *bus, struct mlx_chi
 
 /* ---- An array ---------------------------------------------------------------------------------------- */
 
-/** Bring the chips up, waiting for none; those that do not answer are tried again in each cycle. */
+/** Set up the chips without waiting; those that do not answer are tried again in each cycle. */
 static inline void mlx_array_begin(struct mlx_array *a, const struct mlx_bus *bus,
                                    struct mlx_chip *chips, uint8_t count,
                                    const struct mlx_setting *setting) {
@@ -332,7 +337,7 @@ static inline void mlx_array_begin(struct mlx_array *a, const struct mlx_bus *bu
   }
 }
 
-/** Take a chip that is not up one step further: reset, then settings. */
+/** Take a chip that is not up through its next step: reset, then settings. */
 static inline enum mlx_result mlx_raise_(struct mlx_array *a, struct mlx_chip *chip) {
   if (chip->state == MLX_DOWN) return mlx_reset(a->bus, chip);
   if (a->bus->micros(a->bus->self) - chip->since < MLX_RESET_US) return MLX_NOT_READY;
@@ -344,7 +349,7 @@ static inline enum mlx_result mlx_begin_(struct mlx_array *a, struct mlx_chip *c
   if (chip->state != MLX_UP) {
     result = mlx_raise_(a, chip);
     if (chip->state != MLX_UP) return result;
-  } else if (chip->converting) { /* it never came to an end */
+  } else if (chip->converting) { /* the last conversion was not read */
     (void)mlx_exit(a->bus, chip);
   }
   result = mlx_convert(a->bus, chip);
@@ -352,7 +357,7 @@ static inline enum mlx_result mlx_begin_(struct mlx_array *a, struct mlx_chip *c
   return result;
 }
 
-/** Make every chip begin a conversion, one after another; those that are down are brought up. */
+/** Start a conversion on every chip, one after another; those that are down are set up again. */
 static inline void mlx_array_convert(struct mlx_array *a) {
   bool freed = false;
   uint8_t i;
@@ -367,12 +372,12 @@ static inline void mlx_array_convert(struct mlx_array *a) {
       if (mlx_begin_(a, chip) != MLX_STUCK) continue;
       chip->converting = false;
     }
-    for (; i < a->count; i++) a->chips[i].converting = false; /* nobody can be spoken to */
+    for (; i < a->count; i++) a->chips[i].converting = false; /* the bus is still blocked */
     return;
   }
 }
 
-/** Whether every chip that converts must have ended, by its pin or by the slowest oscillator. */
+/** Whether every conversion must have ended, judged by the pin or the slowest oscillator. */
 static inline bool mlx_array_ready(const struct mlx_array *a) {
   uint32_t now = a->bus->micros(a->bus->self);
   uint8_t i;
@@ -386,7 +391,7 @@ static inline bool mlx_array_ready(const struct mlx_array *a) {
 }
 
 /**
- * Fetch the conversions: one taxel a chip, each with its status, and the mean temperature of the
+ * Read the conversions: one taxel per chip, each with its status, and the mean temperature of the
  * chips that were read.
  */
 static inline void mlx_array_read(struct mlx_array *a, struct tp_taxel *taxels,
@@ -408,9 +413,9 @@ static inline void mlx_array_read(struct mlx_array *a, struct tp_taxel *taxels,
       taxels[i].status = (uint8_t)(chip->last.status | TP_STALE);
     } else {
       taxels[i].status = TP_READ_FAILED;
-      chip->last.status = TP_READ_FAILED; /* too old to be repeated when it comes back */
+      chip->last.status = TP_READ_FAILED; /* too old to be repeated later */
       if (chip->state == MLX_UP && result != MLX_STUCK && result != MLX_NOT_READY) {
-        chip->state = MLX_DOWN; /* to be set up anew */
+        chip->state = MLX_DOWN; /* set it up again */
       }
     }
   }
@@ -419,8 +424,8 @@ static inline void mlx_array_read(struct mlx_array *a, struct tp_taxel *taxels,
 
 /**
  * Set all chips, for Set gain; `rate_mhz` and `bus_us` as in `mlx_max_rate_mhz`. TP_BAD_ARGUMENT:
- * codes that the chip lacks, or too slow for the rate; nothing has changed then. A chip that does
- * not answer takes the settings when it comes back.
+ * invalid codes, or too slow for the rate; nothing has changed then. A chip that does not answer
+ * gets the settings when it is back.
  */
 static inline enum tp_answer mlx_array_set(struct mlx_array *a, const struct mlx_setting *setting,
                                            uint32_t rate_mhz, uint32_t bus_us) {
@@ -432,7 +437,7 @@ static inline enum tp_answer mlx_array_set(struct mlx_array *a, const struct mlx
   for (i = 0; i < a->count; i++) {
     struct mlx_chip *chip = &a->chips[i];
     if (chip->state == MLX_UP) {
-      (void)mlx_exit(a->bus, chip); /* a conversion under way would refuse the registers */
+      (void)mlx_exit(a->bus, chip); /* a conversion in progress would refuse the registers */
       (void)mlx_configure(a->bus, chip, setting);
     }
     chip->last.status = TP_READ_FAILED; /* of the old scale */

@@ -1,12 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /**
- * The wire protocol of taxel boards, version 1.0 (PROTOCOL.md), in C99.
+ * Wire protocol of taxel boards, version 1.0 (PROTOCOL.md), in C99.
  *
- * One header, no allocation, no memory of its own, no dependency beyond <stdint.h>. Both ends are
- * here: a writer and a reader for each message, COBS frames of a serial line, CAN 2.0B and CAN FD
- * transfers. A writer makes header, payload, CRC and stuffing in one pass; a receiver takes one
- * byte (or one CAN frame) at a time and never holds more than the memory it was given, however
- * long the frame.
+ * One header without allocation, own memory or dependencies beyond <stdint.h>. It serves both ends:
+ * a writer and a reader for each message, COBS frames for serial lines, transfers for CAN 2.0B and
+ * CAN FD. A writer produces header, payload, CRC and stuffing in one pass. A receiver takes one
+ * byte (or one CAN frame) at a time and never uses more than the memory it was given, however long
+ * the frame.
  *
  * Sending on a serial line:
  *
@@ -14,7 +14,7 @@
  *     struct tp_writer w;
  *     tp_begin(&w, frame, sizeof frame, TP_ACK, 0, 4, true);
  *     tp_put_ack(&w, TP_START, TP_OK, request);
- *     size = tp_end(&w);                       // 0: the frame has no room for it
+ *     size = tp_end(&w);                       // 0: the frame is too small for it
  *
  * Receiving:
  *
@@ -23,7 +23,7 @@
  *     tp_serial_reset(&rx, held, sizeof held);
  *     if (tp_serial_push(&rx, byte) == TP_PACKET) { ... rx.packet, tp_payload(&rx.packet) ... }
  *
- * `board.h` makes a whole board of it.
+ * `board.h` builds a complete board on it.
  */
 #ifndef TACTILE_PROTO_H
 #define TACTILE_PROTO_H
@@ -47,12 +47,12 @@
 #define TP_MAX_TAXELS 128
 #define TP_MAX_ARRAYS 16
 #define TP_MAX_TEXT 255
-#define TP_NAME 16 /* bytes of a name on the wire, its ending zero included */
+#define TP_NAME 16 /* bytes of a name on the wire, including its ending zero */
 #define TP_BROADCAST 127
 
-/** Bytes of the packet with a payload of n bytes. */
+/** Size of a packet with a payload of n bytes. */
 #define TP_PACKET_BYTES(n) ((n) + TP_OVERHEAD)
-/** Bytes of the serial frame of a payload of n bytes, its zero included. */
+/** Size of the serial frame of a payload of n bytes, including its zero. */
 #define TP_SERIAL_BYTES(n) (TP_PACKET_BYTES(n) + 2 + TP_PACKET_BYTES(n) / 254)
 
 /* Payload bytes of each message. */
@@ -96,8 +96,8 @@ enum tp_reset_cause { TP_POWER_ON = 0, TP_BY_COMMAND = 1, TP_WATCHDOG = 2, TP_BR
 enum tp_level { TP_DEBUG = 10, TP_INFO = 20, TP_WARNING = 30, TP_ERROR = 40 };
 
 /**
- * What a byte or frame brought. From TP_COBS on: why something was refused, as PROTOCOL.md
- * section 8 names it; each comes once for what it refuses, so that counting them is the tally.
+ * Result of a byte or frame. From TP_COBS on: why it was rejected, named as in PROTOCOL.md section
+ * 8. Each is returned once per rejected item, so that counting them gives the totals.
  */
 enum tp_event {
   TP_NOTHING,
@@ -114,10 +114,10 @@ enum tp_event {
   TP_BAD_VALUE,
   TP_EMPTY,
   TP_FOREIGN,
-  TP_ERROR_FRAME, /* for the shell: a CAN controller's report */
+  TP_ERROR_FRAME, /* for the caller: a report of the CAN controller */
   TP_BAD_FRAME,
   TP_NO_START,
-  TP_INTERRUPTED, /* never returned, for it may come with a packet: see tp_can_rx */
+  TP_INTERRUPTED, /* never returned, as it may coincide with a packet: see tp_can_rx */
   TP_OUT_OF_ORDER,
   TP_DUPLICATE,
   TP_EVENTS
@@ -138,9 +138,9 @@ static inline int16_t tp_get_i16(const uint8_t *at) { return (int16_t)tp_get_u16
 /* ---- CRC-32C ---------------------------------------------------------------------------------- */
 
 #define TP_CRC_SEED 0xFFFFFFFFUL
-#define TP_CRC_GOOD 0xB798B438UL /* register after a whole packet, its crc included */
+#define TP_CRC_GOOD 0xB798B438UL /* register after a whole packet including its crc */
 
-/** Register after one more byte: two steps through a table of 16, 64 bytes of flash. */
+/** Register after one more byte. Two lookups in a table of 16 entries, 64 bytes of flash. */
 static inline uint32_t tp_crc_step(uint32_t crc, uint8_t byte) {
 #ifdef __AVR__
   static const uint32_t table[16] PROGMEM = {
@@ -160,7 +160,7 @@ static inline uint32_t tp_crc_step(uint32_t crc, uint8_t byte) {
 #undef TP_TABLE
 }
 
-/** CRC-32C of n bytes, as the packet carries it. */
+/** CRC-32C of n bytes, as sent in the packet. */
 static inline uint32_t tp_crc(const uint8_t *bytes, size_t n) {
   uint32_t crc = TP_CRC_SEED;
   size_t i;
@@ -170,16 +170,16 @@ static inline uint32_t tp_crc(const uint8_t *bytes, size_t n) {
 
 /* ---- Writer ------------------------------------------------------------------------------------ */
 
-/** A packet in the making: plain (for CAN) or as the COBS frame of a serial line. */
+/** A packet being written: plain (for CAN) or as the COBS frame of a serial line. */
 struct tp_writer {
   uint8_t *out;
   uint16_t capacity;
   uint16_t size;
-  uint16_t code_at; /* where the code of the present COBS block belongs */
-  uint16_t due;     /* payload bytes that are still to come */
+  uint16_t code_at; /* where the code of the current COBS block goes */
+  uint16_t due;     /* payload bytes still to be written */
   uint32_t crc;
   bool stuffed;
-  bool failed; /* no room, or another length than was said */
+  bool failed; /* no room, or not the announced length */
 };
 
 static inline void tp_store_(struct tp_writer *w, uint8_t byte) {
@@ -195,7 +195,7 @@ static inline void tp_stuff_(struct tp_writer *w, uint8_t byte) {
     tp_store_(w, byte);
     return;
   }
-  if (w->size - w->code_at == 255 && !w->failed) { /* full: a block that stands for no zero */
+  if (w->size - w->code_at == 255 && !w->failed) { /* full block: no zero follows it */
     w->out[w->code_at] = 255;
     w->code_at = w->size;
     tp_store_(w, 0);
@@ -238,7 +238,10 @@ static inline void tp_bytes(struct tp_writer *w, const void *bytes, uint16_t n) 
   while (n-- != 0) tp_u8(w, *at++);
 }
 
-/** A name: at most 15 characters of `text`, then zeros. What is not printable ASCII becomes '?'. */
+/**
+ * Write a name: at most 15 characters of `text`, then zeros. Replaces all but printable ASCII by
+ * '?'.
+ */
 static inline void tp_name(struct tp_writer *w, const char *text) {
   uint8_t i;
   for (i = 0; i < TP_NAME; i++) {
@@ -249,8 +252,8 @@ static inline void tp_name(struct tp_writer *w, const char *text) {
 }
 
 /**
- * Begin a packet of `length` payload bytes from (or to) `board` in `out`. `stuffed`: as the frame of
- * a serial line, for which `board` is 0; else plain, for `tp_can_frame`.
+ * Begin a packet of `length` payload bytes from (or to) `board` in `out`. `stuffed`: as a frame for
+ * a serial line, with `board` 0; otherwise plain, for `tp_can_segment`.
  */
 static inline void tp_begin(struct tp_writer *w, uint8_t *out, uint16_t capacity, uint8_t type,
                             uint8_t board, uint16_t length, bool stuffed) {
@@ -269,7 +272,9 @@ static inline void tp_begin(struct tp_writer *w, uint8_t *out, uint16_t capacity
   w->due = length;
 }
 
-/** End the packet: its size in bytes, 0 when it had no room or the payload another length. */
+/**
+ * End the packet and return its size in bytes; 0 if it had no room or its payload another length.
+ */
 static inline uint16_t tp_end(struct tp_writer *w) {
   uint32_t crc = w->crc ^ 0xFFFFFFFFUL;
   uint8_t i;
@@ -291,10 +296,10 @@ struct tp_descriptor {
   uint8_t minor;
   uint8_t unique_id[8];
   char model[TP_NAME];
-  char firmware[TP_NAME]; /* from here on only where major is TP_MAJOR */
+  char firmware[TP_NAME]; /* this and the rest only if major is TP_MAJOR */
   uint32_t tick_hz;
   uint32_t max_rate_mhz;
-  uint8_t count; /* arrays: each is read by tp_get_array */
+  uint8_t count; /* number of arrays; read each with tp_get_array */
   uint8_t stride_bytes;
 };
 
@@ -309,7 +314,7 @@ struct tp_array {
   char name[TP_NAME];
 };
 
-/** Head of Samples; field and status of a taxel are read by tp_get_taxel. */
+/** Head of Samples; tp_get_taxel reads the field and status of a taxel. */
 struct tp_samples {
   uint8_t array;
   uint8_t taxels;
@@ -346,7 +351,7 @@ struct tp_log {
   uint8_t level;
   uint8_t size_bytes;
   uint32_t ticks;
-  const uint8_t *text; /* not ended by a zero; what is not printable is the reader's to replace */
+  const uint8_t *text; /* without an ending zero; may hold characters that are not printable */
 };
 
 struct tp_ack {
@@ -375,7 +380,7 @@ struct tp_set_gain {
   uint8_t filter;
 };
 
-/** Fields 0 to 51 of a Descriptor; `tp_put_array` for each array must follow. */
+/** Write bytes 0 to 51 of a Descriptor; `tp_put_array` for each array must follow. */
 static inline void tp_put_descriptor(struct tp_writer *w, const struct tp_descriptor *m) {
   tp_u8(w, m->major);
   tp_u8(w, m->minor);
@@ -399,7 +404,10 @@ static inline void tp_put_array(struct tp_writer *w, const struct tp_array *m) {
   tp_name(w, m->name);
 }
 
-/** Fields 0 to 11 of Samples; x, y, z of every taxel, then the status of every taxel must follow. */
+/**
+ * Write bytes 0 to 11 of Samples; x, y, z of every taxel, then the status of every taxel, must
+ * follow.
+ */
 static inline void tp_put_samples(struct tp_writer *w, const struct tp_samples *m) {
   tp_u8(w, m->array);
   tp_u8(w, m->taxels);
@@ -426,7 +434,7 @@ static inline void tp_put_clock_reply(struct tp_writer *w, uint32_t token, uint3
   tp_u32(w, ticks_sent);
 }
 
-/** Fields 0 to 5 of Log; its text must follow. */
+/** Write bytes 0 to 5 of a Log; its text must follow. */
 static inline void tp_put_log(struct tp_writer *w, uint8_t level, uint8_t size_bytes,
                               uint32_t ticks) {
   tp_u8(w, level);
@@ -461,8 +469,8 @@ static inline void tp_put_set_gain(struct tp_writer *w, const struct tp_set_gain
   tp_u8(w, m->filter);
 }
 
-/* Readers: `p` is the payload, `n` its length. TP_PACKET, or why it is refused. Bytes after the
- * fields of version 1.0 belong to a newer minor version and are passed over. */
+/* Readers: `p` is the payload, `n` its length. They return TP_PACKET or the reason for rejection.
+ * Bytes after the fields of version 1.0 belong to a newer minor version and are ignored. */
 
 static inline bool tp_get_name_(const uint8_t *at, char *name) {
   bool ended = false;
@@ -478,7 +486,7 @@ static inline bool tp_get_name_(const uint8_t *at, char *name) {
   return ended;
 }
 
-/** Entry `i` of a Descriptor; TP_BAD_VALUE for one that section 4 excludes. */
+/** Read entry `i` of a Descriptor; TP_BAD_VALUE if section 4 excludes it. */
 static inline enum tp_event tp_get_array(const uint8_t *p, uint16_t n, uint8_t i,
                                          struct tp_array *m) {
   uint16_t from;
@@ -503,8 +511,8 @@ static inline enum tp_event tp_get_array(const uint8_t *p, uint16_t n, uint8_t i
 }
 
 /**
- * Descriptor with all its entries checked. Of another major version only the fields 0 to 25 are
- * read; `count` is 0 then.
+ * Read a Descriptor and check all its entries. If the major version differs, only bytes 0 to 25 are
+ * read and `count` is 0.
  */
 static inline enum tp_event tp_get_descriptor(const uint8_t *p, uint16_t n,
                                               struct tp_descriptor *m) {
@@ -551,7 +559,7 @@ static inline enum tp_event tp_get_samples(const uint8_t *p, uint16_t n, struct 
   return (n < TP_SAMPLES_BYTES((uint16_t)m->taxels)) ? TP_SHORT_PAYLOAD : TP_PACKET;
 }
 
-/** Taxel `i` of Samples that tp_get_samples has taken. */
+/** Read taxel `i` of Samples that tp_get_samples has accepted. */
 static inline struct tp_taxel tp_get_taxel(const uint8_t *p, uint8_t i) {
   const uint8_t *at = p + 12U + 6U * (uint16_t)i;
   struct tp_taxel taxel;
@@ -610,7 +618,10 @@ static inline enum tp_event tp_get_identify(const uint8_t *p, uint16_t n, struct
   return TP_PACKET;
 }
 
-/** Request number of any command but the clock poll; all there is of Start, Stop and Reboot. */
+/**
+ * Read the request number of any command except Clock poll; Start, Stop and Reboot hold nothing
+ * else.
+ */
 static inline enum tp_event tp_get_request(const uint8_t *p, uint16_t n, uint16_t *request) {
   if (n < TP_REQUEST_BYTES) return TP_SHORT_PAYLOAD;
   *request = tp_get_u16(p);
@@ -645,18 +656,19 @@ static inline bool tp_is_known(uint8_t type) {
   return (type >= TP_DESCRIPTOR && type <= TP_ACK) || (type >= TP_IDENTIFY && type <= TP_REBOOT);
 }
 
-/* ---- What receivers hold of a packet ------------------------------------------------------------- */
+/* ---- Received packets
+ * ---------------------------------------------------------------------------- */
 
-/** The first `hold` bytes of a packet, plain; the rest is checked and counted, and not kept. */
+/** The first `hold` bytes of a packet, plain; the rest is checked and counted but not kept. */
 struct tp_packet {
   uint8_t *bytes; /* header and payload */
-  uint16_t hold;  /* bytes of memory there, TP_HEADER or more */
-  uint16_t size;  /* bytes that came, crc included */
+  uint16_t hold;  /* size of that memory, at least TP_HEADER */
+  uint16_t size;  /* bytes received, including the crc */
 };
 
 static inline const uint8_t *tp_payload(const struct tp_packet *p) { return p->bytes + TP_HEADER; }
 
-/** Payload bytes that may be read: all that came, as far as they are held. */
+/** Number of readable payload bytes: those received and held. */
 static inline uint16_t tp_payload_size(const struct tp_packet *p) {
   uint16_t came = (uint16_t)(p->size - TP_OVERHEAD);
   uint16_t room = (uint16_t)(p->hold - TP_HEADER);
@@ -673,9 +685,9 @@ struct tp_serial_rx {
   struct tp_packet packet;
   uint32_t crc;
   uint16_t raw;    /* bytes since the last zero */
-  uint8_t code;    /* of the present block; 0 before the first */
-  uint8_t left;    /* bytes of it that are still to come */
-  bool discarding; /* too long: up to the next zero */
+  uint8_t code;    /* of the current block; 0 before the first */
+  uint8_t left;    /* bytes of it still to be received */
+  bool discarding; /* frame too long: skip to the next zero */
 };
 
 static inline void tp_serial_clear_(struct tp_serial_rx *rx) {
@@ -686,7 +698,9 @@ static inline void tp_serial_clear_(struct tp_serial_rx *rx) {
   rx->discarding = false;
 }
 
-/** Begin anew with `hold` bytes of memory, TP_HEADER at least; what comes beyond is not kept. */
+/**
+ * Reset the receiver with `hold` bytes of memory, at least TP_HEADER; further bytes are not kept.
+ */
 static inline void tp_serial_reset(struct tp_serial_rx *rx, uint8_t *memory, uint16_t hold) {
   rx->packet.bytes = memory;
   rx->packet.hold = hold;
@@ -700,13 +714,13 @@ static inline void tp_serial_take_(struct tp_serial_rx *rx, uint8_t byte) {
 }
 
 /**
- * One byte of the line. TP_PACKET: `rx->packet` is whole and right, until the next push. Anything
- * from TP_COBS on was refused; the next frame decodes.
+ * Process one byte of the line. TP_PACKET: `rx->packet` is complete and correct, until the next
+ * push. TP_COBS and later: something was rejected; the next frame is decoded again.
  */
 static inline enum tp_event tp_serial_push(struct tp_serial_rx *rx, uint8_t byte) {
   enum tp_event said;
   if (rx->raw == 0 && rx->code == 0 && !rx->discarding) {
-    tp_serial_clear_(rx); /* whatever was handed out before */
+    tp_serial_clear_(rx); /* discard the packet returned before */
   }
   if (byte == 0) {
     if (rx->discarding) {
@@ -752,7 +766,7 @@ static inline enum tp_event tp_serial_push(struct tp_serial_rx *rx, uint8_t byte
 /* ---- CAN 2.0B and CAN FD ------------------------------------------------------------------------------ */
 
 #ifndef TP_CAN_BYTES
-#define TP_CAN_BYTES 64 /* 8: for controllers without CAN FD, less memory */
+#define TP_CAN_BYTES 64 /* 8: for controllers without CAN FD, to save memory */
 #endif
 
 #define TP_CAN_MARK 0x2A5UL
@@ -760,7 +774,7 @@ static inline enum tp_event tp_serial_push(struct tp_serial_rx *rx, uint8_t byte
 #define TP_CAN_END 0x40
 #define TP_CAN_TOGGLE 0x20
 #define TP_CAN_ID 0x1F
-#define TP_CAN_PADDING 15 /* most bytes that CAN FD fills a frame up with */
+#define TP_CAN_PADDING 15 /* most padding bytes of a CAN FD frame */
 
 /** A data frame with a 29-bit identifier. */
 struct tp_can_frame {
@@ -779,21 +793,21 @@ static inline uint32_t tp_can_identifier(uint8_t type, uint8_t board) {
   return priority << 26 | TP_CAN_MARK << 16 | (uint32_t)type << 8 | board;
 }
 
-/** Whether the identifier has the mark of this protocol; frames without it are somebody else's. */
+/** Whether the identifier has the mark of this protocol; other frames belong to others. */
 static inline bool tp_can_is_ours(uint32_t identifier) {
   return (identifier >> 16 & 0x3FFUL) == TP_CAN_MARK && (identifier & 0x80UL) == 0 &&
          identifier >> 29 == 0;
 }
 
-/** Frames that a packet of `size` bytes takes. */
+/** Number of frames for a packet of `size` bytes. */
 static inline uint16_t tp_can_frames(uint16_t size, bool fd) {
   uint16_t step = fd ? 63 : 7;
   return (uint16_t)((size + step - 1) / step);
 }
 
 /**
- * Frame number `k` (from 0) of the transfer of a plain packet. `transfer`: 0 to 31, one more for
- * each transfer of the same type to or from the same board.
+ * Make frame number `k` (from 0) of the transfer of a plain packet. `transfer`: 0 to 31,
+ * incremented for each transfer of the same type to or from the same board.
  */
 static inline void tp_can_segment(const uint8_t *packet, uint16_t size, uint16_t k, bool fd,
                                   uint8_t transfer, struct tp_can_frame *frame) {
@@ -808,7 +822,7 @@ static inline void tp_can_segment(const uint8_t *packet, uint16_t size, uint16_t
   if (k == 0) tail |= TP_CAN_START;
   if (from + part == size) {
     tail |= TP_CAN_END;
-    if (frame->fd) { /* up to the next length that CAN FD has: 8, 12, 16, 20, 24, 32, 48, 64 */
+    if (frame->fd) { /* pad to the next CAN FD length: 8, 12, 16, 20, 24, 32, 48, 64 */
       uint8_t full = (uint8_t)((part < 24) ? (part + 4) / 4 * 4 : (part < 32) ? 32 : (part < 48) ? 48 : 64);
       if (part < 8) full = (uint8_t)(part + 1);
       while (part < full - 1) frame->data[part++] = 0;
@@ -818,34 +832,34 @@ static inline void tp_can_segment(const uint8_t *packet, uint16_t size, uint16_t
   frame->size = (uint8_t)(part + 1);
 }
 
-/** What came so far of one transfer of one type from or to one board. */
+/** Received part of one transfer of one type from or to one board. */
 struct tp_can_slot {
   struct tp_packet packet;
   uint32_t crc;
   uint16_t key;  /* type and board of the identifier */
   uint16_t age;  /* when it was last used */
   bool used;
-  bool open;     /* a transfer is under way */
+  bool open;     /* a transfer is in progress */
   bool fd;
-  uint8_t expected; /* tail of the next frame, its end bit apart */
+  uint8_t expected; /* tail of the next frame without its end bit */
   uint8_t last_size;
-  uint8_t last[TP_CAN_BYTES]; /* frame before this one, to tell a repetition */
+  uint8_t last[TP_CAN_BYTES]; /* previous frame, to detect a repetition */
 };
 
 struct tp_can_rx {
   struct tp_can_slot *slots;
   uint8_t count;
   uint16_t clock;
-  uint32_t interrupted;    /* unfinished transfers dropped by the next start, or for their slot */
-  struct tp_packet packet; /* after TP_PACKET: what came, until the next push */
+  uint32_t interrupted;    /* unfinished transfers dropped for a new start or to free their slot */
+  struct tp_packet packet; /* after TP_PACKET: the packet, until the next push */
   uint8_t unknown_type;    /* after TP_UNKNOWN_TYPE */
   uint16_t unknown_request;
 };
 
 /**
- * Begin anew with `count` slots and `hold` bytes of memory for each (`count` * `hold` in all). A
- * slot serves one type of one board at a time; when all are taken the one used longest ago gives
- * way, and its unfinished transfer with it.
+ * Reset the receiver with `count` slots and `hold` bytes of memory for each (`count` * `hold` in
+ * all). A slot serves one type of one board at a time. When all are taken, the least recently used
+ * one is reused and its unfinished transfer dropped.
  */
 static inline void tp_can_reset(struct tp_can_rx *rx, struct tp_can_slot *slots, uint8_t count,
                                 uint8_t *memory, uint16_t hold) {
@@ -869,7 +883,9 @@ static inline void tp_can_reset(struct tp_can_rx *rx, struct tp_can_slot *slots,
   }
 }
 
-/** Slot of `key`; NULL: there is none, and a frame that starts nothing takes none from another. */
+/**
+ * Slot of `key`. NULL if there is none: a frame that is not a start does not displace another slot.
+ */
 static inline struct tp_can_slot *tp_can_slot_(struct tp_can_rx *rx, uint16_t key, bool start) {
   struct tp_can_slot *oldest = rx->slots;
   uint8_t i;
@@ -914,15 +930,15 @@ static inline void tp_can_take_(struct tp_can_slot *slot, uint8_t byte) {
   struct tp_packet *p = &slot->packet;
   uint16_t at = p->size++;
   if (at < p->hold) p->bytes[at] = byte;
-  /* What CAN FD is filled up with is not part of the packet, whose length says where it ends. */
+  /* Padding of CAN FD is not part of the packet, whose length field tells where it ends. */
   if (at < TP_HEADER || at - TP_OVERHEAD < (int32_t)tp_get_u16(p->bytes + 2)) {
     slot->crc = tp_crc_step(slot->crc, byte);
   }
 }
 
 /**
- * One frame of the bus. TP_PACKET: `rx->packet` is whole and right, until the next push.
- * TP_UNKNOWN_TYPE: once for each such transfer; a board answers `unknown_request` with a refusal.
+ * Process one frame of the bus. TP_PACKET: `rx->packet` is complete and correct, until the next
+ * push. TP_UNKNOWN_TYPE: once per such transfer; a board answers `unknown_request` with a refusal.
  */
 static inline enum tp_event tp_can_push(struct tp_can_rx *rx, const struct tp_can_frame *frame) {
   uint8_t full = (uint8_t)(frame->fd ? 64 : 8);

@@ -1,10 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /**
- * The headers as a shared library, for tests in another language: codec, receivers, the reference
- * board on a line and a clock that the caller moves, and a bus of modelled chips.
+ * The headers as a shared library, for tests in Python: codec, receivers, the reference board with
+ * a line and a clock set by the caller, and a bus of modelled chips.
  *
- * Numbers of a message travel as int64_t `v`, names and texts as bytes `blob`, in the order of its
- * fields.
+ * The numbers of a message are passed as int64_t `v`, names and texts as bytes `blob`, in the order
+ * of its fields.
  */
 #include <stdlib.h>
 #include <string.h>
@@ -285,7 +285,8 @@ int bridge_decode(int type, const uint8_t *p, int size, int64_t *v, uint8_t *blo
   }
 }
 
-/* ---- Receivers: packets come out one after another, each behind its size in two bytes ------------ */
+/* ---- Receivers: packets are returned one after another, each preceded by its size in two bytes
+ * --- */
 
 struct receiver {
   struct tp_serial_rx serial;
@@ -324,7 +325,7 @@ void bridge_receiver_free(struct receiver *r) {
   free(r);
 }
 
-/** Count what came, and append a whole packet, as far as it was held, to `out`. */
+/** Count the event, and append a whole packet, as far as it was held, to `out`. */
 static int told(enum tp_event said, const struct tp_packet *p, uint32_t *counts, uint8_t *out) {
   int64_t v[600];
   uint8_t blob[320];
@@ -381,7 +382,7 @@ int bridge_segment(const uint8_t *packet, int size, int k, int fd, int transfer,
 struct bench {
   struct reference reference;
   uint32_t now_us;
-  uint32_t room;       /* bytes (frames) that the line takes yet */
+  uint32_t room;       /* bytes (frames) that the line still takes */
   uint8_t *in;
   size_t in_size;
   size_t in_at;
@@ -484,7 +485,10 @@ void bench_free(struct bench *t) {
   free(t);
 }
 
-/** Poll once at `now_us` with `n` more bytes from the host and `room` on the line; bytes said. */
+/**
+ * Poll once at `now_us` with `n` more bytes from the host and `room` on the line; returns bytes
+ * sent.
+ */
 int bench_poll(struct bench *t, uint32_t now_us, uint32_t room, const uint8_t *in, int n,
                uint8_t *out) {
   int said;
@@ -530,7 +534,8 @@ void bench_counters(struct bench *t, uint32_t *v) {
   v[6] = (uint32_t)sizeof(struct board);
 }
 
-/* ---- One bus of modelled chips under the driver ------------------------------------------------------- */
+/* ---- A bus of modelled chips for the driver
+ * ------------------------------------------------------ */
 
 struct rig {
   struct model_bus model;
@@ -598,7 +603,10 @@ void rig_field(struct rig *r, const int32_t *nt, int cc) {
   r->cc = (int16_t)cc;
 }
 
-/** One cycle: convert, wait, read. v: x, y, z, status of each chip, then temperature; 1 if ready. */
+/**
+ * One cycle: convert, wait, read. v: x, y, z, status of each chip, then temperature; returns 1 if
+ * ready.
+ */
 int rig_cycle(struct rig *r, uint32_t wait_us, int64_t *v) {
   struct tp_taxel taxels[8];
   int16_t cc = -32768;
@@ -640,7 +648,7 @@ int rig_register(struct rig *r, int chip, int number) { return r->modelled[chip]
 
 void rig_flip(struct rig *r, int flipped) { r->array.flipped = flipped != 0; }
 
-/** Burst: every `step_us` try to read; v: the result of each try (enum mlx_result). */
+/** Burst: try to read every `step_us`; v: the result of each try (enum mlx_result). */
 int rig_burst(struct rig *r, int chip, int interval, uint32_t step_us, int steps, int64_t *v) {
   struct mlx_chip *c = &r->chips[chip];
   enum mlx_result said = MLX_OK;

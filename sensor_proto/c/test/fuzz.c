@@ -1,11 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /**
- * libFuzzer's way into receivers, readers and the reference board:
+ * libFuzzer entry point for receivers, readers and the reference board:
  *
  *     clang -std=c99 -g -O1 -fsanitize=fuzzer,address,undefined -o fuzz test/fuzz.c
  *     ./fuzz -runs=1000000 -max_len=2048
  *
- * The first byte chooses a serial line, a CAN bus, or the readers of payloads alone.
+ * The first byte selects a serial line, a CAN bus, or the payload readers alone.
  */
 #include <stdlib.h>
 #include <string.h>
@@ -42,7 +42,7 @@ static size_t get(void *self, uint8_t *bytes, size_t count) {
 
 static void reboot(void *self) { (void)reference_begin((struct reference *)self, TP_BY_COMMAND); }
 
-/** Every reader on its own copy, so that a byte too far is seen. */
+/** Every reader gets its own copy, so that reading beyond the end is detected. */
 static void read_payload(uint8_t type, const uint8_t *p, uint16_t n) {
   uint8_t *copy = (uint8_t *)malloc(n != 0 ? n : 1);
   struct tp_descriptor descriptor;
@@ -137,7 +137,7 @@ static void on_a_bus(const uint8_t *data, size_t size) {
   }
 }
 
-/** Give packets a right CRC, so that the fuzzer comes past it. */
+/** Give packets a correct CRC, so that the fuzzer gets past the check. */
 static void with_right_crcs(const uint8_t *data, size_t size) {
   uint8_t line[4096];
   uint16_t at = 0;

@@ -1,14 +1,14 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /**
- * MLX90393 chips at the level of their registers, to run firmware against without hardware.
+ * Register-level model of MLX90393 chips, to run firmware without hardware.
  *
- * Each chip has its 64 registers, the commands EX, SB, SM, RM, RR, WR and RT, the status byte, the
- * data-ready pin, conversions that take their time by an oscillator that may be wrong, and 16-bit
- * outputs that wrap as the chip's do. Faults: no answer, a bus held down, a chip that resets by
- * itself. Field and temperature come from the caller.
+ * Each chip has its registers, the commands EX, SB, SM, RM, RR, WR and RT, the status byte, the
+ * data-ready pin, conversions timed by an oscillator that may be off, and 16-bit outputs that wrap
+ * as the chip's do. Faults: no answer, a blocked bus, a chip that resets by itself. The caller
+ * supplies field and temperature.
  *
- * Taken from the datasheet; where that is silent (RM before the end of a conversion) the model
- * sets the error bit, as users of the chip report.
+ * Based on the datasheet. Where that is silent (RM before the end of a conversion), the model sets
+ * the error bit, as users of the chip report.
  */
 #ifndef MLX90393_MODEL_H
 #define MLX90393_MODEL_H
@@ -18,14 +18,14 @@
 struct model_chip {
   uint8_t address;
   bool dead;          /* does not answer */
-  bool holds_bus;     /* holds SDA down until the bus is freed */
+  bool holds_bus;     /* holds SDA low until the bus is freed */
   uint16_t registers[10];
   uint8_t mode;       /* 0 idle, MLX_STATUS_BURST or MLX_STATUS_SINGLE */
   bool ready;
-  bool was_reset;     /* told once by the next status byte */
+  bool was_reset;     /* reported once in the next status byte */
   bool resetting;
-  int8_t slow_percent; /* error of the oscillator: its conversions take that much longer */
-  uint32_t since_us;  /* beginning of the conversion, or of the reset */
+  int8_t slow_percent; /* error of the oscillator: conversions take that much longer */
+  uint32_t since_us;  /* start of the conversion or of the reset */
   uint16_t raw[4];    /* temperature, x, y, z */
 };
 
@@ -60,7 +60,7 @@ static inline void model_power_on(struct model_chip *c) {
   c->resetting = false;
 }
 
-/** Make chip `c`, number `address` of its bus, as after power-on. */
+/** Initialise chip `c` with address `address`, as after power-on. */
 static inline void model_make(struct model_chip *c, uint8_t address) {
   c->address = address;
   c->dead = c->holds_bus = false;
@@ -74,7 +74,7 @@ static inline uint32_t model_conversion_us_(const struct model_chip *c) {
   return (uint32_t)((int32_t)mlx_conversion_us(&s) / 100 * (100 + c->slow_percent));
 }
 
-/** Round to nearest, and keep 16 bits as the chip does. */
+/** Round to nearest and keep 16 bits, as the chip does. */
 static inline uint16_t model_count_(int32_t nt, uint32_t lsb_nt, uint8_t resolution) {
   int32_t lsb = (int32_t)lsb_nt;
   int32_t count = (nt >= 0) ? (nt + lsb / 2) / lsb : -((-nt + lsb / 2) / lsb);
@@ -90,7 +90,7 @@ static inline uint16_t model_count_(int32_t nt, uint32_t lsb_nt, uint8_t resolut
   return (uint16_t)((uint32_t)count & 0xFFFFUL);
 }
 
-/** Let chip number `i` do what it has done by now. */
+/** Advance chip number `i` to the current time. */
 static inline void model_advance_(struct model_bus *bus, uint8_t i) {
   struct model_chip *c = &bus->chips[i];
   uint32_t now = bus->micros(bus->self);
@@ -103,7 +103,7 @@ static inline void model_advance_(struct model_bus *bus, uint8_t i) {
   uint8_t k;
   if (c->resetting && now - c->since_us >= 1500) model_power_on(c);
   if (c->resetting || c->mode == 0) return;
-  if ((int32_t)(now - c->since_us) < (int32_t)took) return; /* a burst's next one may lie ahead */
+  if ((int32_t)(now - c->since_us) < (int32_t)took) return; /* a burst may have a start ahead */
   s = model_setting_(c);
   if (c->mode == MLX_STATUS_BURST) {
     if ((c->registers[1] & 63U) != 0) period = 20000UL * (c->registers[1] & 63U);
@@ -114,7 +114,7 @@ static inline void model_advance_(struct model_bus *bus, uint8_t i) {
   }
   mlx_scales(&s, &lsb[0], &lsb[1]);
   axis = (uint32_t)(2U + (1U << s.filter)) * 64U << s.oversampling;
-  for (k = 0; k < 3; k++) { /* x, y, z one after another, z at the end */
+  for (k = 0; k < 3; k++) { /* x, y, z are converted one after another, z last */
     int32_t nt[3];
     bus->field(bus->self, i, c->since_us + took - (2U - k) * axis, nt, &cc);
     c->raw[1 + k] = model_count_(nt[k], lsb[k == 2], s.resolution);
@@ -152,7 +152,7 @@ static inline enum mlx_result model_transfer(void *self, uint8_t address, const 
     }
   }
   if (c == NULL || c->dead || c->resetting) {
-    for (i = 0; i < in_count; i++) in[i] = 0xFF; /* what an SPI master reads of an open line */
+    for (i = 0; i < in_count; i++) in[i] = 0xFF; /* what an SPI master reads from an open line */
     return bus->spi ? MLX_OK : MLX_NACK;
   }
   for (i = 0; i < in_count; i++) in[i] = 0;
@@ -206,7 +206,7 @@ static inline enum mlx_result model_transfer(void *self, uint8_t address, const 
   return MLX_OK;
 }
 
-/** `recover` of a `struct mlx_bus`: whoever held the bus lets go. */
+/** `recover` of a `struct mlx_bus`: every chip releases the bus. */
 static inline void model_recover(void *self) {
   struct model_bus *bus = (struct model_bus *)self;
   uint8_t i;

@@ -1,11 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /**
- * The reference board: board.h, the driver of mlx90393.h, and modelled chips in place of real ones.
- * Host, QEMU and AVR builds give it a line and a clock.
+ * The reference board: board.h, the driver of mlx90393.h, and modelled chips instead of real ones.
+ * The host, QEMU and AVR builds provide a line and a clock.
  *
- * Its skin: one array of five chips that somebody presses every four seconds. With REFERENCE_TABLE
- * set to the name of a header that `field_table.py` wrote, it is a skin of the simulator instead,
- * whose forces are known.
+ * Its skin is one array of five chips, pressed every four seconds. If REFERENCE_TABLE names a
+ * header written by `field_table.py`, it is a skin of the simulator with known forces instead.
  */
 #ifndef REFERENCE_BOARD_H
 #define REFERENCE_BOARD_H
@@ -27,7 +26,7 @@
 #include "mlx90393_model.h"
 
 #ifndef REFERENCE_BUS_US
-#define REFERENCE_BUS_US 400 /* to start and read all chips */
+#define REFERENCE_BUS_US 400 /* time to start and read all chips */
 #endif
 
 #ifdef REFERENCE_TABLE
@@ -48,11 +47,11 @@ struct reference {
   struct model_bus model;
   struct model_chip modelled[REFERENCE_CHIPS];
   uint32_t noise;
-  void *self; /* of the platform's functions */
+  void *self; /* for the platform's functions */
   uint32_t (*micros)(void *self);
 };
 
-/** About normal, in nT: the sum of four evenly spread numbers; sigma is 3.7 uT. */
+/** Approximately normal noise in nT: the sum of four uniform numbers; sigma is 3.7 uT. */
 static inline int32_t reference_noise_(struct reference *r) {
   uint32_t n = r->noise;
   n ^= n << 13;
@@ -79,7 +78,7 @@ static inline void reference_field_(void *self, uint8_t chip, uint32_t us, int32
     nt[k] = from + (to - from) / REFERENCE_FRAME_MS * after;
   }
 #else
-  /* Up to 5 N on the middle chip, a second up and a second down in four. */
+  /* Up to 5 N on the middle chip: of four seconds, one rising and one falling. */
   uint32_t ms = us / 1000 % 4000;
   int32_t press = (int32_t)((ms < 2000) ? 0 : (ms < 3000) ? ms - 2000 : 4000 - ms);
   *temperature_cc = 2710;
@@ -123,7 +122,7 @@ static inline enum tp_answer reference_set_gain_(void *self, uint8_t array,
   setting.filter = codes->filter;
   for (i = 0; i < REFERENCE_ARRAYS; i++) {
     if (array == i || array == BOARD_ALL_ARRAYS) {
-      /* What is refused is refused by the first: codes and rate are the same for all. */
+      /* The first array refuses if any does: codes and rate are the same for all. */
       enum tp_answer said = mlx_array_set(&r->arrays[i], &setting, rate_mhz, REFERENCE_BUS_US);
       if (said != TP_OK) return said;
     }
@@ -144,7 +143,9 @@ static inline uint32_t reference_scales_(void *self, uint8_t array, uint32_t *ls
   return slowest;
 }
 
-/** Power on, or after a reset of cause `cause`. The platform has filled `port` and `micros` in. */
+/**
+ * Start at power-on or after a reset with cause `cause`. The platform has set `port` and `micros`.
+ */
 static inline bool reference_begin(struct reference *r, uint8_t cause) {
   static const struct mlx_setting setting = {4, 0, 0, 3};
   uint8_t first = 0;
@@ -162,7 +163,7 @@ static inline bool reference_begin(struct reference *r, uint8_t cause) {
   r->port.sample = reference_sample_;
   r->port.set_gain = reference_set_gain_;
   r->port.scales = reference_scales_;
-  if (cause != TP_BY_COMMAND) { /* the chips do not know of a reset of the microcontroller */
+  if (cause != TP_BY_COMMAND) { /* a reset of the microcontroller does not reset the chips */
     r->noise = 2463534242UL;
     r->model.chips = r->modelled;
     r->model.count = REFERENCE_CHIPS;

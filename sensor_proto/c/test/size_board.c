@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* A board of five taxels whose port does nothing: linked to see what board.h takes. */
+/* A board of five taxels whose port does nothing: linked to measure the size of board.h. */
 #define BOARD_MAX_TAXELS 5
 #ifdef SIZE_CAN
 #define BOARD_CAN 1

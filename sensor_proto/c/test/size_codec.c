@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* A receiver of commands and a writer of acks: linked to see what the bare codec takes. */
+/* A receiver of commands and a writer of acks: linked to measure the size of the bare codec. */
 #include "tactile_proto.h"
 
 #define size_register (*(volatile uint8_t *)0x44)

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* A board of five MLX90393 on a bus that does nothing: linked to see what board and driver take. */
+/* A board of five MLX90393 on a bus that does nothing: linked to measure board and driver. */
 #define BOARD_MAX_TAXELS 5
 #include "board.h"
 #include "mlx90393.h"

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The fuzzer's ways in with inputs of a fixed seed, for machines without libFuzzer. */
+/* Runs the fuzzer's entry point on inputs from a fixed seed, for machines without libFuzzer. */
 #include "fuzz.c"
 
 int main(void) {
@@ -17,7 +17,7 @@ int main(void) {
       n ^= n << 13;
       n ^= n >> 17;
       n ^= n << 5;
-      /* Types and small lengths more often than chance would have them. */
+      /* Make types and small lengths more frequent than by chance. */
       input[i] = (uint8_t)((n & 0x700U) == 0 ? 0x81U + (n & 7U) : (n & 0x800U) ? n & 15U : n);
     }
     input[0] = (uint8_t)(round & 3);

@@ -5,16 +5,16 @@
 #define BOARD_MAX_TAXELS 4
 #include <board.h>
 
-static const uint8_t uniqueId[8] = {1, 2, 3, 4, 5, 6, 7, 8};  // another on every board you make
+static const uint8_t uniqueId[8] = {1, 2, 3, 4, 5, 6, 7, 8};  // different on every board you make
 
 static const board_array arrays[] = {
-    // name, chip, rows, columns, pitch in um, nT a count of x and y, nT a count of z
+    // name, chip, rows, columns, pitch in um, nT per count of x and y, nT per count of z
     {"pad", 0, 2, 2, 8000, 1000, 1000},
 };
 
 static const board_config config = {
     uniqueId, "four-taxels", "1.0", arrays, 1,
-    1000000,  // ticks a second: micros()
+    1000000,  // ticks per second: micros()
     200000,   // highest rate, mHz
     100000,   // rate after a reset, mHz
 };
@@ -48,7 +48,7 @@ static board theBoard;
 static const board_port port = {nullptr, writeBytes, readBytes, ticks, sample,
                                 nullptr, nullptr,    nullptr,   reboot};
 
-// Where the microcontroller can reset itself, do that instead.
+// If the microcontroller can reset itself, do that instead.
 static void reboot(void *) { (void)board_begin(&theBoard, &config, &port, TP_BY_COMMAND); }
 
 void setup() {

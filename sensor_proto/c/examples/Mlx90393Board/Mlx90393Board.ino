@@ -1,6 +1,5 @@
-// SPDX-License-Identifier: Apache-2.0
-// Five MLX90393 on I2C (addresses 0C to 10 hex), as on AnySkin boards, with a checked protocol, device
-// time, gain and rate that the host sets. Untried on silicon.
+// Five MLX90393 on I2C (addresses 0C to 10 hex), as on AnySkin boards, but with checked frames,
+// device time, and gain and rate set by the host. Untried on silicon.
 //
 // Then, on the host:   tactile board-check --port /dev/ttyACM0
 #include <Wire.h>
@@ -9,9 +8,9 @@
 #include <board.h>
 #include <mlx90393.h>
 
-static const uint32_t BUS_US = 2500;  // to start and read five chips at 400 kHz
+static const uint32_t BUS_US = 2500;  // time to start and read five chips at 400 kHz
 
-static const uint8_t uniqueId[8] = {1, 2, 3, 4, 5, 6, 7, 9};  // another on every board you make
+static const uint8_t uniqueId[8] = {1, 2, 3, 4, 5, 6, 7, 9};  // different on every board you make
 static const board_array arrays[] = {{"pad", 1, 1, 5, 8000, 300, 484}};
 static const board_config config = {uniqueId, "five-chips", "1.0", arrays, 1, 1000000, 150000, 100000};
 
@@ -73,7 +72,7 @@ static void begin(uint8_t cause) {
   (void)board_begin(&theBoard, &config, &port, cause);
 }
 
-// Where the microcontroller can reset itself, do that instead.
+// If the microcontroller can reset itself, do that instead.
 static void reboot(void *) { begin(TP_BY_COMMAND); }
 
 void setup() {

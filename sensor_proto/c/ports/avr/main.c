@@ -4,8 +4,8 @@
  *
  *     avr-gcc -std=c99 -mmcu=atmega328p -DF_CPU=16000000UL -Os -o board.elf ports/avr/main.c
  *
- * Timer 1 runs freely at 2 MHz; ticks are us. Bytes of the host are taken by an interrupt, for the
- * UART holds two; those that find no room are counted as refused.
+ * Timer 1 runs freely at 2 MHz; ticks are us. An interrupt receives the bytes of the host, as the
+ * UART holds only two; bytes without room are counted as refused.
  */
 #include <avr/interrupt.h>
 #include <avr/io.h>
@@ -13,7 +13,7 @@
 
 #define BOARD_CYCLES 3
 #define BOARD_LOG_TEXT 20
-#define REFERENCE_BUS_US 5000 /* modelled chips are work for 8 bits: 127 Hz at most */
+#define REFERENCE_BUS_US 5000 /* computing modelled chips is slow on 8 bits: 127 Hz at most */
 #include "../../test/reference_board.h"
 
 static volatile uint8_t rx[256]; /* indices of 8 bits wrap by themselves */
@@ -22,7 +22,7 @@ static volatile uint8_t rx_out;
 static volatile uint16_t rx_lost;
 static volatile uint16_t timer_high;
 
-/* Neither cleared nor set at the start: tells a reset by command from one by the watchdog. */
+/* Not initialised at start: tells a reset by command from one by the watchdog. */
 static uint16_t kept_cause __attribute__((section(".noinit")));
 #define BY_COMMAND 0x7265U
 
@@ -51,7 +51,7 @@ static uint32_t micros(void *self) {
   high = timer_high;
   if ((TIFR1 & (1 << TOV1)) != 0 && low < 0x8000U) high++; /* not yet served */
   SREG = flags;
-  /* 48 bits of half us, of which the 32 of whole us are kept: they wrap at 2^32 us. */
+  /* 48 bits of half us; the low 32 bits in whole us are kept and wrap at 2^32 us. */
   return high << 15 | low >> 1;
 }
 
@@ -106,7 +106,7 @@ int main(void) {
   r.port.read = get;
   r.port.reboot = reboot;
   if (!reference_begin(&r, TP_POWER_ON)) return 1;
-  r.board.cause_ = cause; /* the modelled chips are in our memory: for them it was power-on */
+  r.board.cause_ = cause; /* the modelled chips live in this memory: for them it was power-on */
   for (;;) {
     uint8_t flags = SREG;
     cli();

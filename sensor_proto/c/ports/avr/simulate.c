@@ -24,7 +24,7 @@
 
 static volatile sig_atomic_t ended;
 static int master;
-static int room = 1; /* the UART takes a byte */
+static int room = 1; /* the UART accepts a byte */
 
 static void end(int number) {
   (void)number;
@@ -35,7 +35,7 @@ static void said(struct avr_irq_t *irq, uint32_t value, void *self) {
   unsigned char byte = (unsigned char)value;
   (void)irq;
   (void)self;
-  if (write(master, &byte, 1) != 1) return; /* a UART knows nothing of who listens */
+  if (write(master, &byte, 1) != 1) return; /* a UART does not know whether anyone listens */
 }
 
 static void takes(struct avr_irq_t *irq, uint32_t value, void *self) {
@@ -67,7 +67,7 @@ int main(int argc, char **argv) {
   }
   master = posix_openpt(O_RDWR | O_NOCTTY);
   if (master < 0 || grantpt(master) != 0 || unlockpt(master) != 0) return 3;
-  slave = open(ptsname(master), O_RDWR | O_NOCTTY); /* kept open: a UART is never hung up */
+  slave = open(ptsname(master), O_RDWR | O_NOCTTY); /* kept open: a UART never hangs up */
   if (slave < 0 || tcgetattr(slave, &raw) != 0) return 3;
   cfmakeraw(&raw);
   if (tcsetattr(slave, TCSANOW, &raw) != 0 || fcntl(master, F_SETFL, O_NONBLOCK) != 0) return 3;

@@ -6,7 +6,7 @@
  *     ./board ./board0 &
  *     tactiled --port ./board0        # or: tactile board-check --port ./board0
  *
- * A link to the pseudo-terminal is laid at the path given, and taken away at the end.
+ * It links the given path to the pseudo-terminal and removes the link at the end.
  */
 #define _XOPEN_SOURCE 700
 
@@ -37,7 +37,7 @@ static uint32_t micros(void *self) {
   return (uint32_t)((uint64_t)now.tv_sec * 1000000U + (uint64_t)now.tv_nsec / 1000U);
 }
 
-/** Whether a host has the other end open; like a USB port, nothing is sent into the void. */
+/** Whether a host has the other end open; if not, nothing is sent, as on a USB port. */
 static bool is_open(void) {
   struct pollfd line;
   line.fd = master;
@@ -61,7 +61,7 @@ static size_t get(void *self, uint8_t *bytes, size_t count) {
 
 static void reboot(void *self) { (void)reference_begin((struct reference *)self, TP_BY_COMMAND); }
 
-/** Pseudo-terminal in raw mode, linked to from `path`; false with the reason on stderr. */
+/** Open a pseudo-terminal in raw mode and link `path` to it; false with the reason on stderr. */
 static bool open_line(const char *path) {
   struct termios raw;
   int slave;

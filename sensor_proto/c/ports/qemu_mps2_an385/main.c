@@ -1,12 +1,13 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /**
- * The reference board on a Cortex-M3: Arm's MPS2 board with image AN385, as QEMU emulates it.
+ * The reference board on a Cortex-M3: Arm's MPS2 board with image AN385, as emulated by QEMU.
  *
  *     arm-none-eabi-gcc -std=c99 -mcpu=cortex-m3 -mthumb -O2 -nostartfiles --specs=nosys.specs \
  *       -T ports/qemu_mps2_an385/link.ld -o board.elf ports/qemu_mps2_an385/main.c
  *     qemu-system-arm -M mps2-an385 -display none -serial pty -kernel board.elf
  *
- * UART 0 is the line, the free-running CMSDK timer 0 the clock (25 MHz, counted down, here in us).
+ * UART 0 is the serial line; the free-running CMSDK timer 0 is the clock (25 MHz, counting down,
+ * converted to us).
  */
 #include "../../test/reference_board.h"
 
@@ -27,13 +28,15 @@ extern uint32_t image_data_end;
 extern uint32_t image_bss;
 extern uint32_t image_bss_end;
 
-/* Survives a reset by command, so that the next start knows of it. */
+/* Survives a reset by command, so that the next start can report it. */
 __attribute__((section(".kept"))) static uint32_t kept_cause;
 #define BY_COMMAND 0x7265626FUL
 
 static struct reference r;
 
-/** us since the start: whole ones of the timer's ticks, the rest kept. Called often enough. */
+/**
+ * us since the start; the remainder of timer ticks is kept. Must be called before the timer wraps.
+ */
 static uint32_t micros(void *self) {
   static uint32_t last;
   static uint32_t rest;
@@ -90,7 +93,7 @@ void start(void) {
   r.port.reboot = reboot;
   r.model.chips = NULL;
   if (reference_begin(&r, TP_POWER_ON)) {
-    r.board.cause_ = cause; /* the modelled chips are in our memory: for them it was power-on */
+    r.board.cause_ = cause; /* the modelled chips live in this memory: for them it was power-on */
     board_log(&r.board, TP_INFO, "reference board up");
     for (;;) board_poll(&r.board);
   }

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /**
  * Five MLX90393 on I2C 0 of a Raspberry Pi Pico, USB CDC to the host. Untried on silicon: written
- * from the Pico SDK's documentation; it compiles where the SDK is there, and nowhere else.
+ * from the documentation of the Pico SDK, which it needs to compile.
  *
  *     add_executable(board ports/rp2040/main.c)
  *     target_include_directories(board PRIVATE sensor_proto/c)
@@ -59,7 +59,7 @@ static enum mlx_result transfer(void *self, uint8_t address, const uint8_t *out,
   return (said == in_count) ? MLX_OK : MLX_NACK;
 }
 
-/** Nine clocks by hand, so that a chip in the middle of a byte lets go of the data line. */
+/** Nine clocks by hand, so that a chip in the middle of a byte releases the data line. */
 static void recover(void *self) {
   (void)self;
   gpio_set_function(SCL, GPIO_FUNC_SIO);
@@ -103,7 +103,7 @@ static uint32_t scales(void *self, uint8_t array, uint32_t *xy_nt, uint32_t *z_n
 
 static void reboot(void *self) {
   (void)self;
-  watchdog_hw->scratch[0] = 0x7265626F; /* tells this reset from one by the watchdog */
+  watchdog_hw->scratch[0] = 0x7265626F; /* distinguishes this reset from one by the watchdog */
   watchdog_reboot(0, 0, 0);
   for (;;) tight_loop_contents();
 }

@@ -1,9 +1,9 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /**
- * Port functions for an STM32F4 with ST's HAL: USART 2 with DMA-fed ring for receiving, timer 2 as
- * the clock, I2C 1 for the chips. Untried on silicon: written from the HAL's documentation; it
- * compiles in a project that CubeMX made (handles `huart2`, `htim2`, `hi2c1`; USART 2 RX DMA
- * circular into `rx`; timer 2 with 32 bits, prescaled to 1 MHz), and nowhere else.
+ * Port functions for an STM32F4 with ST's HAL: USART 2 receiving into a DMA ring, timer 2 as the
+ * clock, I2C 1 for the chips. Untried on silicon: written from the documentation of the HAL. It
+ * needs a project made by CubeMX (handles `huart2`, `htim2`, `hi2c1`; USART 2 RX DMA circular into
+ * `rx`; timer 2 with 32 bits, prescaled to 1 MHz).
  *
  * Call `tactile_begin()` after CubeMX's initialisation, and `tactile_poll()` in the main loop.
  */
@@ -20,7 +20,7 @@ extern UART_HandleTypeDef huart2;
 extern TIM_HandleTypeDef htim2;
 extern I2C_HandleTypeDef hi2c1;
 
-void Error_Handler(void); /* CubeMX's */
+void Error_Handler(void); /* provided by CubeMX */
 void tactile_begin(void);
 void tactile_poll(void);
 

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* As much of Arduino's names as the sketches use, for checking them where no Arduino is installed. */
+/* The Arduino names used by the sketches, to check them without an Arduino installation. */
 #ifndef STAND_IN_ARDUINO_H
 #define STAND_IN_ARDUINO_H
 #include <stddef.h>

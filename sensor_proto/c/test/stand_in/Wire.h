@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* As much of Arduino's I2C as the sketches use. */
+/* The Arduino I2C names used by the sketches. */
 #ifndef STAND_IN_WIRE_H
 #define STAND_IN_WIRE_H
 #include <stddef.h>
