@@ -92,15 +92,15 @@ def state_frame(state: BusState) -> CanFrame:
     return error_frame(CONTROLLER, _CONTROLLER_STATE[state])
 
 
-def names(frame: CanFrame) -> tuple[str, ...]:
+def error_names(frame: CanFrame) -> tuple[str, ...]:
     """Names of all errors and states in an error frame; never empty."""
-    told = [name for bit, name in _CLASSES.items() if frame.identifier & bit]
+    found = [name for bit, name in _CLASSES.items() if frame.identifier & bit]
     if frame.identifier & CONTROLLER:
-        told += [name for bits, name in _CONTROLLER_BITS.items() if _controller(frame) & bits]
-    return tuple(told) or ("unspecified",)
+        found += [name for bits, name in _CONTROLLER_BITS.items() if _controller(frame) & bits]
+    return tuple(found) or ("unspecified",)
 
 
-def told_state(frame: CanFrame) -> BusState | None:
+def reported_state(frame: CanFrame) -> BusState | None:
     """Bus state announced by an error frame; None if it announces none."""
     if frame.identifier & BUS_OFF:
         return BusState.BUS_OFF

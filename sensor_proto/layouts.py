@@ -149,7 +149,7 @@ MAX_EXTRA = 16
 MAX_LINES = 64
 """Most lines of text per frame."""
 
-STEPS_PER_K, RAW_AT_25_C = 45.2, 46244
+RAW_AT_25_C = 46244
 """Temperature of integer layouts: T = 25 + (raw − 46244) / 45.2 °C (MLX90393 datasheet)."""
 
 COUNT_UT = (0.15, 0.15, 0.242)
@@ -423,7 +423,7 @@ def _scale(text: str) -> tuple[float, float, float]:
     except ValueError:
         values = []
     if not 1 <= len(values) <= 3 or not all(1e-6 <= abs(v) <= 1e6 for v in values):
-        raise ValueError(f"{text!r} is not one to three numbers of µT, parted by /")
+        raise ValueError(f"{text!r} is not one to three numbers of µT, separated by /")
     xy, z = values[0], values[-1]
     return (xy, values[1] if len(values) == 3 else xy, z)
 

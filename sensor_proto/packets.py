@@ -386,7 +386,7 @@ def message_type(message: Message) -> MessageType:
     """Type of ``message``. Raises TypeError for anything but a message of this protocol."""
     kind = _TYPES.get(type(message))
     if kind is None:
-        raise TypeError(f"{type(message).__name__} is no message of this protocol")
+        raise TypeError(f"{type(message).__name__} is not a message of this protocol")
     return kind
 
 

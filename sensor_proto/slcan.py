@@ -89,7 +89,7 @@ def encode_frame(frame: CanFrame) -> bytes:
     """
     code = CODE_OF_LENGTH.get(len(frame.data))
     if code is None or (code > 8 and not frame.fd):
-        raise ValueError(f"no CAN frame has {len(frame.data)} data bytes (fd={frame.fd})")
+        raise ValueError(f"a CAN frame cannot have {len(frame.data)} data bytes (fd={frame.fd})")
     if frame.error or not 0 <= frame.identifier < 1 << 29:
         raise ValueError("only data frames with 29-bit identifiers can be sent")
     letter = "B" if frame.fd else "T"

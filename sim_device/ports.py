@@ -235,7 +235,7 @@ class SlcanPort:
         self._answer()
 
     def _suffer(self, frame: CanFrame) -> None:
-        state = can_transfers.told_state(frame)
+        state = can_transfers.reported_state(frame)
         if state is not None:
             self.adapter.set_bus_off(state is BusState.BUS_OFF)
 

@@ -181,8 +181,8 @@ def test_layout_text_round_trips(text: str) -> None:
         ("floats:5xyz,skip=99", "0 to 16"),
         ("floats:5xyz,lead=1", "not an option"),
         ("text:5xyz,end=lf", "not an option"),
-        ("int16:5xyz,scale=0", "parted by /"),
-        ("int16:5xyz,scale=nan", "parted by /"),
+        ("int16:5xyz,scale=0", "separated by /"),
+        ("int16:5xyz,scale=nan", "separated by /"),
     ],
 )
 def test_invalid_layout_is_refused_with_the_expected_form(text: str, named: str) -> None:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sensor_proto.can_transfers import BusState, CanDecoder, CanEncoder, CanFrame, told_state
+from sensor_proto.can_transfers import BusState, CanDecoder, CanEncoder, CanFrame, reported_state
 from sensor_proto.framing import SerialDecoder, encode_serial
 from sensor_proto.packets import Log
 from sim_device.board.wire import CanWire, SerialWire
@@ -163,10 +163,10 @@ def test_bus_off_is_reported_by_error_frames_and_ends() -> None:
     assert wire.pass_on(data, 0.9) == data
     (told,) = wire.pass_on(data, 1.0)
     assert told.error
-    assert told_state(told) is BusState.BUS_OFF
+    assert reported_state(told) is BusState.BUS_OFF
     assert wire.pass_on(data, 1.2) == []
     told, *rest = wire.pass_on(data, 1.5)
-    assert told_state(told) is BusState.ACTIVE
+    assert reported_state(told) is BusState.ACTIVE
     assert rest == data
     counters = wire.counters
     assert counters["lost"] == 2 * len(data)

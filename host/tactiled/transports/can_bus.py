@@ -151,9 +151,9 @@ class CanTransport:
         self._link.close()
 
     def _note(self, frame: CanFrame) -> None:
-        for told in can_transfers.names(frame):
+        for told in can_transfers.error_names(frame):
             self._losses.add(f"can_{told}")
-        state = can_transfers.told_state(frame)
+        state = can_transfers.reported_state(frame)
         if state is not None:
             self._enter(state)
 

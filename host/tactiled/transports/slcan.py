@@ -138,7 +138,7 @@ class SlcanLink:
             raise TypeError("a serial chunk holds bytes")
         frames = []
         for frame in self._decoder.feed(chunk.payload):
-            state = can_transfers.told_state(frame) if frame.error else None
+            state = can_transfers.reported_state(frame) if frame.error else None
             if state is None or state is not self._told:
                 frames.append(frame)
             if not frame.error and self._told is BusState.BUS_OFF:

@@ -92,10 +92,10 @@ def test_chunking_of_adapter_bytes_does_not_matter(cuts: list[int]) -> None:
     for start, end in pairwise(edges):
         frames += decoder.feed(STREAM[start:end])
     assert frames[:2] == [FRAME, FD_FRAME]
-    assert can_transfers.told_state(frames[2]) is BusState.WARNING
-    assert can_transfers.names(frames[3]) == ("bus-error",)
-    assert can_transfers.told_state(frames[4]) is BusState.BUS_OFF
-    assert can_transfers.names(frames[5]) == (
+    assert can_transfers.reported_state(frames[2]) is BusState.WARNING
+    assert can_transfers.error_names(frames[3]) == ("bus-error",)
+    assert can_transfers.reported_state(frames[4]) is BusState.BUS_OFF
+    assert can_transfers.error_names(frames[5]) == (
         "protocol-violation",
         "no-acknowledgement",
         "bus-error",
@@ -168,19 +168,19 @@ def test_state_and_error_lines_become_named_error_frames(
 ) -> None:
     (frame,) = slcan.SlcanDecoder().feed(line + b"\r")
     assert frame.error
-    assert can_transfers.names(frame) == names
-    assert can_transfers.told_state(frame) is state
+    assert can_transfers.error_names(frame) == names
+    assert can_transfers.reported_state(frame) is state
 
 
 def test_socketcan_error_frames_have_their_kernel_names() -> None:
     # Classes and controller bits of linux/can/error.h.
-    assert can_transfers.names(CanFrame(0x040, bytes(8), error=True)) == ("bus-off",)
-    assert can_transfers.told_state(CanFrame(0x100, bytes(8), error=True)) is BusState.ACTIVE
+    assert can_transfers.error_names(CanFrame(0x040, bytes(8), error=True)) == ("bus-off",)
+    assert can_transfers.reported_state(CanFrame(0x100, bytes(8), error=True)) is BusState.ACTIVE
     passive = CanFrame(0x004, b"\0\x20\0\0\0\0\0\0", error=True)
-    assert can_transfers.names(passive) == ("error-passive",)
-    assert can_transfers.told_state(passive) is BusState.PASSIVE
-    assert can_transfers.told_state(CanFrame(0x020, b"", error=True)) is None
-    assert can_transfers.names(CanFrame(0, b"", error=True)) == ("unspecified",)
+    assert can_transfers.error_names(passive) == ("error-passive",)
+    assert can_transfers.reported_state(passive) is BusState.PASSIVE
+    assert can_transfers.reported_state(CanFrame(0x020, b"", error=True)) is None
+    assert can_transfers.error_names(CanFrame(0, b"", error=True)) == ("unspecified",)
 
 
 @pytest.mark.parametrize(
@@ -352,9 +352,9 @@ def test_flags_are_decoded_as_bus_errors(
     flags: bytes, names: tuple[str, ...], state: BusState | None
 ) -> None:
     state_frame, errors = slcan.SlcanDecoder().feed(flags + b"\r")
-    assert can_transfers.told_state(state_frame) is (state or BusState.ACTIVE)
-    assert can_transfers.names(errors) == names
-    assert can_transfers.told_state(errors) is None
+    assert can_transfers.reported_state(state_frame) is (state or BusState.ACTIVE)
+    assert can_transfers.error_names(errors) == names
+    assert can_transfers.reported_state(errors) is None
 
 
 def test_persistent_flag_is_reported_once() -> None:
@@ -376,8 +376,8 @@ def test_error_reports_of_newer_firmware_are_understood(
     line: bytes, state: BusState, names: tuple[str, ...]
 ) -> None:
     first, *rest = slcan.SlcanDecoder().feed(line + b"\r")
-    assert can_transfers.told_state(first) is state
-    assert [can_transfers.names(f) for f in rest] == ([names] if names else [])
+    assert can_transfers.reported_state(first) is state
+    assert [can_transfers.error_names(f) for f in rest] == ([names] if names else [])
 
 
 def test_every_bit_rate_has_a_command() -> None:
