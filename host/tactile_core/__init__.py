@@ -1,1 +1,2 @@
-"""What daemons, simulator and tools agree on: instants, topics, messages, sessions, logs."""
+"""Shared by daemons, simulator and tools: time, topics, messages, sessions, calibrations and
+logs."""

@@ -1,4 +1,4 @@
-"""Types of numpy arrays."""
+"""Type aliases for numpy arrays."""
 
 from __future__ import annotations
 
@@ -6,4 +6,4 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
-"""Any shape; the docstring of whatever takes or gives one says which."""
+"""Array of any shape; docstrings give the shape where one is used."""

@@ -1,4 +1,7 @@
-"""One typed instant: nanoseconds of the host's monotonic clock. Durations are float seconds."""
+"""Instants, wall-clock stamps, and the values that arms and controllers exchange.
+
+An `Instant` is in nanoseconds of the host's monotonic clock. Durations are floats in seconds.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from datetime import UTC, datetime, timedelta
 from types import MappingProxyType
 from typing import Final, NewType, TypeVar, dataclass_transform
 
-# Values that a control cycle makes by the dozen.
+# Records that each control cycle creates by the dozen.
 
 
 T = TypeVar("T")
@@ -17,32 +20,32 @@ T = TypeVar("T")
 
 @dataclass_transform(frozen_default=True)
 def record(cls: type[T]) -> type[T]:
-    """Return ``cls`` as a slotted dataclass that the type checker holds to be frozen.
+    """Return ``cls`` as a slotted dataclass that the type checker treats as frozen.
 
-    To freeze it at run time as well, Python sets each field through a function call, which costs
-    more than all the arithmetic of a control cycle. Equal records have equal hashes.
+    Freezing it at run time would set each field through a function call, which costs more than all
+    the arithmetic of a control cycle. Equal records have equal hashes.
     """
     return dataclass(slots=True, unsafe_hash=True)(cls)
 
 
 Instant = NewType("Instant", int)
-"""CLOCK_MONOTONIC in nanoseconds: the only time the control path knows."""
+"""CLOCK_MONOTONIC in nanoseconds: the only clock that control code uses."""
 
 NS_PER_S = 1_000_000_000
 
 
 STAMP_END_NS = (1 << 31) * NS_PER_S
-"""First wall-clock time that a ROS 2 header cannot hold: its seconds are an int32, which ends on
+"""First wall-clock time that does not fit into a ROS 2 header: its int32 seconds end on
 2038-01-19."""
 
 
 def monotonic_now() -> Instant:
-    """Present instant. Only the thin shells call this; pure code is handed its ``now``."""
+    """Current instant. Only shells call this; pure code receives ``now`` as an argument."""
     return Instant(time.monotonic_ns())
 
 
 def seconds_between(start: Instant, end: Instant) -> float:
-    """Duration from ``start`` to ``end`` in seconds (negative when ``end`` is earlier)."""
+    """Duration from ``start`` to ``end`` in seconds; negative if ``end`` is earlier."""
     return (end - start) / NS_PER_S
 
 
@@ -53,10 +56,10 @@ def after(start: Instant, seconds: float) -> Instant:
 
 @dataclass(frozen=True, slots=True)
 class WallClock:
-    """Maps instants to wall-clock stamps by one offset, taken once.
+    """Maps instants to wall-clock stamps with one fixed offset.
 
-    Because the offset never changes, a step of the system clock moves neither motion nor the
-    order of a log. ``problem``: what is to be said of the stamps, empty when they are as usual.
+    As the offset never changes, a step of the system clock affects neither motion nor the order of
+    a log. ``problem``: a warning about the stamps; empty if they are as usual.
     """
 
     offset_ns: int
@@ -64,17 +67,18 @@ class WallClock:
 
     @classmethod
     def take(cls) -> WallClock:
-        """Read both clocks now; the monotonic reads around the wall read bound the error."""
+        """Read both clocks now. Monotonic reads before and after the wall-clock read bound the
+        error."""
         before = time.monotonic_ns()
         wall = time.time_ns()
         return cls.reading(wall, (before + time.monotonic_ns()) // 2)
 
     @classmethod
     def reading(cls, wall_ns: int, monotonic_ns: int) -> WallClock:
-        """Clock of a machine whose two clocks read these at once.
+        """Create the mapping from simultaneous readings of both clocks.
 
-        A log holds no time before 1970. Where the system clock says one, stamps count from the
-        start of the monotonic clock, as if that had been at midnight of 1970-01-01.
+        A log cannot hold times before 1970. If the system clock reads one, stamps count from the
+        start of the monotonic clock, as if that had been midnight of 1970-01-01.
         """
         if wall_ns < 0:
             return cls(
@@ -91,14 +95,14 @@ class WallClock:
         return cls(wall_ns - monotonic_ns)
 
     def wall_ns(self, instant: Instant) -> int:
-        """Nanoseconds since the Unix epoch that stand for ``instant``."""
+        """Nanoseconds since the Unix epoch for ``instant``."""
         return instant + self.offset_ns
 
 
 def utc_text(wall_ns: int, layout: str = "%Y-%m-%d %H:%M:%S") -> str:
-    """A wall-clock time as UTC, by a layout of `datetime.strftime`; any number of ns will do.
+    """Format a wall-clock time as UTC (`datetime.strftime` layout); accepts any integer in ns.
 
-    What lies before the year 1000 or after 9999 is shown as the nearest time within.
+    Times before the year 1000 or after 9999 are shown as the nearest time within.
     """
     earliest, latest = datetime(1000, 1, 1, tzinfo=UTC), datetime(9999, 12, 31, tzinfo=UTC)
     epoch = datetime(1970, 1, 1, tzinfo=UTC)
@@ -109,11 +113,11 @@ def utc_text(wall_ns: int, layout: str = "%Y-%m-%d %H:%M:%S") -> str:
     return min(max(when, earliest), latest).strftime(layout)
 
 
-# What every arm, simulated or real, is told and says: twists, state and limits.
+# Values exchanged with every arm, simulated or real: twists, state and limits.
 #
-# Planar quantities are in the cupboard's frame ``cupboard``: origin at the middle of its front
-# edge, x into the cupboard, y left, angles counter-clockwise from x. (The paper's axes are x right,
-# y forward, angles from y: x_here = y_paper, y_here = −x_paper.)
+# Planar quantities are in the frame ``cupboard``: origin at the middle of its front edge, x into
+# the cupboard, y left, angles counter-clockwise from x. (The paper's axes are x right, y forward,
+# angles from y: x_here = y_paper, y_here = −x_paper.)
 
 
 @record
@@ -130,11 +134,11 @@ ZERO = Twist(0.0, 0.0, 0.0)
 
 @record
 class Echo:
-    """What an arm says of whom it obeys, and of the command in force or the last that was.
+    """Which commander an arm obeys, and its command in force or the last that was.
 
-    ``commander``: as granted, empty for nobody. ``decided``: instant of the decision, by the
-    commander's clock; 0, as is ``sequence``, before the first. ``own``: for whoever reads the
-    state, whether that commander is himself.
+    ``commander``: name as granted, empty for none. ``decided``: when the command was decided, by
+    the commander's clock; 0 before the first, as is ``sequence``. ``own``: whether the reader of
+    the state is that commander.
     """
 
     commander: str
@@ -145,12 +149,12 @@ class Echo:
 
 @record
 class ArmState:
-    """What the arm reports of itself at its own rate.
+    """State that an arm reports at its own rate.
 
     Pose of the wrist pivot (m, rad) and its twist; wrench that the environment exerts on the
     end-effector about the pivot (N, N, N·m), all in ``cupboard``. ``mode`` is "ready", "moving",
     "stopped", "fault" or "estop". The limits are those the arm confirms: m/s, rad/s, N, N·m.
-    ``echo`` is None where commands reach the arm without a way between: in lockstep.
+    ``echo`` is None if commands reach the arm directly: in lockstep.
     """
 
     captured: Instant
@@ -172,9 +176,9 @@ class ArmState:
 
 @dataclass(frozen=True, slots=True)
 class ArmLimits:
-    """Limits an arm is asked to keep: m/s, rad/s, N on each world axis, N·m about the pivot.
+    """Limits requested of an arm: m/s, rad/s, N on each world axis, N·m about the pivot.
 
-    ValueError unless all are finite and positive.
+    Raises ValueError unless all are finite and positive.
     """
 
     v_max: float
@@ -183,7 +187,7 @@ class ArmLimits:
     m_max: float
 
     def __post_init__(self) -> None:
-        """Refuse limits that would not limit."""
+        """Reject limits without effect."""
         for name in ("v_max", "omega_max", "f_max", "m_max"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
@@ -194,26 +198,27 @@ ARM_LIMITS: Final = MappingProxyType(
     {
         # Table I of the paper, as printed.
         "hardware": ArmLimits(v_max=0.045, omega_max=0.1, f_max=15.0, m_max=4.5),
-        # Authors' simulator at true scale: 0.5 u/s and ±15 at a lever of ten times its length.
-        # Its excavation turns at 0.25 rad/s of the 0.35 allowed; that belongs to the primitive.
+        # Authors' simulator at true scale: 0.5 u/s and ±15 at a lever of ten times its length. Its
+        # excavation turns at 0.25 rad/s of the allowed 0.35; that limit belongs to the primitive.
         "authors_sim": ArmLimits(v_max=0.05, omega_max=0.35, f_max=10.0, m_max=1.5),
     }
 )
 """Limits of the two named parameter sets."""
 
 
-# Stamps of another machine's monotonic clock. Pure.
+# Time stamps of another machine's monotonic clock. Pure.
 
 
 DRIFT = 2e-4
-"""s/s by which the clocks of two machines may drift apart: twice what bad quartzes do."""
+"""Largest relative drift between the clocks of two machines: twice that of poor quartz crystals."""
 
 
 class RemoteClock:
-    """Maps another machine's monotonic stamps to this one's: the least delay seen counts as none.
+    """Maps another machine's monotonic stamps to this machine's, taking the least delay seen as
+    zero.
 
-    What comes later than the quickest did is that much older, so a queue that fills up on the way
-    shows as age. The quickest is forgotten no faster than clocks drift.
+    A message delayed more than the fastest one is older by the difference, so a growing queue on
+    the way shows as age. The minimum is relaxed only as fast as clocks may drift.
     """
 
     def __init__(self) -> None:

@@ -1,1 +1,1 @@
-"""The bus: topics, messages, sessions, who may do what, commands with proof."""
+"""The bus: topics, messages, sessions, access rights, and authenticated commands."""

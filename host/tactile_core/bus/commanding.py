@@ -1,14 +1,14 @@
-"""Who commands an arm: granted by the arm, proved with every command, and for a short time only.
+"""Command of an arm: granted by the arm, proved with every command, valid for a short time.
 
-The arm's side is `CommandDesk`, for the simulated arm and for every driver; the commander's side
-is `Signer`. The arm grants its command through a service, one commander at a time, and hands out a
-secret with it. Every command carries a keyed hash made with that secret, so that whoever reads the
-bus and repeats, forges or renumbers commands is not obeyed, and takes nothing from the owner. Pure.
+`CommandDesk` is the arm's side, for the simulated arm and every driver; `Signer` is the commander's
+side. The arm grants its command through a service, to one commander at a time, together with a
+secret. Every command carries a keyed hash made with that secret. Whoever reads the bus and repeats,
+forges or renumbers commands is therefore not obeyed, and takes nothing from the owner. Pure.
 
-A command dies at its expiry, counted from the instant of its **decision**. That instant is of the
-commander's monotonic clock. Where both run on one machine (`clock_domain` tells) it is this
-machine's own; else it is mapped by the least delay seen, so that what every command was delayed by
-from the first is not seen by the arm, but by the commander, whose own instants the arm echoes.
+A command ends at its expiry, counted from the instant of its **decision** on the commander's
+monotonic clock. If both run on one machine (see `clock_domain`), that clock is also the arm's.
+Otherwise the arm maps it by the least delay seen: it cannot see a delay that all commands share,
+but the commander can, as the arm echoes the commander's own instants.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from tactile_core.types import (
     record,
 )
 
-# The services through which every arm, simulated or real, grants its command.
+# Services through which every arm, simulated or real, grants its command.
 
 
 def serve_desk(session: zenoh.Session, arm: str, desk: CommandDesk) -> list[Service]:
@@ -72,16 +72,16 @@ def serve_desk(session: zenoh.Session, arm: str, desk: CommandDesk) -> list[Serv
 FRAME: Final = "cupboard"
 
 TAKEOVER: Final = 0.5
-"""s of a commander's silence after which another may be granted; the arm rests long before."""
+"""Silence of a commander, in s, after which another may be granted; the arm stops long before."""
 
 FIRST_COMMAND: Final = 2.0
-"""s that a commander may take from the grant to the first command."""
+"""Time in s allowed from the grant to the first command."""
 
 LONGEST_EXPIRY: Final = 0.1
-"""s after its decision for which any command may hold: what the arm may take to come to rest."""
+"""Longest expiry in s after the decision: the time the arm may take to stop."""
 
 AHEAD: Final = 0.01
-"""s that a decision of this machine's own clock may seem to lie ahead of now."""
+"""Tolerance in s for decisions in the future of this machine's clock."""
 
 PROOF_BYTES: Final = 16
 NO_PROOF: Final = np.zeros(PROOF_BYTES, np.uint8)
@@ -109,26 +109,28 @@ REFUSALS: Final[tuple[Refusal, ...]] = (
     "wrong_frame",
     "not_planar",
 )
-"""Why a command is not obeyed. ``foreign``: from somebody who does not command the arm.
-``forged``: under the commander's name without his proof. ``repeated``: obeyed already, or older
-than one that was. ``late``: older than its expiry when it came. ``future``: decided after now."""
+"""Why a command is not obeyed. ``foreign``: the sender does not command the arm. ``forged``: under
+the commander's name without the right proof. ``repeated``: obeyed before, or older than one that
+was. ``late``: older than its expiry on arrival. ``future``: decided after now."""
 
 
 class NotGrantedError(Exception):
-    """The arm's command, or what only its commander may ask for, is not granted; says why."""
+    """The arm's command, or a request reserved for its commander, was not granted; the text says
+    why."""
 
 
 class ClaimRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``name``: of the reach. ``clock``: `clock_domain` of the commander."""
+    """Request for the command. ``name``: name of the reach; ``clock``: commander's
+    `clock_domain`."""
 
     name: str
     clock: str
 
 
 class Grant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``commander``: how the arm calls its new owner. ``key``: the secret, as hex digits.
+    """Granted command. ``commander``: name given by the arm; ``key``: the secret, as hex digits.
 
-    ``clock``: "same" where the arm counts by the commander's own clock, else "remote".
+    ``clock``: "same" if the arm uses the commander's own clock, otherwise "remote".
     """
 
     commander: str
@@ -137,9 +139,9 @@ class Grant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Signed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the commander asks for, with the proof that it is him; see `Signer.sign`.
+    """Request with a proof that the commander made it; see `Signer.sign`.
 
-    All empty from somebody who is not: granted only while nobody commands the arm.
+    All fields are empty without a grant: such requests pass only while the arm has no commander.
     """
 
     commander: str = ""
@@ -148,7 +150,7 @@ class Signed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class LimitsRequest(Signed, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """`ArmLimits`, signed. ValueError for limits that would not limit."""
+    """`ArmLimits`, signed. Raises ValueError for limits without effect."""
 
     v_max: float
     omega_max: float
@@ -156,20 +158,20 @@ class LimitsRequest(Signed, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     m_max: float
 
     def __post_init__(self) -> None:
-        """Refuse them as `ArmLimits` does."""
+        """Reject invalid limits, as `ArmLimits` does."""
         _ = self.limits
 
     @property
     def limits(self) -> ArmLimits:
-        """The limits alone."""
+        """The limits without the signature."""
         return ArmLimits(self.v_max, self.omega_max, self.f_max, self.m_max)
 
 
 @record
 class Order:
-    """A command that may be obeyed until ``expires``, by the arm's clock.
+    """A command that may be obeyed until ``expires``, on the arm's clock.
 
-    ``decided`` is the instant by the commander's clock, to be echoed with ``sequence``.
+    ``decided`` is the instant on the commander's clock, echoed together with ``sequence``.
     """
 
     twist: Twist
@@ -181,9 +183,9 @@ class Order:
 
 @cache
 def clock_domain() -> str:
-    """Names the monotonic clock of this process: equal where instants can be compared."""
+    """Identify the monotonic clock of this process: instants of equal domains can be compared."""
     parts = [platform.node()]
-    with suppress(OSError):  # not Linux: the machine's name alone
+    with suppress(OSError):  # not Linux: use the machine's name alone
         parts = [Path("/proc/sys/kernel/random/boot_id").read_text().strip()]
         parts.append(os.readlink("/proc/self/ns/time"))  # containers may shift the clock
     return " ".join(parts)
@@ -198,7 +200,7 @@ def command_message(
     commander: str = "",
     sequence: int = 0,
 ) -> Any:
-    """``ArmCommand`` without a proof, decided at ``wall_ns``, which the header tells."""
+    """``ArmCommand`` without a proof; ``wall_ns``, the time of decision, goes into the header."""
     linear, angular = MSG.Vector3(twist.vx, twist.vy, 0.0), MSG.Vector3(0.0, 0.0, twist.omega)
     return MSG.ArmCommand(
         header=header(wall_ns, FRAME),
@@ -212,7 +214,7 @@ def command_message(
 
 
 class Signer:
-    """The commander's side of ``grant``: numbers commands and requests, and proves them."""
+    """The commander's side of ``grant``: numbers and signs commands and requests."""
 
     def __init__(self, grant: Grant) -> None:
         self.commander = grant.commander
@@ -221,7 +223,7 @@ class Signer:
         self._number = 0
 
     def command(self, twist: Twist, decided: Instant, expiry: float, wall_ns: int) -> bytes:
-        """CDR bytes of the next command."""
+        """Encode and sign the next command; CDR bytes."""
         self._sequence += 1
         message = command_message(
             twist, decided, expiry, wall_ns, commander=self.commander, sequence=self._sequence
@@ -230,7 +232,7 @@ class Signer:
         return data + _proof(self._key, data)
 
     def sign(self, service: str, **fields: object) -> dict[str, object]:
-        """A request to the arm's ``service``, to be sent as JSON."""
+        """Sign a request to the arm's ``service``; returns the fields to be sent as JSON."""
         self._number += 1
         about = _about(service, self.commander, self._number, fields)
         signed = {"commander": self.commander, "number": self._number}
@@ -238,10 +240,10 @@ class Signer:
 
 
 class CommandDesk:
-    """The arm's side: grants its command to one at a time, and tells whose words are obeyed.
+    """The arm's side: grants the command to one at a time and checks every command.
 
-    Every command is judged as it comes, in any thread, so that no flood of others can hide the
-    commander's; `newest` then hands out the last that holds.
+    Every command is checked on arrival, in any thread, so that a flood from others cannot hide the
+    commander's; `newest` returns the last valid one.
     """
 
     def __init__(self) -> None:
@@ -250,25 +252,25 @@ class CommandDesk:
         self._commander = ""
         self._name = ""
         self._key = b""
-        self._clock: RemoteClock | None = None  # None where it is our own
-        self._until = Instant(0)  # until when nobody else is granted
-        self._taken = 0  # sequence of the newest command that was believed
-        self._asked = 0  # number of the newest request that was granted
+        self._clock: RemoteClock | None = None  # None if it is this machine's clock
+        self._until = Instant(0)  # nobody else is granted before
+        self._taken = 0  # sequence of the newest authentic command
+        self._asked = 0  # number of the newest granted request
         self._order: Order | None = None
         self._counts: Counter[str] = Counter()
 
     @property
     def commander(self) -> str:
-        """Whose commands are obeyed; empty for nobody's."""
+        """Commander whose commands are obeyed; empty for none."""
         return self._commander
 
     @property
     def refused(self) -> dict[str, int]:
-        """Commands not obeyed so far, by reason; ``not_granted``: claims and requests."""
+        """Commands refused so far, by reason; ``not_granted`` counts claims and requests."""
         return {reason: self._counts[reason] for reason in (*REFUSALS, "not_granted")}
 
     def claim(self, request: ClaimRequest, now: Instant) -> Grant:
-        """Grant the command; `NotGrantedError` while somebody else is heard."""
+        """Grant the command. Raises `NotGrantedError` while another commander is active."""
         with self._lock:
             if not NAME.fullmatch(request.name):
                 self._counts["not_granted"] += 1
@@ -287,7 +289,8 @@ class CommandDesk:
             return Grant(self._commander, key.hex(), "same" if own else "remote")
 
     def release(self, request: Signed) -> None:
-        """The commander gives his grant back; `NotGrantedError` when it is not his."""
+        """Give the grant back. Raises `NotGrantedError` if the request is not from the
+        commander."""
         with self._lock:
             if not self._commander:
                 return
@@ -295,7 +298,7 @@ class CommandDesk:
             self._forget()
 
     def forget(self) -> None:
-        """Whoever commands the arm does so no longer: for the arm's own operator."""
+        """Revoke the grant; for the arm's own operator."""
         with self._lock:
             self._forget()
 
@@ -305,16 +308,16 @@ class CommandDesk:
         self._order = None
 
     def authorise(self, service: str, request: Signed, now: Instant, **fields: object) -> None:
-        """Let a request pass that only the commander may make; `NotGrantedError`.
+        """Check a request reserved for the commander; raises `NotGrantedError`.
 
-        While nobody commands the arm, or its commander has long been silent, anybody may.
+        While the arm has no commander, or one that has long been silent, any request passes.
         """
         with self._lock:
             if self._commander and (request.commander or now < self._until):
                 self._prove(service, request, fields)
 
     def hear(self, data: bytes, now: Instant) -> Refusal | None:
-        """Judge a command that came at ``now``; returns, and counts, why it is not obeyed."""
+        """Check a command received at ``now``; returns and counts the reason if it is refused."""
         with self._lock:
             found = self._judge(data, now)
             if isinstance(found, Order):
@@ -324,7 +327,7 @@ class CommandDesk:
             return found
 
     def newest(self, now: Instant) -> Order | None:
-        """The newest command that was not handed out before and still holds."""
+        """The newest command not returned before, if it is still valid."""
         with self._lock:
             order, self._order = self._order, None
             if order is not None and order.expires <= now:
@@ -342,7 +345,7 @@ class CommandDesk:
         head, proof = data[:-PROOF_BYTES], data[-PROOF_BYTES:]
         if not hmac.compare_digest(_proof(self._key, head), proof):
             return "forged"
-        # From here on it is the commander who speaks.
+        # From here on the command is authentic.
         sequence = int(message.sequence)
         if sequence <= self._taken:
             return "repeated"
@@ -367,7 +370,7 @@ class CommandDesk:
         return Order(twist, self._commander, sequence, stamp, expires)
 
     def _prove(self, service: str, request: Signed, fields: dict[str, object]) -> None:
-        """NotGrantedError unless ``request`` is the commander's and new; the lock is held."""
+        """Raise NotGrantedError unless ``request`` is new and the commander's; needs the lock."""
         about = _about(service, request.commander, request.number, fields)
         good = hmac.compare_digest(_proof(self._key, about).hex().encode(), request.proof.encode())
         if request.commander != self._commander or not good or request.number <= self._asked:
@@ -388,7 +391,7 @@ def _about(service: str, commander: str, number: int, fields: dict[str, object])
 
 
 def limits_fields(limits: ArmLimits) -> dict[str, object]:
-    """``limits`` as the fields of a `LimitsRequest`."""
+    """Fields of a `LimitsRequest` for ``limits``."""
     return {
         "v_max": limits.v_max,
         "omega_max": limits.omega_max,

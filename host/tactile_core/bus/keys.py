@@ -1,7 +1,7 @@
-"""A folder of keys: what one party of a rig needs to join it over TLS.
+"""Folder of keys with which one process or user joins a rig over TLS.
 
-``ca.pem`` (the lab's own authority), ``cert.pem`` and ``key.pem`` (this party's), ``roles.toml``
-(which certificate names are let in, and as what). `tactile bus keys` makes them.
+``ca.pem`` (the lab's own authority), ``cert.pem`` and ``key.pem`` (of this party), ``roles.toml``
+(the certificate names of each role). `tactile bus keys` makes them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class KeysError(Exception):
 
 
 class Roles(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Certificate names of each role; whoever is on no list is let do nothing."""
+    """Certificate names of each role; a name in no list has no rights."""
 
     tactiled: Annotated[
         tuple[str, ...], Meta(description="certificate names of those that publish boards")
@@ -41,14 +41,14 @@ class Roles(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     ] = ()
 
     def table(self) -> dict[CertificateRole, tuple[str, ...]]:
-        """Names by role."""
+        """Certificate names by role."""
         return {role: getattr(self, role) for role in CERTIFICATE_ROLES}
 
 
 class TlsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Mutual TLS: paths of PEM files, and the certificate names of each role (no others come in).
+    """Mutual TLS: paths of PEM files, and the certificate names of each role (others are refused).
 
-    ``name``: this party's own common name, so that what it may not ask can be told at once.
+    ``name``: this party's own common name, so that requests it may not make fail at once.
     """
 
     replaced: ClassVar[dict[str, str]] = {
@@ -63,7 +63,7 @@ class TlsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     name: Annotated[str, Meta(description="this party's own common name")] = ""
 
     def role(self) -> CertificateRole | None:
-        """Role of this party's own certificate, None where ``name`` does not say."""
+        """Role of this party's certificate; None if ``name`` is in no list."""
         return next(
             (role for role, names in self.roles.table().items() if self.name in names), None
         )
@@ -77,7 +77,7 @@ class RolesFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 def load_keys(folder: Path | str) -> TlsConfig:
-    """What a folder of keys says; `KeysError` when it is not whole."""
+    """Load a folder of keys. Raises `KeysError` if it is incomplete."""
     folder = Path(folder)
     if not folder.is_dir():
         raise KeysError(
@@ -100,7 +100,11 @@ def load_keys(folder: Path | str) -> TlsConfig:
 
 
 def check_keys(tls: TlsConfig) -> None:
-    """`KeysError` when a file is missing, or others of this machine can read the private key."""
+    """Check the key files.
+
+    Raises `KeysError` if one is missing, or if other users of this machine can read the private
+    key.
+    """
     for path in (tls.root_ca, tls.certificate, tls.private_key):
         try:
             with Path(path).open("rb") as file:

@@ -1,4 +1,4 @@
-"""Shapes for a 3D view: ``visualization_msgs/Marker``, the many fields nobody sets left empty."""
+"""Shapes for a 3D view: ``visualization_msgs/Marker`` with the rarely used fields left empty."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ARROW, CUBE, SPHERE, CYLINDER, SPHERE_LIST, TEXT = 0, 1, 2, 3, 7, 9
 """Kinds of marker, as ``visualization_msgs/Marker`` numbers them."""
 
 ADD, DELETE, DELETE_ALL = 0, 2, 3
-"""What a marker does to the one of its namespace and number, or to all of its topic."""
+"""Action of a marker on the one with its namespace and number, or on all of its topic."""
 
 Triple = tuple[float, float, float]
 Colour = tuple[float, float, float, float]
@@ -37,7 +37,7 @@ def marker(
 ) -> Any:
     """One upright shape. ``pose``: x, y, z in m and yaw in rad; ``size``: m along its own axes.
 
-    ``points``: of a list, or tail and tip of an arrow, m; ``colours``: one a point.
+    ``points``: of a list, or tail and tip of an arrow, m; ``colours``: one per point.
     """
     x, y, z, yaw = pose
     head = header(wall_ns, frame_id)
@@ -69,7 +69,7 @@ def marker(
 
 
 def wipe(wall_ns: int, frame_id: str) -> Any:
-    """The marker that takes away all earlier ones of its topic; first in an array."""
+    """Marker that deletes all earlier ones of its topic; put it first in an array."""
     nothing = (0.0, 0.0, 0.0)
     colour = (0.0, 0.0, 0.0, 0.0)
     pose = (0.0, 0.0, 0.0, 0.0)
@@ -79,7 +79,7 @@ def wipe(wall_ns: int, frame_id: str) -> Any:
 def frame_transform(
     wall_ns: int, parent: str, child: str, pose: tuple[float, float, float, float]
 ) -> Any:
-    """``TFMessage`` with the place of frame ``child`` in ``parent``: x, y, z in m, yaw in rad."""
+    """``TFMessage`` with the pose of frame ``child`` in ``parent``: x, y, z in m, yaw in rad."""
     x, y, z, yaw = pose
     turn = MSG.Quaternion(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
     place = MSG.Transform(MSG.Vector3(x, y, z), turn)

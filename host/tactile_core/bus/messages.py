@@ -24,8 +24,9 @@ from tactile_core.bus.topics import Topic
 from tactile_core.types import NS_PER_S, STAMP_END_NS
 
 MAX_PAYLOAD = 65536
-"""Bytes: largest message on the bus or in a log (faults.md row 22), so one forged length field or
-one runaway sender cannot take memory; the largest real message, RawChunk, stays below 20 kB."""
+"""Largest message on the bus or in a log, in bytes (faults.md row 22). It keeps a forged length
+field or a runaway sender from exhausting memory; the largest real message, RawChunk, stays below 20
+kB."""
 
 OWN_PACKAGE = "tactile_msgs"
 
@@ -67,7 +68,7 @@ SHORT_NAMES = {
         "visualization_msgs/msg/MarkerArray",
     )
 }
-"""Types that ``MSG.<name>`` finds by their last part."""
+"""Types available as ``MSG.<name>``, by the last part of their name."""
 
 LATER_FIELDS: Mapping[str, frozenset[str]] = {
     "tactile_msgs/msg/ArmState": frozenset({"commander", "command_sequence", "command_ns"}),
@@ -77,8 +78,8 @@ LATER_FIELDS: Mapping[str, frozenset[str]] = {
     "tactile_msgs/msg/SkinGeometry": frozenset({"array_posed"}),
     "tactile_msgs/msg/TaxelForces": frozenset({"normal_bound"}),
 }
-"""Fields that a type has got since its first version. Logs from before lack them, and are read:
-whoever goes by one has to do without it there."""
+"""Fields added since the first version of a type. Older logs lack them but can be read; users of
+such a field must do without it there."""
 
 NUMBER_TYPES = {
     "bool": np.bool_,
@@ -98,21 +99,21 @@ NUMBER_TYPES = {
 
 
 class DecodeError(ValueError):
-    """Bytes that are no message of the type they were said to be."""
+    """Bytes that are not a message of the expected type."""
 
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """Definition of a type as MCAP wants it (encoding ``ros2msg``)."""
+    """Definition of a type for MCAP (encoding ``ros2msg``)."""
 
     name: str
     encoding: str
     data: bytes
-    type_hash: str  # RIHS01, as rmw_zenoh and rosbag2 name it
+    type_hash: str  # RIHS01, as used by rmw_zenoh and rosbag2
 
 
 class Codec:
-    """CDR encoder and decoder over one type store. Safe to share between threads."""
+    """CDR encoder and decoder on one type store. Thread-safe."""
 
     def __init__(self) -> None:
         self._store = get_typestore(Stores.ROS2_HUMBLE)
@@ -130,18 +131,18 @@ class Codec:
         self._schemas: dict[str, Schema] = {}
 
     def message_class(self, msgtype: str) -> Any:
-        """Dataclass of ``package/msg/Name``; ValueError when the store has no such type."""
+        """Dataclass of ``package/msg/Name``. Raises ValueError if the store has no such type."""
         try:
             return self._store.types[msgtype]
         except KeyError:
             raise ValueError(f"no message type {msgtype!r}") from None
 
     def encode(self, kind: Topic | str, message: Any) -> bytes:
-        """CDR bytes, little-endian with encapsulation header.
+        """Encode as CDR bytes, little-endian with encapsulation header.
 
-        ValueError or TypeError for a message that is not of that type (wrong array type or shape,
-        wrong field type, more than MAX_PAYLOAD bytes): never bytes that would decode to other
-        values.
+        Raises ValueError or TypeError for a message that is not of that type (wrong array type or
+        shape, wrong field type, more than MAX_PAYLOAD bytes); never returns bytes that would decode
+        to other values.
         """
         msgtype = kind if isinstance(kind, str) else kind.msgtype
         checks = self._arrays.get(msgtype)
@@ -165,7 +166,7 @@ class Codec:
         return data
 
     def decode(self, kind: Topic | str, data: bytes | memoryview) -> Any:
-        """Message in ``data``; raises `DecodeError` and nothing else on any bytes.
+        """Decode ``data``; raises `DecodeError` and nothing else, whatever the bytes.
 
         Arrays of the message are read-only views of ``data``.
         """
@@ -180,7 +181,8 @@ class Codec:
             raise DecodeError(f"{msgtype} of {len(data)} bytes: {error}") from error
 
     def schema(self, kind: Topic | str) -> Schema:
-        """Name, encoding, definition text and hash of a type; ValueError when unknown."""
+        """Name, encoding, definition text and hash of a type. Raises ValueError if it is
+        unknown."""
         msgtype = kind if isinstance(kind, str) else kind.msgtype
         schema = self._schemas.get(msgtype)
         if schema is None:
@@ -194,14 +196,14 @@ class Codec:
         return schema
 
     def fields(self, msgtype: str) -> tuple[tuple[str, Any], ...]:
-        """Names and descriptions (rosbags' own) of a type's fields; ValueError when unknown."""
+        """Names and rosbags descriptions of a type's fields. Raises ValueError if it is unknown."""
         definition = self._store.fielddefs.get(msgtype)
         if definition is None:
             raise ValueError(f"no message type {msgtype!r}")
         return tuple(definition[1])
 
     def _annotate(self, msgtype: str, text: str) -> str:
-        """Put the remarks of our own definitions, with their units, beside the fields again."""
+        """Add the comments of our own definitions, with their units, to the fields."""
         notes = self._notes.get(msgtype.replace("/msg/", "/"), {})
         lines = []
         for line in text.splitlines():
@@ -212,18 +214,18 @@ class Codec:
         return "\n".join(lines) + "\n"
 
     def _find_arrays(self, msgtype: str) -> tuple[tuple[str, np.dtype[Any]], ...]:
-        """Fields of a type that must be numpy arrays: a same-sized wrong type encodes silently."""
+        """Fields that must be numpy arrays: a wrong type of the same size would encode silently."""
         found = []
         for name, description in self.fields(msgtype):
             if description[0] in (3, 4):  # rosbags Nodetype: array, sequence
                 element: Any = description[1][0]
-                if element[0] == 1 and element[1][0] in NUMBER_TYPES:  # of base type
+                if element[0] == 1 and element[1][0] in NUMBER_TYPES:  # base type
                     found.append((name, np.dtype(NUMBER_TYPES[element[1][0]])))
         return tuple(found)
 
 
 def _notes(definition: str) -> dict[str, str]:
-    """Remarks behind the fields of a ``.msg`` file, by field."""
+    """Comments after the fields of a ``.msg`` file, by field."""
     found = {}
     for line in definition.splitlines():
         field, _, remark = line.partition("#")
@@ -241,8 +243,8 @@ def _codec() -> Codec:
 
 
 def codec() -> Codec:
-    """The one codec of this process, built on first call (about 0.2 s)."""
-    with _building:  # else two threads that ask first would build two
+    """The shared codec of this process, built on the first call (about 0.2 s)."""
+    with _building:  # otherwise two first calls in parallel would build two
         return _codec()
 
 
@@ -250,7 +252,7 @@ class _Messages:
     """Attribute access to the classes named in `SHORT_NAMES`."""
 
     def __getattr__(self, name: str) -> Any:
-        """Class of ``name``, kept as an attribute so that later access costs nothing."""
+        """Class of ``name``, stored as an attribute so that later access is free."""
         try:
             full = SHORT_NAMES[name]
         except KeyError:
@@ -261,19 +263,19 @@ class _Messages:
 
 
 MSG = _Messages()
-"""``MSG.ContactFeatures`` and so on; see `SHORT_NAMES`."""
+"""Message classes such as ``MSG.ContactFeatures``; see `SHORT_NAMES`."""
 
 
 def message_class(msgtype: str) -> Any:
-    """Dataclass of any type of the store, by its full name ``package/msg/Name``."""
+    """Dataclass of any type in the store, by its full name ``package/msg/Name``."""
     return codec().message_class(msgtype)
 
 
 def stamp(wall_ns: int) -> Any:
     """``builtin_interfaces/Time`` of nanoseconds since the Unix epoch.
 
-    Its seconds are an int32, and readers take none below 0: a time before 1970 or after
-    2038-01-19 becomes 0, which in ROS means that there is no stamp.
+    Its seconds are an int32, and readers reject negative ones: a time before 1970 or after
+    2038-01-19 becomes 0, which in ROS means no time stamp.
     """
     if not 0 <= wall_ns < STAMP_END_NS:
         return MSG.Time(0, 0)
@@ -297,7 +299,7 @@ def log_message(wall_ns: int, level: int, name: str, text: str) -> Any:
 
 
 DROPS_PREFIX = "drops."
-"""Diagnostic values that count losses are called ``drops.<reason>``; `log info` shows them."""
+"""Prefix of diagnostic values that count losses, ``drops.<reason>``; `log info` shows them."""
 
 
 def diagnostic_status(

@@ -1,8 +1,8 @@
-"""Who may do what: the one table of roles, from which zenoh's access control is made.
+"""Access rights: the table of roles, from which zenoh's access control is generated.
 
-A role is what a certificate entitles to. Every process checks what comes in from a peer against the
-rights of that peer's certificate; what is not granted here is dropped. On the bus of one machine,
-which only its owner and group can enter (`runtime`), everybody has all rights.
+A certificate gives its holder a role. Every process checks the traffic from a peer against the
+rights of that peer's certificate and drops what they do not grant. On the bus of one machine, which
+only its owner and group can enter (`runtime`), everybody has all rights.
 """
 
 from __future__ import annotations
@@ -20,15 +20,16 @@ CERTIFICATE_ROLES: tuple[CertificateRole, ...] = (
     "operator",
     "viewer",
 )
-"""Daemons; operator: a person or tool that arms, gives goals, tares; viewer: looks on."""
+"""Roles: the daemons; operator, a person or tool that arms, gives goals and tares; viewer,
+read-only."""
 
 ASKS_ONLY = ("status", "geometry")
-"""Services that change nothing: every role may ask them."""
+"""Services that change nothing and are open to every role."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rights:
-    """Key expressions that a role may publish, ask (services), serve, and hold tokens at."""
+    """Key expressions that a role may publish, ask (services), serve, and declare tokens for."""
 
     publishes: tuple[str, ...] = ()
     asks: tuple[str, ...] = ()
@@ -37,7 +38,7 @@ class Rights:
 
 
 PREFIX = "replay/"
-"""What a replay puts before its keys."""
+"""Prefix of a replay's keys."""
 
 PUBLIC = tuple(
     f"{lead}{kind}/*/srv/{name}"
@@ -56,7 +57,7 @@ RIGHTS: Mapping[CertificateRole, Rights] = {
     ),
     "reachd": Rights(
         publishes=("arm/*/cmd_vel", "reach/**"),
-        # The arm itself hears none but its commander out: limits, clear, release.
+        # The arm accepts limits, clear and release only from its commander.
         asks=("arm/*/srv/*",),
         serves=("reach/*/srv/*",),
         tokens=("reach/*/alive", "arm/*/commander/*"),
@@ -75,11 +76,11 @@ RIGHTS: Mapping[CertificateRole, Rights] = {
 }
 
 READS = ("tactile/**", "arm/**", "reach/**", "reference/**", "world/**", "replay/**", "tf")
-"""What every role may hear."""
+"""Key expressions that every role may subscribe to."""
 
 
 def access_control(roles: Mapping[CertificateRole, Sequence[str]]) -> dict[str, Any]:
-    """zenoh's ``access_control`` for the certificate names of each role: all else is denied."""
+    """zenoh's ``access_control`` for the certificate names of each role; all else is denied."""
     rules: list[dict[str, Any]] = [
         _rule("hear", ["egress"], ["put", "delete", "liveliness_token"], [*READS, *PUBLIC]),
         _rule("be asked", ["egress"], ["query", "reply", "liveliness_query"], READS),
@@ -140,10 +141,10 @@ def _rule(name: str, flows: list[str], messages: list[str], keys: Sequence[str])
 
 
 def may_ask(role: str, key: str) -> bool:
-    """Whether a certificate of ``role`` entitles to ask the service at ``key``."""
+    """Whether a certificate of ``role`` may ask the service at ``key``."""
     import zenoh
 
-    rights = RIGHTS.get(role)  # type: ignore[call-overload]  # a name of no role has no rights
+    rights = RIGHTS.get(role)  # type: ignore[call-overload]  # an unknown role has no rights
     if rights is None:
         return False
     wanted = zenoh.KeyExpr(key)

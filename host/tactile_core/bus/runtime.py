@@ -1,8 +1,9 @@
-"""Where the processes of one rig meet on one machine: a folder, sockets in it, and a secret.
+"""Runtime folder: where the processes of one rig on one machine find each other.
 
-The folder is readable by its owner and group alone, so the kernel keeps everybody else out. The
-secret (`token_file`) proves the same over a loopback TCP port, which any user may open. It is the
-user's, not the rig's: rigs of one user side by side have folders of their own and one secret.
+It holds their sockets and a secret. Only its owner and group can read it, so the kernel keeps all
+others out. The secret (`token_file`) gives the same protection on a loopback TCP port, which any
+user may open. It belongs to the user rather than the rig: rigs of one user side by side have
+folders of their own but share one secret.
 """
 
 from __future__ import annotations
@@ -20,31 +21,32 @@ from dataclasses import dataclass
 from pathlib import Path
 
 RUNTIME_VARIABLE = "TACTILE_RUNTIME_DIR"
-"""Environment variable that names another folder to meet in: rigs side by side need one each."""
+"""Environment variable with another runtime folder: rigs side by side need one each."""
 
 SYSTEMD_VARIABLE = "RUNTIME_DIRECTORY"
-"""What systemd sets for a service with ``RuntimeDirectory=``; the first of several counts."""
+"""Variable that systemd sets for a service with ``RuntimeDirectory=``; the first of several folders
+is used."""
 
 SERVICE_FOLDER = Path("/run/tactile")
-"""Folder of installed services; whoever is in their group meets them there."""
+"""Runtime folder of installed services; members of their group join them there."""
 
 BUS = "bus"
-"""Folder of the sockets, below the runtime folder."""
+"""Folder of the sockets, inside the runtime folder."""
 
 TOKEN = "token"
-"""File of the secret, below the runtime folder: one line ``USER:SECRET``."""
+"""File of the secret, inside the runtime folder: one line ``USER:SECRET``."""
 
 USER = "rig"
-"""Name that goes with the secret; it says nothing about rights, for here all have the same."""
+"""User name that goes with the secret; it carries no rights, as all users here have the same."""
 
 MAX_SOCKET_PATH = 107
-"""Bytes a unix socket's path may have in Linux (108 with its closing zero)."""
+"""Longest path of a unix socket on Linux, in bytes (108 with its closing zero)."""
 
 ODD = re.compile(r"[?#;\s]")
-"""Characters that mean something else in a zenoh endpoint, or in its configuration."""
+"""Characters with a special meaning in a zenoh endpoint or configuration."""
 
 UNIX = "unixsock-stream/"
-"""What the endpoint of a unix socket begins with in zenoh."""
+"""Prefix of a unix socket's endpoint in zenoh."""
 
 
 class RuntimeFolderError(Exception):
@@ -53,7 +55,7 @@ class RuntimeFolderError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Runtime:
-    """A runtime folder. ``shared``: its group may join, as the services' own group may."""
+    """A runtime folder. ``shared``: its group may join, as with the services' group."""
 
     folder: Path
     shared: bool = False
@@ -64,25 +66,26 @@ class Runtime:
         return self.folder / BUS
 
     def endpoint(self, role: str) -> str:
-        """The zenoh endpoint of ``role``; `RuntimeFolderError` when no socket can be had here."""
+        """Zenoh endpoint of ``role``. Raises `RuntimeFolderError` if no socket is possible here."""
         check_socket_path(self.bus / f"{role}.sock")
         return f"{UNIX}{self.bus / role}.sock"
 
 
 def find_runtime() -> Runtime:
-    """Where to meet: the folder that the environment names, or `home`."""
+    """Runtime folder: the one named by the environment, or `home`."""
     given = os.environ.get(RUNTIME_VARIABLE)
     return Runtime(Path(given).absolute()) if given else home()
 
 
 def home() -> Runtime:
-    """The folder of a service, of the installed services for those in their group, or one's own."""
+    """Folder of this service; of the installed services for members of their group; or the user's
+    own."""
     from_systemd = os.environ.get(SYSTEMD_VARIABLE, "").partition(":")[0]
     if from_systemd:
         return Runtime(Path(from_systemd).absolute(), shared=True)
     if os.access(SERVICE_FOLDER / BUS, os.X_OK) and os.access(SERVICE_FOLDER / TOKEN, os.R_OK):
         return Runtime(SERVICE_FOLDER, shared=True)
-    # Not by the variable alone: what cron starts, which has none, must meet what a desktop starts.
+    # The variable alone is not enough: cron does not set it, but its jobs must meet the desktop's.
     for own in (os.environ.get("XDG_RUNTIME_DIR"), f"/run/user/{os.getuid()}"):
         if own and os.access(own, os.W_OK | os.X_OK):
             return Runtime(Path(own).absolute() / "tactile")
@@ -90,16 +93,16 @@ def home() -> Runtime:
 
 
 def _variable(runtime: Runtime) -> str:
-    """Environment variable that moves this folder: the secret stays where the user's home is."""
+    """Environment variable that selects this folder; the secret stays in the user's home folder."""
     given = os.environ.get(RUNTIME_VARIABLE)
     here = given is not None and runtime.folder == Path(given).absolute()
     return RUNTIME_VARIABLE if here else "XDG_RUNTIME_DIR"
 
 
 def prepare(runtime: Runtime) -> None:
-    """Make the folder of the sockets, mode 0750, or refuse one that others can get into.
+    """Create the folder of the sockets with mode 0750, or reject one that others can enter.
 
-    `RuntimeFolderError` when it belongs to somebody else or cannot be made.
+    Raises `RuntimeFolderError` if it belongs to another user or cannot be created.
     """
     for folder in (runtime.folder, runtime.bus):
         _prepare_folder(folder, runtime)
@@ -113,7 +116,7 @@ def _prepare_folder(folder: Path, runtime: Runtime) -> None:
     try:
         with contextlib.suppress(FileExistsError):
             folder.mkdir(mode=0o750, parents=True)
-            folder.chmod(0o750)  # whatever the umask
+            folder.chmod(0o750)  # regardless of the umask
         itself, found = folder.lstat(), folder.stat()
     except OSError as error:
         raise RuntimeFolderError(
@@ -136,9 +139,10 @@ def _prepare_folder(folder: Path, runtime: Runtime) -> None:
 
 
 def token_file(runtime: Runtime) -> tuple[Path, str]:
-    """The secret in this folder, made when there is none: its file, and the secret itself.
+    """Return the file of the secret and the secret, creating it if there is none.
 
-    `RuntimeFolderError` when it cannot be read, belongs to somebody else, or others can read it.
+    Raises `RuntimeFolderError` if it cannot be read, belongs to another user, or others can read
+    it.
     """
     path = runtime.folder / TOKEN
     if not path.exists():
@@ -168,7 +172,7 @@ def token_file(runtime: Runtime) -> tuple[Path, str]:
 
 
 def _make_token(path: Path, mode: int) -> None:
-    """Write a new secret at once: whoever comes at the same time gets the first one's."""
+    """Create the secret atomically: a process that comes second uses the first one's."""
     new = path.with_name(f".{TOKEN}-{os.getpid()}-{secrets.token_hex(4)}")
     file = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
     try:
@@ -182,14 +186,14 @@ def _make_token(path: Path, mode: int) -> None:
 
 
 def socket_path(endpoint: str) -> Path | None:
-    """File of a unix socket's endpoint, None for one of another kind."""
+    """Path of a unix socket's endpoint; None for any other endpoint."""
     if not endpoint.startswith(UNIX):
         return None
     return Path(endpoint.removeprefix(UNIX).partition("#")[0].partition("?")[0])
 
 
 def check_socket_path(path: Path) -> None:
-    """`RuntimeFolderError` when no socket can be had at ``path``."""
+    """Raise `RuntimeFolderError` if no socket is possible at ``path``."""
     length = len(os.fsencode(path))
     if length > MAX_SOCKET_PATH:
         raise RuntimeFolderError(
@@ -206,10 +210,10 @@ def check_socket_path(path: Path) -> None:
 
 
 class SocketLock:
-    """Held while a process listens at a socket, until its session has closed for good.
+    """Lock held while a process listens at a socket, until its session has closed completely.
 
-    zenoh's own lock is let go before its socket is deleted, so that a process which comes between
-    would listen at a file that is gone.
+    zenoh releases its own lock before it deletes the socket, so that a process starting in between
+    would listen at a deleted file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -217,7 +221,8 @@ class SocketLock:
         self._file: int | None = None
 
     def acquire(self) -> bool:
-        """Take it; False when another process has it. OSError when the folder does not allow it."""
+        """Acquire the lock; False if another process holds it. Raises OSError if the folder forbids
+        it."""
         file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -228,14 +233,15 @@ class SocketLock:
         return True
 
     def release(self) -> None:
-        """Let it go. The file stays: to delete it would let two hold locks of one name."""
+        """Release the lock. The file stays: deleting it would let two processes hold locks of one
+        name."""
         if self._file is not None:
             os.close(self._file)
             self._file = None
 
 
 def listener_of(path: Path) -> int | None:
-    """Process that listens at a unix socket, None when nobody does or the system does not say."""
+    """Process id of the listener at a unix socket; None if there is none or it is unknown."""
     if not hasattr(socket, "SO_PEERCRED"):
         return None
     try:

@@ -1,7 +1,7 @@
 """Requests and replies over zenoh queryables. Both are JSON: few, small, and read by people.
 
-A service always answers: a handler that fails, a request that is no JSON or of the wrong shape,
-and a reply that is too large all come back as an error (``{"error": text}``), never as silence.
+A service always answers. A failing handler, an invalid request and an oversized reply all return an
+error (``{"error": text}``) rather than silence.
 """
 
 from __future__ import annotations
@@ -24,22 +24,23 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 MAX_ERROR = 4096
-"""Characters of an error: some quote what was asked for."""
+"""Longest error in characters; some quote the request."""
 
 RETRY_PERIOD = 0.05
-"""s between questions while nobody serves the key: a new session takes a moment to find peers."""
+"""Interval in s between attempts while no service is found: a new session takes a moment to find
+its peers."""
 
 
 class ServiceError(Exception):
-    """The service answered with an error; the text is its reason. Handlers raise it, too."""
+    """The service answered with an error, whose text is the reason. Handlers raise it as well."""
 
 
 class NoAnswerError(ServiceError):
-    """Nobody answered."""
+    """No service answered."""
 
 
 class Service:
-    """A declared service. Handlers run one at a time on the service's own thread."""
+    """A declared service. Handlers run one at a time, on the service's own thread."""
 
     def __init__(
         self, session: zenoh.Session, key: str, handler: Callable[[Any], object], request: Any
@@ -52,12 +53,12 @@ class Service:
         self._queryable = session.declare_queryable(key, self._serve, complete=True)
 
     def close(self) -> None:
-        """Take the service back."""
-        with suppress(zenoh.ZError):  # the session has closed by itself
+        """Withdraw the service."""
+        with suppress(zenoh.ZError):  # the session is already closed
             self._queryable.undeclare()
 
     def _serve(self, query: zenoh.Query) -> None:
-        # A session that closes meanwhile leaves nobody to answer.
+        # If the session closes meanwhile, there is nobody to answer.
         with suppress(zenoh.ZError), query:
             try:
                 reply = self._answer(query)
@@ -76,7 +77,7 @@ class Service:
             raise ServiceError(f"request of {len(payload)} bytes: {MAX_PAYLOAD} allowed")
         try:
             request = self._decoder.decode(payload or b"{}")
-        except msgspec.DecodeError as error:  # ValidationError is one
+        except msgspec.DecodeError as error:  # includes ValidationError
             raise ServiceError(f"bad request: {error}") from error
         try:
             reply = msgspec.json.encode(self._handler(request))
@@ -96,18 +97,18 @@ def declare_service(
     handler: Callable[[Any], object],
     request: Any = dict[str, Any],
 ) -> Service:
-    """Answer requests at ``key`` with what ``handler`` returns (anything msgspec can encode).
+    """Serve requests at ``key`` with the result of ``handler`` (anything msgspec can encode).
 
-    ``request``: type the request is decoded to (a msgspec struct refuses unknown fields when it
-    says so). `ServiceError` from the handler is the caller's error text.
+    ``request``: type to which requests are decoded (a msgspec struct can forbid unknown fields). A
+    `ServiceError` from the handler is sent to the caller.
     """
     return Service(session, key, handler, request)
 
 
 def call(session: zenoh.Session, key: str, payload: object = None, timeout: float = 2.0) -> Any:
-    """Ask the service at ``key`` and return its reply; waits up to ``timeout`` s in all.
+    """Call the service at ``key`` and return its reply; waits at most ``timeout`` s in all.
 
-    `ServiceError` with the service's reason, or `NoAnswerError` when nobody answered.
+    Raises `ServiceError` with the service's reason, or `NoAnswerError` if there was no answer.
     """
     request = msgspec.json.encode({} if payload is None else payload)
     if len(request) > MAX_PAYLOAD:
@@ -129,7 +130,7 @@ def call(session: zenoh.Session, key: str, payload: object = None, timeout: floa
                 answer = _decode(key, reply.err.payload.to_bytes())
                 reason = answer.get("error") if isinstance(answer, dict) else answer
                 raise ServiceError(str(reason))
-            if reply.err is not None:  # zenoh's own: the peer took the request and did not answer
+            if reply.err is not None:  # zenoh's own: the peer got the request, no answer
                 raise NoAnswerError(f"no answer from {key} within {timeout:g} s")
         time.sleep(RETRY_PERIOD)
     config = config_of(session)
@@ -140,7 +141,7 @@ def call(session: zenoh.Session, key: str, payload: object = None, timeout: floa
 
 
 def _refuse_without_right(session: zenoh.Session, key: str) -> None:
-    """`ServiceError` where our own certificate does not entitle to ask: nobody would answer."""
+    """Raise `ServiceError` if our certificate does not allow the call: it would get no answer."""
     config = config_of(session)
     role = None if config is None or config.tls is None else config.tls.role()
     if role is not None and not may_ask(role, key):

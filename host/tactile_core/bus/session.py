@@ -1,13 +1,13 @@
 """zenoh sessions with the project's security defaults.
 
-A rig is one of three, and all of its processes are of one kind:
+All processes of a rig use the same one of three modes:
 
-- on one machine (the default): every role listens at a unix socket in a folder that only its owner
-  and group can enter (`runtime`), and connects to the roles before it; tools listen nowhere and
-  connect to all (one link a pair; two links between the same peers double the traffic). Loopback
-  TCP where it is asked for, too. Either way a peer must know the folder's secret.
-- with keys (``tls``): mutual TLS everywhere, rights by the role of the certificate (`rights`).
-- ``insecure``, by name: whoever reaches an endpoint may read and command.
+- One machine (the default): every role listens at a unix socket in a folder that only its owner and
+  group can enter (`runtime`), and connects to the roles before it. Tools do not listen and connect
+  to all roles (one link per pair: two links between the same peers double the traffic). Loopback
+  TCP is possible on request. In both cases a peer must know the folder's secret.
+- With keys (``tls``): mutual TLS everywhere; rights by the role of the certificate (`rights`).
+- ``insecure``, explicitly: whoever reaches an endpoint may read and command.
 """
 
 from __future__ import annotations
@@ -47,24 +47,26 @@ log = logging.getLogger(__name__)
 Role = Literal["tactiled", "reachd", "arm", "tool"]
 
 PORTS: dict[str, int] = {"tactiled": 7451, "reachd": 7452, "arm": 7453}
-"""TCP port of each role over TLS, in the order of who connects to whom: each to those before it.
-Not 7447, where a ROS 2 machine has its zenoh router."""
+"""TCP port of each role over TLS. Each role connects to those before it. Port 7447 is avoided, as a
+ROS 2 machine has its zenoh router there."""
 
 MAX_MESSAGE = MAX_PAYLOAD + 1024
-"""Bytes zenoh may reassemble: a full payload, its key, its attachment and headers."""
+"""Largest message in bytes that zenoh may reassemble: a full payload, its key, attachment and
+headers."""
 
 MAX_SESSIONS = 512
-"""Peers one process accepts: over TLS a certificate of the lab's takes a seat before its rights are
-looked at, and a hundred of them must leave room for three daemons and a dozen tools."""
+"""Peers that one process accepts. Over TLS, any certificate of the lab takes a place before its
+rights are checked; a hundred of them must leave room for three daemons and a dozen tools."""
 
 MAX_PENDING = 1024
-"""Connections whose handshake may be under way: those of strangers who say nothing among them."""
+"""Connections that may be in the handshake, including silent ones of strangers."""
 
 ACCEPT_TIMEOUT_MS = 2000
-"""A handshake takes 10 ms; who has not finished by then gives up the place."""
+"""A handshake takes 10 ms; slower peers lose their place."""
 
 CLOSE_TIMEOUT = 1.0
-"""s to wait for zenoh to close; it waits up to 10 s by itself for a peer that is stopped."""
+"""Time in s to wait for zenoh to close; zenoh itself waits up to 10 s for a peer that is
+stopped."""
 
 
 class BusError(Exception):
@@ -74,7 +76,7 @@ class BusError(Exception):
 class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How to join the bus. ``listen`` and ``connect``: zenoh endpoints; None: those of the role.
 
-    ``keys``: folder of keys (`keys`), or ``tls`` that names each file.
+    ``keys``: folder of keys (see module `keys`); ``tls`` names each file instead.
     """
 
     role: Role = "tool"
@@ -86,11 +88,11 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
     @property
     def certified(self) -> bool:
-        """Whether this rig has keys."""
+        """Whether this rig uses keys."""
         return self.tls is not None or self.keys is not None
 
     def with_keys(self) -> BusConfig:
-        """The same with what the folder of keys holds; `BusError` when it is not whole."""
+        """Return a copy with the keys loaded. Raises `BusError` if the folder is incomplete."""
         tls = self.tls
         try:
             if self.keys is not None:
@@ -102,13 +104,13 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         return msgspec.structs.replace(self, tls=tls)
 
     def listen_endpoints(self) -> tuple[str, ...]:
-        """Where this process listens."""
+        """Endpoints at which this process listens."""
         if self.listen is not None:
             return self.listen
         return (self._endpoint(self.role),) if self.role in PORTS else ()
 
     def connect_endpoints(self) -> tuple[str, ...]:
-        """Whom this process seeks, again and again, in the background."""
+        """Endpoints to which this process connects, retrying in the background."""
         if self.connect is not None:
             return self.connect
         roles = list(PORTS)
@@ -116,7 +118,7 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         return tuple(self._endpoint(role) for role in earlier)
 
     def meets(self) -> str:
-        """Where others are sought, in words that go on a sentence."""
+        """Where peers are looked for, as words to append to a sentence."""
         places = [*self.connect_endpoints(), *self.listen_endpoints()]
         paths = [path for path in map(socket_path, places) if path is not None]
         if self.connect is None and paths:
@@ -130,7 +132,7 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 def _is_local(endpoint: str) -> bool:
-    """Whether an endpoint cannot be reached from another machine."""
+    """Whether an endpoint is unreachable from other machines."""
     protocol, _, address = endpoint.partition("/")
     if protocol.startswith("unix"):
         return True
@@ -144,11 +146,12 @@ def _is_local(endpoint: str) -> bool:
 
 
 SECURE = ("tls/", "quic/")
-"""Beginnings of endpoints that certificates protect."""
+"""Prefixes of endpoints that certificates protect."""
 
 
 def _check_endpoints(config: BusConfig) -> None:
-    """Refuse what would open the bus to the network without TLS, or asks for TLS without keys."""
+    """Reject endpoints that open the bus to the network without TLS, or that need keys not
+    given."""
     for endpoint in (*config.listen_endpoints(), *config.connect_endpoints()):
         secure = endpoint.startswith(SECURE)
         if secure and config.tls is None:
@@ -183,7 +186,7 @@ def _tls_settings(tls: TlsConfig) -> dict[str, Any]:
             "connect_private_key": tls.private_key,
             "enable_mtls": True,
             "verify_name_on_connect": True,
-            # A certificate that expires while its peer is connected ends the link then.
+            # If a certificate expires while its peer is connected, the link ends.
             "close_link_on_expiration": True,
         },
         "access_control": access_control(tls.roles.table()),
@@ -200,14 +203,14 @@ def _secret_settings(runtime: Runtime) -> dict[str, Any]:
 
 
 def _zenoh_config(config: BusConfig) -> zenoh.Config:
-    """The whole zenoh configuration; nothing is taken from the environment."""
+    """The complete zenoh configuration; nothing is taken from the environment."""
     values: dict[str, Any] = {
         "mode": "peer",
         "listen/endpoints": list(config.listen_endpoints()),
         "listen/timeout_ms": 0,
         "listen/exit_on_failure": True,
         "connect/endpoints": list(config.connect_endpoints()),
-        "connect/timeout_ms": -1,  # never give up, in the background
+        "connect/timeout_ms": -1,  # retry forever, in the background
         "connect/exit_on_failure": False,
         "connect/retry": {
             "period_init_ms": 100,
@@ -221,7 +224,7 @@ def _zenoh_config(config: BusConfig) -> zenoh.Config:
         "transport/unicast/accept_pending": MAX_PENDING,
         "transport/unicast/accept_timeout": ACCEPT_TIMEOUT_MS,
         "transport/link/rx/max_message_size": MAX_MESSAGE,
-        # A message of several fragments may wait no longer than a small one when a link is full.
+        # When a link is full, a fragmented message may wait no longer than a small one.
         "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 1000,
         "transport/shared_memory/enabled": False,
     }
@@ -240,15 +243,15 @@ def _zenoh_config(config: BusConfig) -> zenoh.Config:
 
 
 def _brief(error: zenoh.ZError) -> str:
-    """A zenoh error without the places in its source code."""
+    """Text of a zenoh error without the source locations."""
     return str(error).partition(" at /")[0]
 
 
 def open_session(config: BusConfig) -> zenoh.Session:
-    """Join the bus; `BusError` with the remedy when the port is busy or the endpoint refused.
+    """Join the bus. Raises `BusError` with the remedy if the port is busy or the endpoint refused.
 
-    Returns at once: peers that are not there yet are sought in the background for ever. End it
-    with `close_session`; sessions still open when the interpreter exits are closed then.
+    Returns at once; peers that are not yet running are sought in the background. End the session
+    with `close_session`; those still open when the interpreter exits are closed then.
     """
     config = config.with_keys()
     locks: list[SocketLock] = []
@@ -262,7 +265,7 @@ def open_session(config: BusConfig) -> zenoh.Session:
                 locks.append(_hold(path, config.role))
         session = _open(settings, config)
         for lock in locks:
-            # With a group of its own, a service lets that in; otherwise the owner alone.
+            # A service with its own group admits that group; otherwise only the owner is admitted.
             lock.path.with_name(lock.path.name.removesuffix(".held")).chmod(
                 0o660 if runtime.shared else 0o600
             )
@@ -277,21 +280,22 @@ def open_session(config: BusConfig) -> zenoh.Session:
 
 
 def _prepare_sockets(config: BusConfig) -> Runtime:
-    """Check the paths of all sockets, and make the folder of those that are in ours."""
+    """Check the paths of all sockets, and create the runtime folder if they are in it."""
     runtime = find_runtime()
     for endpoint in (*config.listen_endpoints(), *config.connect_endpoints()):
         path = socket_path(endpoint)
         if path is None:
             continue
         check_socket_path(path)
-        # A peer's too: nobody else shall make the folder first and listen in it.
+        # Do so for peers as well, so that no other user can create the folder first and listen
+        # there.
         if path.parent == runtime.bus:
             prepare(runtime)
     return runtime
 
 
 def _hold(path: Path, role: str) -> SocketLock:
-    """Keep the place of a socket until the session has closed."""
+    """Lock a socket until the session has closed."""
     lock = SocketLock(path)
     try:
         held = lock.acquire()
@@ -334,7 +338,8 @@ def _example(where: str) -> str:
 
 
 def close_session(session: zenoh.Session, timeout: float = CLOSE_TIMEOUT) -> bool:
-    """Close within ``timeout`` s; False when zenoh still waits for a peer (it goes on alone)."""
+    """Close within ``timeout`` s; False if zenoh still waits for a peer (closing then
+    continues)."""
     if session.is_closed():
         return True
     opened = _open_sessions.pop(str(session.zid()), None)
@@ -354,18 +359,18 @@ def close_session(session: zenoh.Session, timeout: float = CLOSE_TIMEOUT) -> boo
 
 
 def open_sessions() -> list[zenoh.Session]:
-    """Sessions that this process has open, oldest first."""
+    """Open sessions of this process, oldest first."""
     return [opened.session for opened in _open_sessions.values()]
 
 
 def config_of(session: zenoh.Session) -> BusConfig | None:
-    """What a session that is open was opened with, None for one of somebody else's."""
+    """Configuration of an open session; None for one that `open_session` did not open."""
     opened = _open_sessions.get(str(session.zid()))
     return None if opened is None else opened.config
 
 
 def certificate_names(session: zenoh.Session) -> list[str]:
-    """Names of the certificates of the peers that are connected now."""
+    """Certificate names of the peers connected now."""
     names = set()
     with contextlib.suppress(zenoh.ZError):
         for link in session.info.links():
@@ -375,7 +380,7 @@ def certificate_names(session: zenoh.Session) -> list[str]:
 
 
 class _Open:
-    """A session with what it was opened with."""
+    """An open session with its configuration and socket locks."""
 
     def __init__(
         self, session: zenoh.Session, config: BusConfig, locks: Sequence[SocketLock]
@@ -393,9 +398,9 @@ def _close_all() -> None:
         close_session(opened.session)
 
 
-# zenoh serves callbacks from threads that end only with their session. Plain atexit hooks run after
-# the interpreter has joined those, so a forgotten session would hang the process: the hook that
-# concurrent.futures uses runs before.
+# zenoh runs callbacks on threads that end only with their session. Plain atexit hooks run after the
+# interpreter has joined those threads, so a forgotten session would hang the process. The hook used
+# by concurrent.futures runs earlier.
 _register: Callable[[Callable[[], None]], object] = getattr(
     threading, "_register_atexit", atexit.register
 )

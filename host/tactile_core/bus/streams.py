@@ -1,4 +1,4 @@
-"""Streams over zenoh: publishers that never block, and readers that only ever see the newest."""
+"""Streams over zenoh: publishers that never block, and readers that get only the newest sample."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from tactile_core.bus.messages import MAX_PAYLOAD
 from tactile_core.bus.topics import Topic, alive_key
 
 ATTACHMENT = struct.Struct("<qqB16s")
-"""Sequence number, wall-clock ns, length of the id, id of the publisher: rmw_zenoh's layout."""
+"""Sequence number, wall-clock ns, length of the id, id of the publisher; layout of rmw_zenoh."""
 
 WALL_LIMIT_NS = (1 << 63) - 1
 
 
 class Publisher:
-    """One stream, for one thread; drops when a link is full, never waits for a subscriber."""
+    """Publisher of one stream, for use by one thread. Drops when a link is full; never waits."""
 
     def __init__(self, session: zenoh.Session, key: str, msgtype: str) -> None:
         encoding = zenoh.Encoding.APPLICATION_CDR.with_schema(msgtype)
@@ -35,9 +35,9 @@ class Publisher:
         self.sequence = 0
 
     def put(self, data: bytes, wall_ns: int) -> None:
-        """Send CDR bytes stamped with their wall-clock time; ValueError above MAX_PAYLOAD.
+        """Send CDR bytes with their wall-clock stamp. Raises ValueError above MAX_PAYLOAD.
 
-        A time that the attachment cannot hold (64 bits of ns) becomes the nearest that it can.
+        A time beyond the 64 bits of the attachment (ns) is clipped.
         """
         if len(data) > MAX_PAYLOAD:
             raise ValueError(f"{len(data)} bytes on {self.key}: {MAX_PAYLOAD} allowed")
@@ -47,22 +47,22 @@ class Publisher:
         self._publisher.put(data, attachment=attachment)
 
     def close(self) -> None:
-        """Take the stream back."""
+        """Withdraw the stream."""
         self._publisher.undeclare()
 
 
 def declare_publisher(
     session: zenoh.Session, topic: Topic, name: str, prefix: str = ""
 ) -> Publisher:
-    """Stream ``topic`` of the board, arm or reach called ``name``."""
+    """Declare the publisher of ``topic`` for the board, arm or reach called ``name``."""
     return Publisher(session, topic.key(name, prefix), topic.msgtype)
 
 
 @dataclass(frozen=True, slots=True)
 class BusSample:
-    """What a publisher put. The last three are None where the sender attached nothing.
+    """One received sample. The last three fields are None if the sender attached nothing.
 
-    ``wall_ns``: the sender's stamp. ``source``: 16 bytes that tell one publisher from another.
+    ``wall_ns``: the sender's stamp. ``source``: 16 bytes that identify the publisher.
     """
 
     key: str
@@ -73,7 +73,7 @@ class BusSample:
 
 
 def read_sample(sample: zenoh.Sample) -> BusSample:
-    """Bytes of a sample and what its publisher said of itself."""
+    """Read a zenoh sample and its publisher's attachment."""
     sequence = wall_ns = source = None
     attachment = sample.attachment
     if attachment is not None and len(attachment) == ATTACHMENT.size:
@@ -83,10 +83,10 @@ def read_sample(sample: zenoh.Sample) -> BusSample:
 
 
 class Latest:
-    """Newest sample of a key; older ones that were not fetched are gone, and counted.
+    """Newest sample of a key. Older ones that were not fetched are dropped and counted.
 
-    zenoh keeps one sample (RingChannel), in its own threads, so the reader's age of data does not
-    grow however slow it is. ``skipped`` is exact for publishers of this project.
+    zenoh keeps one sample (RingChannel) on its own threads, so samples do not age however slow the
+    reader is. ``skipped`` is exact for publishers of this project.
     """
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
@@ -99,7 +99,7 @@ class Latest:
         self.refused = 0  # above MAX_PAYLOAD
 
     def newest(self) -> BusSample | None:
-        """The newest sample not fetched before, or None. Never blocks."""
+        """The newest sample not yet fetched, or None. Never blocks."""
         sample = self._subscriber.try_recv()
         if sample is None:
             return None
@@ -115,7 +115,7 @@ class Latest:
         return found
 
     def wait(self, timeout: float, period: float = 0.001) -> BusSample | None:
-        """The newest sample, waiting for one up to ``timeout`` s; None when none came."""
+        """The newest sample, waiting up to ``timeout`` s for one; None on timeout."""
         deadline = time.monotonic() + timeout
         while (sample := self.newest()) is None:
             if time.monotonic() >= deadline:
@@ -124,15 +124,16 @@ class Latest:
         return sample
 
     def close(self) -> None:
-        """Take the subscription back."""
+        """Unsubscribe."""
         self._subscriber.undeclare()
 
 
 class Tap:
-    """Every sample of a key expression, handed to ``take`` in zenoh's thread: for logs and watches.
+    """Passes every sample of a key expression to ``take``, on zenoh's thread: for logs and
+    monitors.
 
-    ``take`` must be quick, for what it leaves undone piles up: control reads `Latest` instead.
-    ``remote_only``: nothing that this session itself puts.
+    ``take`` must be quick, or samples pile up; control loops use `Latest` instead. ``remote_only``:
+    ignore samples that this session publishes.
     """
 
     def __init__(
@@ -150,7 +151,7 @@ class Tap:
         self._subscriber = session.declare_subscriber(key, self._hear, allowed_origin=origin)
 
     def close(self) -> None:
-        """Take the subscription back."""
+        """Unsubscribe."""
         self._subscriber.undeclare()
 
     def _hear(self, sample: zenoh.Sample) -> None:
@@ -161,17 +162,17 @@ class Tap:
 
 
 def latest(session: zenoh.Session, key: str) -> Latest:
-    """Subscribe for control or display: only ever the newest sample of ``key``."""
+    """Subscribe for control or display: only the newest sample of ``key``."""
     return Latest(session, key)
 
 
 def declare_alive(session: zenoh.Session, name: str) -> zenoh.LivelinessToken:
-    """Announce that someone publishes for ``name``. Information only: safety rests on data age."""
+    """Announce a publisher for ``name``. For information only: safety relies on the age of data."""
     return session.liveliness().declare_token(alive_key(name))
 
 
 def list_alive(session: zenoh.Session, timeout: float = 1.0) -> list[str]:
-    """Names with a liveliness token, sorted; asks until ``timeout`` s passed or one answered."""
+    """Sorted names with a liveliness token; asks until ``timeout`` s passed or one answered."""
     deadline = time.monotonic() + timeout
     names: set[str] = set()
     while not names:

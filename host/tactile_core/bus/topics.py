@@ -1,6 +1,6 @@
-"""The one table of topics: key, type, rate, whether logged, and when a value is too old to act on.
+"""Table of all topics: key, type, rate, whether logged, and when a value is too old to act on.
 
-Key building is here and nowhere else, so that another scheme (rmw_zenoh's) is a change of one file.
+Keys are built only here, so that another scheme (that of rmw_zenoh) would change one file.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ import re
 from dataclasses import dataclass
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,63}")
-"""What a board, arm or reach may be called: one chunk of a key expression, no wildcard."""
+"""Valid name of a board, arm or reach: one chunk of a key expression, without wildcards."""
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One stream. ``stale_after`` in s, None where age does not matter; ``rate`` in Hz, nominal."""
+    """One stream. ``stale_after`` in s, None if age does not matter; ``rate`` in Hz, nominal."""
 
     template: str
     msgtype: str
@@ -22,17 +22,17 @@ class Topic:
     published: bool = True
     logged: bool = True
     stale_after: float | None = None
-    latched: bool = False  # the last value holds until the next: repeated in every log file
+    latched: bool = False  # holds until the next value: repeated in every log file
 
     def key(self, name: str, prefix: str = "") -> str:
-        """Key expression for ``name``; ValueError when it is no single plain chunk."""
+        """Key expression for ``name``. Raises ValueError unless it is a single plain chunk."""
         if not NAME.fullmatch(name):
             raise ValueError(f"{name!r} is no name: letters, digits, _ and -, at most 64")
         key = self.template.format(name=name)
         return f"{prefix}/{key}" if prefix else key
 
     def channel(self, name: str) -> str:
-        """Name of the channel in a log: the key with the leading slash of a ROS topic."""
+        """Channel name in a log: the key with the leading slash of a ROS topic."""
         return "/" + self.key(name)
 
 
@@ -55,9 +55,9 @@ REACH_STATE = Topic("reach/{name}/state", f"{_OWN}/ReachState", 100)
 REACH_EVENT = Topic("reach/{name}/event", f"{_OWN}/ReachEvent", 0)
 TF = Topic("tf", "tf2_msgs/msg/TFMessage", 25)
 REFERENCE = Topic("reference/{name}/wrench", "geometry_msgs/msg/WrenchStamped", 100)
-"""What a load cell, a weight or a gauge says of the force on board ``name`` while it is calibrated:
-N that the environment exerts on the skin, in the axes of the taxels pressed, so that a press has a
-negative z. The header's stamp is when it was true."""
+"""Reference force on board ``name`` during calibration, from a load cell, weight or gauge: N that
+the environment exerts on the skin, in the axes of the pressed taxels, so that a press has a
+negative z. The header's stamp is the time of the measurement."""
 WORLD = Topic("world/{name}/objects", "visualization_msgs/msg/MarkerArray", 10)
 
 TOPICS = (
@@ -82,10 +82,11 @@ TOPICS = (
 
 
 def find_topic(key: str) -> tuple[Topic, str] | None:
-    """Topic and name that ``key`` (a key expression, or a channel of a log) was built from.
+    """Topic and name from which ``key`` (a key expression or log channel) was built; None if
+    unknown.
 
-    A leading slash (channels of a log have one) and a replay prefix are passed over. The name of
-    a topic that all share is the topic's own.
+    A leading slash (log channels) and a replay prefix are ignored. A topic shared by all has its
+    own name.
     """
     parts = key.strip("/").split("/")
     for topic in TOPICS:
@@ -99,7 +100,7 @@ def find_topic(key: str) -> tuple[Topic, str] | None:
 
 
 def service_key(name: str, service: str, kind: str = "tactile") -> str:
-    """Key of a queryable of a daemon.
+    """Key of a daemon's service.
 
     ``kind`` tactile: status, tare, set_rate, record, recalibrate, geometry; arm: claim, release,
     limits, clear, status; reach: goal, stop, reset, arm, clear, status.
@@ -108,10 +109,10 @@ def service_key(name: str, service: str, kind: str = "tactile") -> str:
 
 
 def alive_key(name: str, kind: str = "tactile") -> str:
-    """Key of the liveliness token of whoever publishes for ``name``. Information only."""
+    """Key of the liveliness token of the publisher for ``name``. For information only."""
     return Topic(kind + "/{name}/alive", "", 0).key(name)
 
 
 def commander_key(arm: str, reach: str) -> str:
-    """Key of the liveliness token of whoever commands an arm. Information only."""
+    """Key of the liveliness token of an arm's commander. For information only."""
     return Topic(f"arm/{arm}/commander/{{name}}", "", 0).key(reach)

@@ -1,6 +1,6 @@
 """Calibration of one board: where its taxels are and how field becomes force.
 
-The one place to import from; types, files and nominal figures live in modules of their own.
+Import from here; types, files and nominal figures are in separate modules.
 """
 
 from __future__ import annotations

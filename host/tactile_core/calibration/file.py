@@ -1,8 +1,8 @@
-"""Reading and writing calibration files: versioned TOML of plain numbers, nothing executable.
+"""Read and write calibration files: versioned TOML of plain numbers, nothing executable.
 
-Floats are written as their shortest exact decimals, so a file gives back the very numbers saved.
-The schema below says what a file may hold; what depends on other values of the file (numbers of
-rows, right-handed rotations) is checked as the calibration is built.
+Floats are written as their shortest exact decimals, so that loading restores the saved numbers
+exactly. The schema below defines what a file may hold; conditions between values (numbers of rows,
+right-handed rotations) are checked when the calibration is built.
 """
 
 from __future__ import annotations
@@ -54,21 +54,23 @@ from tactile_core.geometry import ArrayGeometry, Side
 
 FORMAT_NAME = "tactile-calibration"
 FORMAT_VERSION = 3
-"""2 added ``[[net]]``, fitted models of the whole contact; 3 ``posed``, for arrays whose place
-is not known. A file is written in the oldest version that holds what it says."""
+"""Version 2 added ``[[net]]``, fitted models of the whole contact; 3 ``posed``, for arrays in an
+unknown place. A file is written in the oldest version that can express its content."""
 SUFFIX = ".cal.toml"
 MAX_FILE_BYTES = 64 * 1024 * 1024
-"""Four arrays of 128 taxels with every coupling block come to about 13 MB of text."""
+"""Largest file in bytes. Four arrays of 128 taxels with every coupling block make about 13 MB of
+text."""
 WHOLLY_FOREIGN = 1 << 16
-"""Bytes within which a calibration says what it is: 64 MB of what is not take minutes."""
+"""A calibration must identify itself within this many bytes, as parsing 64 MB of anything else
+takes minutes."""
 MAX_TAXELS = 128
 """Largest array of the wire protocol."""
 ORTHONORMAL_TOLERANCE = 1e-6
-"""A rotation may differ this much from an orthonormal matrix: more is a typing error."""
+"""Largest deviation of a rotation from an orthonormal matrix; more is a typing error."""
 MAX_CHANNELS = 3 * 128 * 4
 """Channels of the largest board: four arrays of 128 taxels."""
 MAX_TERMS = 64
-"""Time constants or radii; more would not run in time."""
+"""Most time constants or radii; more would not run in time."""
 MAX_FIGURES = 100
 
 _SIDES = {side.name.lower(): side for side in Side}
@@ -240,7 +242,8 @@ class CalibrationFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
 
 def save(calibration: BoardCalibration, path: Path | str) -> None:
-    """Write ``calibration`` to ``path``; either the whole file appears or the old one stays."""
+    """Write ``calibration`` to ``path`` atomically: the old file stays until the new one is
+    complete."""
     path = Path(path)
     temporary = path.with_name(path.name + ".part")
     try:
@@ -253,7 +256,7 @@ def save(calibration: BoardCalibration, path: Path | str) -> None:
 
 
 def load(path: Path | str) -> BoardCalibration:
-    """Calibration in the file ``path``; `CalibrationError` names file, line, key and allowed."""
+    """Load the file ``path``. A `CalibrationError` names file, line, key and what is allowed."""
     try:
         text = read_text(path, MAX_FILE_BYTES)
     except ConfigError as error:
@@ -262,7 +265,7 @@ def load(path: Path | str) -> BoardCalibration:
 
 
 def saves(calibration: BoardCalibration) -> str:
-    """Text of a calibration file."""
+    """Format a calibration as the text of a file."""
     lines = [
         "# Calibration of one taxel board. Lengths in m, angles in deg, fields in uT, forces in N;",
         "# vectors in taxel axes (z is the outward normal) unless a key says otherwise.",
@@ -283,7 +286,7 @@ def saves(calibration: BoardCalibration) -> str:
 
 
 def loads(text: str, source: str = "calibration") -> BoardCalibration:
-    """Calibration from the text of a file; ``source`` names it in errors."""
+    """Parse the text of a calibration file; ``source`` names it in errors."""
     if len(text) > WHOLLY_FOREIGN and FORMAT_NAME not in text[:WHOLLY_FOREIGN]:
         raise CalibrationError(f"{source}: not a calibration: it does not say {FORMAT_NAME!r}")
     try:
@@ -321,7 +324,7 @@ def _calibration(document: Document) -> BoardCalibration:
 
 
 def _version(calibration: BoardCalibration) -> int:
-    """Oldest version of the format that holds all that ``calibration`` says."""
+    """Oldest version of the format that can express ``calibration``."""
     if not all(array.geometry.posed for array in calibration.arrays):
         return 3
     return 2 if calibration.nets else 1
@@ -359,7 +362,7 @@ def _array_lines(array: ArrayCalibration) -> Iterable[str]:
 
 
 def _net_lines(net: NetModel) -> Iterable[str]:
-    """Lines of one model."""
+    """Lines of one fitted model."""
     f = net.features
     yield "[[net]]"
     yield f"recipe = {quoted(net.recipe)}"
@@ -418,7 +421,7 @@ def _exact(value: float) -> str:
 
 
 def _check_printable(document: Document, keys: KeyPath) -> None:
-    """Refuse a text that cannot be shown: messages name boards by such."""
+    """Reject unprintable text, as messages show these names."""
     if not str(document.value(keys)).isprintable():
         raise document.wrong(keys, "a text of printable characters")
 

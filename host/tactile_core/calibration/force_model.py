@@ -1,8 +1,8 @@
-"""A fitted model of the net contact on a board, as values: plain arrays, nothing executable.
+"""Fitted model of the whole contact on a board: plain arrays, nothing executable.
 
-Unlike the matrices of the arrays, which are linear and know no past, it says what the contact as a
-whole is, from the field of all taxels now and before: creep, hysteresis and curvature included.
-`tactiled.sensing.forces` runs it.
+The matrices of the arrays are linear and have no memory. This model predicts the contact as a whole
+from the present and past field of all taxels, including creep, hysteresis and curvature.
+`tactiled.sensing.forces` evaluates it.
 """
 
 from __future__ import annotations
@@ -17,30 +17,31 @@ import numpy as np
 from tactile_core.arrays import FloatArray
 
 TARGET_UNITS = {"normal": "N", "shear": "N", "shear_x": "N", "shear_y": "N", "x": "mm", "y": "mm"}
-"""What a model may predict. ``normal``: force into the skin, positive when pressed. ``shear_x``,
-``shear_y``: force on the skin along its axes; ``shear``: along the one axis of a rig that measures
-no other. ``x``, ``y``: place of the contact in the frame of the rig that moved the probe."""
+"""Possible targets of a model. ``normal``: force into the skin, positive when pressed. ``shear_x``,
+``shear_y``: force on the skin along its axes; ``shear``: along the only axis that the rig measures.
+``x``, ``y``: place of the contact in the frame of the rig that moved the probe."""
 
 MAX_FEATURES = 4096
-"""A readout of more inputs would not run within the 0.3 ms that a frame may cost."""
+"""Most features. A readout of more would not run within the 0.3 ms that a frame may take."""
 MAX_UNITS = 4096
-"""Widest layer; same reason."""
+"""Widest layer, for the same reason."""
 MAX_DEGREE = 5
 MAX_CURVED = 16
-"""Components whose products are features: 16 of degree 3 make 952."""
+"""Most components whose products are features: 16 of degree 3 make 952."""
 MAX_LAYERS = 8
 
 
 class NetModelError(ValueError):
-    """A model whose numbers do not fit together; names the field, what it is and must be."""
+    """Inconsistent numbers of a model; the text names the field, its value and what is allowed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RestTracker:
-    """How the rest field is followed: causal, and only while the skin is at rest.
+    """Tracking of the rest field: causal, and only while the skin is at rest.
 
-    A field within ``near_ut`` µT of the rest (norm over all channels) and within ``still_ut`` of
-    its own one-second mean counts as untouched; the rest then follows it with ``tau_s`` s.
+    A field within ``near_ut`` µT of the rest field (norm over all channels) and within ``still_ut``
+    µT of its own one-second mean counts as untouched; the rest field then follows it with time
+    constant ``tau_s``.
     """
 
     near_ut: float
@@ -62,12 +63,12 @@ class Layer:
 
     @property
     def inputs(self) -> int:
-        """Length of the vector it takes."""
+        """Length of the input vector."""
         return int(self.weights.shape[1 if self.kind == "rbf" else 0])
 
     @property
     def outputs(self) -> int:
-        """Length of the vector it gives."""
+        """Length of the output vector."""
         return int(self.weights.shape[0 if self.kind == "rbf" else 1])
 
 
@@ -85,12 +86,12 @@ class Figure:
 class FeatureMap:
     """Features of the field and its history. n taxels, k components, F features.
 
-    ``projection``: (3n, k), component = change of field from rest (µT, taxel axes) times this.
-    ``degree``: products of the first ``curved`` components up to this many factors are features.
-    ``taus_s``: (T,) s, leaky integrators of the first ``lagged`` components; the features are
-    component minus integrator, alone and times powers of the first component up to ``lag_degree``.
-    ``radii``: (P,) play operators (Prandtl-Ishlinskii) of the same components; features likewise.
-    ``direction``: the components' unit vector is a feature.
+    ``projection``: (3n, k); components = change of field from rest (µT, taxel axes) times this.
+    ``degree``: products of the first ``curved`` components, up to this many factors, are features.
+    ``taus_s``: (T,) s, leaky integrators of the first ``lagged`` components; features are component
+    minus integrator, alone and times powers of the first component up to ``lag_degree``. ``radii``:
+    (P,) play operators (Prandtl-Ishlinskii) of the same components, with features of the same form.
+    ``direction``: the unit vector of the components is a feature.
     """
 
     tracker: RestTracker | None
@@ -104,7 +105,7 @@ class FeatureMap:
     direction: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse numbers that cannot be used."""
+        """Reject unusable numbers."""
         if self.projection.ndim != 2 or self.projection.shape[0] % 3:
             raise NetModelError(f"projection has {len(self.projection)} rows, not 3 a taxel")
         k = self.components
@@ -132,17 +133,17 @@ class FeatureMap:
 
     @property
     def channels(self) -> int:
-        """3n."""
+        """Number of channels, 3n."""
         return int(self.projection.shape[0])
 
     @property
     def components(self) -> int:
-        """k."""
+        """Number of components, k."""
         return int(self.projection.shape[1])
 
     @property
     def size(self) -> int:
-        """F, length of the feature vector."""
+        """Length of the feature vector, F."""
         history = self.lagged * (len(self.taus_s) + len(self.radii))
         products = len(monomials(self.curved, self.degree))
         unit = self.components if self.direction else 0
@@ -151,12 +152,12 @@ class FeatureMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NetModel:
-    """Features of the field's history, and a readout of them.
+    """Features of the field's history and a readout of them.
 
-    ``mean``, ``scale``: (F,) of the features. ``layers``: readout, the last one linear to
-    ``targets``. ``floor``: least value of each target, -inf for none. ``recipe``: what the fit was
-    called. ``delay_s``: by how much the labels lagged behind the field; it was taken out in the
-    fit and costs nothing when the model runs. ``figures``: errors, and how they were obtained.
+    ``mean``, ``scale``: (F,) of the features. ``layers``: readout; the last one is linear to
+    ``targets``. ``floor``: least value of each target, -inf for none. ``recipe``: name of the fit.
+    ``delay_s``: delay of the labels behind the field; the fit removed it, so it adds none at run
+    time. ``figures``: errors and how they were obtained.
     """
 
     recipe: str
@@ -170,7 +171,7 @@ class NetModel:
     figures: tuple[Figure, ...]
 
     def __post_init__(self) -> None:
-        """Refuse shapes that disagree and numbers that cannot be used."""
+        """Reject inconsistent shapes and unusable numbers."""
         _finite(
             ("mean", self.mean),
             ("scale", self.scale),
@@ -206,11 +207,11 @@ class NetModel:
 
     @property
     def taxels(self) -> int:
-        """Taxels of the board."""
+        """Number of taxels of the board."""
         return self.features.channels // 3
 
     def digest(self, text: Callable[[str], None], numbers: Callable[[FloatArray], None]) -> None:
-        """Give everything that the model says to ``text`` and ``numbers`` of a hash."""
+        """Pass the whole model to ``text`` and ``numbers``, which feed a hash."""
         f = self.features
         text(f"{self.recipe}/{','.join(self.targets)}/{f.degree}/{f.curved}/{f.lagged}")
         text(f"{f.lag_degree}/{f.direction}/{f.tracker is not None}")
@@ -234,9 +235,9 @@ def _finite(*named: tuple[str, FloatArray]) -> None:
             raise NetModelError(f"{name} is not finite")
 
 
-@lru_cache(maxsize=64)  # few models are in use; asked for in every frame
+@lru_cache(maxsize=64)  # called in every frame, with few models in use
 def monomials(components: int, degree: int) -> tuple[tuple[int, ...], ...]:
-    """Products of 2 to ``degree`` of the first ``components`` components, as their indices."""
+    """Products of 2 to ``degree`` of the first ``components`` components, as tuples of indices."""
     out: list[tuple[int, ...]] = []
     last: list[tuple[int, ...]] = [(i,) for i in range(components)]
     for _ in range(degree - 1):

@@ -1,7 +1,7 @@
-"""Calibrations made of typical figures, for boards nobody has calibrated yet.
+"""Nominal calibrations from typical figures, for boards that were never calibrated.
 
-They give positions that are right for a known model and forces that are right to a factor of
-about two; their rest field is unknown and must be tared.
+Positions are right for a known model; forces are accurate to within a factor of about two. The rest
+field is unknown and must be tared.
 """
 
 from __future__ import annotations
@@ -25,31 +25,32 @@ from tactile_core.geometry import (
 )
 
 SENSITIVITY_UT_PER_N = {"finger": (152.0, 152.0), "anyskin": (115.0, 115.0)}
-"""µT/N of a shear and of a normal force on the nearest magnetometer.
+"""Field in µT per N of shear and of normal force, on the nearest magnetometer.
 
 ``anyskin``: eFlesh recordings, 34 N → 3.9 mT. ``finger``: a magnet 4 mm above its chip changes the
-field by 3.8 mT/mm sideways (8.0 towards it) and a 16 mm pad gives way by 1 mm in 25 N of shear
-(50 N of pressure). A pad is half as stiff in shear as in pressure and its magnet half as effective,
-so that the two come out alike on both.
+field by 3.8 mT/mm sideways (8.0 towards it), and a 16 mm pad yields 1 mm under 25 N of shear (50 N
+of pressure). A pad is half as stiff in shear as in pressure and its magnet half as effective, so
+that both directions are equal.
 """
 
 REFERENCE_C = 25.0
 ANYSKIN_PITCH = 0.008
-"""m between neighbouring magnetometers of an AnySkin board."""
+"""Distance in m between neighbouring magnetometers of an AnySkin board."""
 ANYSKIN_BOARD_PITCH = 0.030
-"""m between the centres of AnySkin boards on one controller, until a file says how they lie: far
-enough apart for a picture. They sit on different fingers or jaws, so nothing follows from it."""
+"""Distance in m between the centres of AnySkin boards on one controller, until a file gives their
+places: far enough apart to be shown. They sit on different fingers or jaws, so nothing follows from
+it."""
 MAX_ANYSKIN_MAGNETOMETERS = 20
-"""One controller reads four boards of five."""
+"""Four boards of five on one controller."""
 
 NOMINAL_MODELS = ("finger", "anyskin")
 
 
 def nominal_newton_per_ut(taxels: int, shear: float, normal: float) -> FloatArray:
-    """(3n, 3n) N/µT without coupling between taxels, from µT/N of shear and normal force.
+    """Force matrix, (3n, 3n) N/µT, without coupling, from µT/N of shear and of normal force.
 
-    Magnets point away from the chips: a press (negative z) brings them nearer and raises B_z,
-    a force along +x carries them towards +x and raises B_x.
+    Magnets point away from the chips: a press (negative z) brings them nearer and raises B_z; a
+    force along +x moves them towards +x and raises B_x.
     """
     return np.diag(np.tile([1 / shear, 1 / shear, -1 / normal], taxels))
 
@@ -60,11 +61,11 @@ def nominal(
     magnetometers: int | None = None,
     arrays: Sequence[int] | None = None,
 ) -> BoardCalibration:
-    """Typical figures for ``model``, one of `NOMINAL_MODELS`; ValueError for any other.
+    """Nominal calibration of ``model``, one of `NOMINAL_MODELS`; ValueError for any other.
 
     ``magnetometers``: of an ``anyskin`` controller, 1 to 20, numbered as on its bus. ``arrays``:
-    how many of them each of its boards has; None: fives where that goes up, else all one array.
-    Where several boards lie to one another nobody knows: their arrays are not ``posed``.
+    number of magnetometers of each board; None: fives if they divide the total, otherwise one
+    array. The relative places of several boards are unknown, so their arrays are not ``posed``.
     """
     if model == "finger":
         if magnetometers is not None:
@@ -77,10 +78,10 @@ def nominal(
 
 
 def nominal_from_descriptor(descriptor: Descriptor) -> BoardCalibration:
-    """Typical figures for the board that sent ``descriptor``.
+    """Nominal calibration of the board that sent ``descriptor``.
 
-    A known model whose arrays have the same shapes gets that model's geometry; any other gets
-    flat grids of the descriptor's rows, columns and pitch, all at the tip and not ``posed``.
+    A known model whose arrays have the expected shapes gets that model's geometry. Any other gets
+    flat grids with the descriptor's rows, columns and pitch, all at the tip and not ``posed``.
     """
     shapes = [(a.rows, a.columns) for a in descriptor.arrays]
     if descriptor.model == "finger":
@@ -118,13 +119,13 @@ def _typical(geometry: SkinGeometry, serial_number: str, what: str) -> BoardCali
 
 
 def default_arrays(magnetometers: int) -> tuple[int, ...]:
-    """How many magnetometers each board of an AnySkin controller has, where nobody says it."""
+    """Default number of magnetometers of each board of an AnySkin controller."""
     boards, rest = divmod(magnetometers, ANYSKIN_CHIPS)
     return (magnetometers,) if rest else (ANYSKIN_CHIPS,) * boards
 
 
 def _anyskin_controller(magnetometers: int, arrays: Sequence[int] | None) -> SkinGeometry:
-    """The boards of one controller side by side; a plain row for a board that has not five."""
+    """Boards of one controller side by side; a board without five magnetometers is a plain row."""
     if not 1 <= magnetometers <= MAX_ANYSKIN_MAGNETOMETERS:
         raise ValueError(
             f"{magnetometers} magnetometers: an AnySkin controller reads 1 to "
@@ -156,7 +157,7 @@ def _anyskin_controller(magnetometers: int, arrays: Sequence[int] | None) -> Ski
 def _board(five: ArrayGeometry, name: str, size: int, sideways: float) -> ArrayGeometry:
     """One board of ``size`` magnetometers, ``sideways`` m along its x from the place of ``five``.
 
-    Nobody said where it is mounted: it is not posed.
+    Its mounting is unknown, so it is not posed.
     """
     axes = five.rotation[0]
     shift = sideways * axes[:, 0]

@@ -1,4 +1,4 @@
-"""Calibration of one board as values: its taxels' places, rest fields and force model."""
+"""Values of a board's calibration: places of its taxels, rest fields and force model."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from tactile_core.calibration.force_model import NetModel
 from tactile_core.geometry import ArrayGeometry, SkinGeometry
 
 YAW_DECIMALS = 9
-"""Chip yaw is kept in degrees in files; this many decimals make degrees → radians → degrees the
-identity, so a calibration keeps its hash through a file."""
+"""Files hold chip yaw in degrees; with this many decimals, degrees → radians → degrees is the
+identity, so that saving and loading keeps the hash."""
 
 
 class CalibrationError(ValueError):
-    """A calibration that cannot be used; names file, key, what was given and what is allowed."""
+    """Unusable calibration; the text names file, key, value and what is allowed."""
 
 
-class CalibrationMismatch(CalibrationError):  # noqa: N818 - the name users know from the messages
-    """A calibration that belongs to another board; names both serial numbers."""
+class CalibrationMismatch(CalibrationError):  # noqa: N818 - users know the name from messages
+    """Calibration of another board; the text names both serial numbers."""
 
     def __init__(self, calibrated: str, board: str, source: str = "the calibration") -> None:
         self.calibrated = calibrated
@@ -34,11 +34,11 @@ class CalibrationMismatch(CalibrationError):  # noqa: N818 - the name users know
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArrayCalibration:
-    """One array of n taxels; all vectors in taxel axes (after the chips' yaw was undone).
+    """Calibration of one array of n taxels; vectors in taxel axes (after undoing the chips' yaw).
 
     ``rest_ut``: (n, 3) µT unloaded, at ``reference_c`` °C. ``drift_ut_per_k``: (n, 3) µT/K.
     ``newton_per_ut``: (3n, 3n) N/µT; the taxels' forces, one after another, are this matrix times
-    their fields (rest, drift and ambient taken off). Off-diagonal blocks undo crosstalk.
+    their fields (without rest, drift and ambient field). Off-diagonal blocks undo crosstalk.
     """
 
     geometry: ArrayGeometry
@@ -48,7 +48,7 @@ class ArrayCalibration:
     newton_per_ut: FloatArray
 
     def __post_init__(self) -> None:
-        """Refuse shapes that disagree with the geometry, and numbers that are not finite."""
+        """Reject shapes that do not match the geometry, and numbers that are not finite."""
         n = self.geometry.taxels
         for label, array, shape in (
             ("rest_ut", self.rest_ut, (n, 3)),
@@ -69,9 +69,9 @@ class ArrayCalibration:
 class BoardCalibration:
     """Calibration of the board with ``serial_number``.
 
-    ``nominal``: made from typical figures, not from measurements of this board; then the rest
-    field is unknown and must be tared. ``nets``: fitted models of the contact as a whole, each
-    with targets of its own; the arrays' matrices then only say how it is shared among taxels.
+    ``nominal``: from typical figures instead of measurements of this board; the rest field is then
+    unknown and must be tared. ``nets``: fitted models of the whole contact, each with its own
+    targets; the arrays' matrices then only distribute it over the taxels.
     """
 
     serial_number: str
@@ -84,7 +84,7 @@ class BoardCalibration:
     nets: tuple[NetModel, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse models of another number of taxels, and two for the same target."""
+        """Reject models for another number of taxels, and two models for one target."""
         taxels = sum(array.geometry.taxels for array in self.arrays)
         seen: set[str] = set()
         for i, net in enumerate(self.nets):
@@ -104,7 +104,7 @@ class BoardCalibration:
 
     @property
     def hash(self) -> str:
-        """SHA-256 over everything the calibration says, 64 hex digits; the same after a file."""
+        """SHA-256 of the whole calibration, 64 hex digits; unchanged by saving and loading."""
         digest = hashlib.sha256()
 
         def text(value: str) -> None:
@@ -112,7 +112,7 @@ class BoardCalibration:
             digest.update(len(data).to_bytes(4, "little") + data)
 
         def numbers(value: FloatArray) -> None:
-            digest.update(np.ascontiguousarray(value + 0.0, "<f8").tobytes())  # -0 counts as 0
+            digest.update(np.ascontiguousarray(value + 0.0, "<f8").tobytes())  # -0 is hashed as 0
 
         for value in (self.serial_number, self.model, self.frame, self.created, self.provenance):
             text(value)
@@ -131,11 +131,11 @@ class BoardCalibration:
         return digest.hexdigest()
 
     def require_board(self, serial_number: str, source: str = "the calibration") -> None:
-        """Raise `CalibrationMismatch` unless this calibration is that board's own."""
+        """Raise `CalibrationMismatch` unless the calibration belongs to that board."""
         if serial_number != self.serial_number:
             raise CalibrationMismatch(self.serial_number, serial_number, source)
 
 
 def yaw_degrees(yaw: FloatArray) -> FloatArray:
-    """Chip yaw in degrees as files carry it; ``yaw`` in rad."""
+    """Convert chip yaw from rad to degrees, rounded as in files."""
     return np.asarray(np.round(np.rad2deg(yaw), YAW_DECIMALS) + 0.0, np.float64)
