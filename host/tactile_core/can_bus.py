@@ -1,4 +1,4 @@
-"""Naming and opening CAN buses: what the daemon and the simulator must agree on."""
+"""Names and opening of CAN buses, shared by daemon and simulator."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ FORM = "INTERFACE:CHANNEL[@BITRATE[/DATA_BITRATE]][+fd], as in socketcan:can0, \
 slcan:/dev/ttyACM1@1000000, virtual:0"
 
 DEFAULT_BITRATE = 1_000_000
-"""bit/s where none is given and the adapter must be told one."""
+"""Default bit rate in bit/s, for adapters that need one."""
 
 DEFAULT_DATA_BITRATE = 2_000_000
-"""bit/s of the data phase of CAN FD where none is given."""
+"""Default bit rate in bit/s of the CAN FD data phase."""
 
 RX_QUEUE = 4096
-"""Frames of a virtual bus held for a reader: half a second of a full 1 Mbit/s bus. Its default is
-no limit at all."""
+"""Frames queued for a reader of a virtual bus: half a second of a full 1 Mbit/s bus. By default the
+queue is unbounded."""
 
 CAN_LINK_TYPE = "280"  # ARPHRD_CAN
 
@@ -49,7 +49,7 @@ class Trouble(Enum):
 
 
 class CanUnavailable(Exception):  # noqa: N818 - names a state of the bus
-    """A bus that cannot be opened, and the remedy."""
+    """The bus cannot be opened; the text names the remedy."""
 
     def __init__(self, trouble: Trouble, problem: str, remedy: str) -> None:
         super().__init__(f"{problem}; {remedy}")
@@ -60,7 +60,7 @@ class CanUnavailable(Exception):  # noqa: N818 - names a state of the bus
 
 @dataclass(frozen=True, slots=True)
 class CanSpec:
-    """One CAN bus. Rates in bit/s; None: as the interface is already set."""
+    """One CAN bus. Rates in bit/s; None: as the interface is already configured."""
 
     interface: str
     channel: str
@@ -70,7 +70,7 @@ class CanSpec:
 
     @classmethod
     def parse(cls, text: str) -> CanSpec:
-        """Read a bus as users write it; ValueError names what is allowed."""
+        """Parse a bus as written by users. The ValueError it raises names what is allowed."""
         match = _SPEC.fullmatch(text)
         if match is None:
             raise ValueError(f"{text!r} is no CAN bus; allowed: {FORM}")
@@ -81,7 +81,7 @@ class CanSpec:
         return cls(match["interface"], match["channel"], bitrate, data, match["fd"] is not None)
 
     def __str__(self) -> str:
-        """The bus as users write it."""
+        """The syntax that users write."""
         rate = "" if self.bitrate is None else f"@{self.bitrate}"
         if self.data_bitrate is not None:
             rate += f"/{self.data_bitrate}"
@@ -89,11 +89,11 @@ class CanSpec:
 
 
 def open_bus(spec: CanSpec) -> can.BusABC:
-    """Open any interface python-can has; raises `CanUnavailable` with the remedy."""
+    """Open any python-can interface. Raises `CanUnavailable` with the remedy."""
     import can
     from can.interfaces import VALID_INTERFACES
 
-    # python-can logs as errors what it also raises; the raised one carries the remedy.
+    # python-can logs the errors that it also raises; the raised one carries the remedy.
     logging.getLogger("can.interfaces").setLevel(logging.CRITICAL)
     if spec.interface not in VALID_INTERFACES:
         raise CanUnavailable(
@@ -119,7 +119,8 @@ def open_bus(spec: CanSpec) -> can.BusABC:
     except OSError as error:
         raise _explain(spec, error) from error
     except (can.CanError, ImportError, NameError, AttributeError, TypeError, ValueError) as error:
-        # Drivers of absent vendor libraries fail in all these ways; each means the same to a user.
+        # Drivers without their vendor library fail in all these ways; each means the same to a
+        # user.
         raise CanUnavailable(
             Trouble.MISSING,
             f"cannot open {spec}: {error}",
@@ -129,14 +130,14 @@ def open_bus(spec: CanSpec) -> can.BusABC:
 
 
 def can_links() -> list[str]:
-    """Names of the CAN interfaces of the kernel."""
+    """Names of the kernel's CAN interfaces."""
     found = []
     for link in sorted(Path("/sys/class/net").glob("*/type")):
         try:
             if link.read_text(encoding="ascii").strip() == CAN_LINK_TYPE:
                 found.append(link.parent.name)
         except OSError:
-            continue  # it was taken away meanwhile
+            continue  # removed meanwhile
     return found
 
 
@@ -153,7 +154,7 @@ def _check_link(channel: str) -> None:
     try:
         flags = int(Path(f"/sys/class/net/{channel}/flags").read_text(encoding="ascii"), 16)
     except OSError:
-        return  # taken away meanwhile: opening it says so
+        return  # removed meanwhile: opening it reports that
     if not flags & 1:  # IFF_UP
         kind = "" if channel.startswith("vcan") else f" type can bitrate {DEFAULT_BITRATE}"
         raise CanUnavailable(
@@ -184,7 +185,7 @@ def _explain(spec: CanSpec, error: OSError) -> CanUnavailable:
 
 
 def to_message(frame: CanFrame) -> can.Message:
-    """Frame as python-can sends it; FD frames switch bit rate."""
+    """Convert a frame for python-can; FD frames switch bit rate."""
     import can
 
     return can.Message(
@@ -198,9 +199,10 @@ def to_message(frame: CanFrame) -> can.Message:
 
 
 def from_message(message: can.Message) -> CanFrame | str:
-    """Frame of a python-can message, or why it is none of ours: ``standard_id``, ``remote_frame``.
+    """Convert a python-can message, or return why it is not of this protocol: ``standard_id`` or
+    ``remote_frame``.
 
-    The channel name that a virtual bus puts in, its time stamps and flags are dropped.
+    The channel name added by a virtual bus, time stamps and flags are dropped.
     """
     if message.is_error_frame:
         return CanFrame(message.arbitration_id, bytes(message.data), error=True)

@@ -1,7 +1,7 @@
-"""Command lines: the parser, parsers of values, common options, exit codes, live lines, progress.
+"""Command lines: parser, value parsers, common options, exit codes, live lines, progress bars.
 
-Imports only what argparse needs; rich and everything else that takes time to load is imported
-where it is used, so that ``--help`` of any command answers at once.
+Only what argparse needs is imported at the top. rich and other slow modules are imported where they
+are used, so that ``--help`` of any command answers at once.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 DONE, FAILED, USAGE, REFUSED = range(4)
-"""Exit status: the job was done; it was not; bad argument or configuration; hardware, peer or
-system did not allow it."""
+"""Exit status: done; not done; bad argument or configuration; refused by hardware, peer or
+system."""
 
 INTERRUPTED, PIPE_CLOSED = 130, 141
-"""Exit status after Ctrl-C, and when the reader of the output has gone (as shells have them)."""
+"""Exit status after Ctrl-C, and after the reader of the output has gone (as in shells)."""
 
 DISTRIBUTION = "tactile-reach"
 
 DEFAULT_LOG = "tactile-logs"
-"""Folder of the logs, below the folder a daemon was started in."""
+"""Default folder of the logs, in the working folder of the daemon."""
 
 
 class CommandError(Exception):
@@ -70,17 +70,17 @@ EXTRAS: Final[Mapping[str, str]] = {
     "distributed": "dask",
     "shtab": "completion",
 }
-"""Optional modules that the commands import, and the extra of ours that brings each."""
+"""Optional modules, and the extra of this project that installs each."""
 
 
 class MissingExtraError(CommandError):
-    """A module that an extra of ours brings is not installed; the text says how to get it."""
+    """An optional module is not installed; the text says how to install it."""
 
 
 def require(*modules: str, extra: str, what: str = "") -> None:
-    """Check that optional ``modules`` can be imported; `MissingExtraError` when one cannot.
+    """Check that optional ``modules`` can be imported; raises `MissingExtraError` otherwise.
 
-    ``extra``: the extra of ours that brings them. ``what``: what needs them, if not the command.
+    ``extra``: the extra that installs them. ``what``: what needs them, if not the command itself.
     """
     from importlib.util import find_spec
 
@@ -90,7 +90,7 @@ def require(*modules: str, extra: str, what: str = "") -> None:
 
 
 def missing_extra(error: ModuleNotFoundError) -> MissingExtraError | None:
-    """The sentence for an import that failed, where an extra of ours brings the module."""
+    """Error for a failed import if one of our extras installs the module, otherwise None."""
     module = (error.name or "").partition(".")[0]
     extra = EXTRAS.get(module)
     return None if extra is None else MissingExtraError(_needs(module, extra))
@@ -105,20 +105,22 @@ def _needs(module: str, extra: str, what: str = "") -> str:
 # The parser
 
 _NEGATIVE = re.compile(r"-(?:\.?\d|inf\b|nan\b)", re.IGNORECASE)
-"""Begins a value with a minus, such as -0.25,0.1,0 or -30deg/10s, and never one of our flags."""
+"""Start of a value with a minus, such as -0.25,0.1,0 or -30deg/10s, which is never a flag of
+ours."""
 
 _LIMIT = 60
-"""Letters of a wrong value that an error message repeats."""
+"""Most characters of a wrong value quoted in an error message."""
 
 
 class Formatter(argparse.HelpFormatter):
-    """Wraps texts, except those that have lines of their own; a list of commands fits its lines."""
+    """Wraps text except where it contains line breaks; aligns lists of commands."""
 
     def __init__(self, prog: str, **options: Any) -> None:
         super().__init__(prog, **({"max_help_position": 26} | options))
 
     def add_argument(self, action: argparse.Action) -> None:
-        """Add a line; commands stand two columns further in, which argparse forgets."""
+        """Add a line. Commands are indented two columns more, which argparse does not account
+        for."""
         super().add_argument(action)
         if isinstance(action, argparse._SubParsersAction):
             self._action_max_length += 2
@@ -130,11 +132,11 @@ class Formatter(argparse.HelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """The parser of every command and subcommand.
+    """Parser of every command and subcommand.
 
-    Beyond argparse: a value may begin with a minus (``--home -0.25,0.1,0``); what is unknown is
-    refused by the subcommand it was given to, in one sentence that says what may have been meant;
-    an option's former name still works and says what it is called now (`former`).
+    Beyond argparse: a value may begin with a minus (``--home -0.25,0.1,0``); unknown arguments are
+    rejected by the subcommand that got them, in one sentence with a suggestion; former names of
+    options still work and print the current name (`former`).
     """
 
     def __init__(self, *words: Any, **options: Any) -> None:
@@ -147,21 +149,21 @@ class Parser(argparse.ArgumentParser):
         )
 
     def show_version(self) -> None:
-        """List --version in the help; every parser takes it."""
+        """List --version in the help; every parser accepts it."""
         self._version.help = "print the version, and exit"
 
     def former(self, **names: str) -> None:
-        """Accept options under the names they had: ``former(to="until")`` for --to, now --until."""
+        """Accept former names of options: ``former(to="until")`` for --to, now --until."""
         for old, new in names.items():
             self._former[f"--{old.replace('_', '-')}"] = f"--{new.replace('_', '-')}"
 
     @property
     def former_names(self) -> Mapping[str, str]:
-        """Former names of options, and what they are called now."""
+        """Former names of options and their current names."""
         return dict(self._former)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse; unlike argparse's, refuses what it does not know. Subcommands come here, too."""
+        """Parse and, unlike argparse, reject unknown arguments. Also called for subcommands."""
         words = self._renamed(list(sys.argv[1:] if args is None else args))
         namespace, rest = super().parse_known_args(words, namespace)
         if rest:
@@ -169,7 +171,7 @@ class Parser(argparse.ArgumentParser):
         return namespace, rest
 
     def error(self, message: str) -> NoReturn:
-        """Refuse a command line: one sentence, and where the options are listed; exit status 2."""
+        """Reject a command line with one sentence that points to the help; exit status 2."""
         self.exit(USAGE, f"{self.prog}: {message} (see `{self.prog} --help`)\n")
 
     def _renamed(self, words: list[str]) -> list[str]:
@@ -211,13 +213,13 @@ class Parser(argparse.ArgumentParser):
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """``; did you mean X?`` when something of ``known`` is much like ``word``, else empty."""
+    """``; did you mean X?`` if ``known`` has something similar to ``word``, otherwise empty."""
     close = get_close_matches(word, list(known), n=1, cutoff=0.6)
     return f"; did you mean {close[0]}?" if close else ""
 
 
 class _Version(argparse.Action):
-    """Prints the version, which is looked up only then."""
+    """Prints the version, determined only then."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         from importlib.metadata import version
@@ -226,14 +228,14 @@ class _Version(argparse.Action):
         parser.exit(DONE)
 
 
-# Subcommands that are loaded when they are used
+# Subcommands, loaded on use
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A subcommand: ``help``, one line; ``fill``, "module" or "module:function".
+    """A subcommand. ``help``: one line; ``fill``: "module" or "module:function".
 
-    The function (``fill`` unless named) is given the parser, adds the options and sets the default
+    The function (default name ``fill``) receives the parser, adds the options and sets the default
     ``func``, which takes the parsed options and returns the exit status.
     """
 
@@ -242,14 +244,14 @@ class Command:
 
 
 class _Commands(argparse._SubParsersAction):  # type: ignore[type-arg]  # generic in the stubs alone
-    """Subcommands that get their options when they are used."""
+    """Subcommands that get their options on use."""
 
     def __init__(self, *words: Any, **options: Any) -> None:
         super().__init__(*words, **options)
         self.waiting: dict[str, Command] = {}
 
     def load(self, name: str) -> None:
-        """Import the module of ``name`` and let it fill its parser, once."""
+        """Import the module of ``name`` and let it fill the parser, once."""
         command = self.waiting.pop(name, None)
         if command is not None:
             module, _, function = command.fill.partition(":")
@@ -269,7 +271,7 @@ class _Commands(argparse._SubParsersAction):  # type: ignore[type-arg]  # generi
 def add_commands(
     parser: argparse.ArgumentParser, commands: Mapping[str, Command], title: str = "commands"
 ) -> None:
-    """Add subcommands; without one, the command lists them and ends with 2."""
+    """Add subcommands. Called without one, the command lists them and exits with 2."""
     action = parser.add_subparsers(title=title, metavar="COMMAND", action=_Commands)
     assert isinstance(action, _Commands)
     for name, command in commands.items():
@@ -284,9 +286,9 @@ def add_commands(
 
 
 def later(place: str, *needed: str, extra: str = "") -> Callable[[argparse.Namespace], int]:
-    """The function "module:function", imported when it is called.
+    """Wrap the function "module:function" so that it is imported when called.
 
-    ``needed``: optional modules without which it cannot be imported, from our ``extra``.
+    ``needed``: optional modules that it imports, installed by ``extra``.
     """
 
     def call(options: argparse.Namespace) -> int:
@@ -300,7 +302,7 @@ def later(place: str, *needed: str, extra: str = "") -> Callable[[argparse.Names
 
 
 def load_all(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:
-    """Load every subcommand, at any depth; the parser and all of theirs."""
+    """Load every subcommand at any depth; returns all parsers."""
     found = [parser]
     for action in parser._actions:
         if isinstance(action, _Commands):
@@ -313,9 +315,10 @@ def load_all(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:
 def run_command(
     parser: argparse.ArgumentParser, argv: Sequence[str] | None, prog: str | None = None
 ) -> int:
-    """Parse ``argv`` and run what it names; the exit status. What fails is one sentence on stderr.
+    """Parse ``argv``, run the command and return its exit status. Errors are one sentence on
+    stderr.
 
-    ``prog``: what the sentence begins with (default: the parser's).
+    ``prog``: start of the sentence (default: name of the parser).
     """
     options = parser.parse_args(argv)
     try:
@@ -324,7 +327,7 @@ def run_command(
         print("stopped", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
-        # The reader of our output (head, less) has gone: nothing more to say, and no traceback.
+        # The reader of the output (head, less) has gone: end quietly, without a traceback.
         sys.stderr.close()
         return PIPE_CLOSED
     except CommandError as error:
@@ -338,10 +341,10 @@ def run_command(
 
 
 def complain(prog: str, error: CommandError) -> int:
-    """Say what is wrong; the exit status.
+    """Print the error and return its exit status.
 
-    The text may repeat what a log or a peer says: nothing in it that a terminal would act on is
-    printed as it is.
+    The text may contain data from a log or a peer, so anything that a terminal would interpret is
+    escaped.
     """
     text = "".join(
         letter
@@ -354,7 +357,7 @@ def complain(prog: str, error: CommandError) -> int:
 
 
 def _prog_of(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> str:
-    """Name of the subcommand that ``argv`` runs, such as ``tactile log cat``."""
+    """Name of the subcommand in ``argv``, such as ``tactile log cat``."""
     words = iter(sys.argv[1:] if argv is None else argv)
     while True:
         action = next((a for a in parser._actions if isinstance(a, _Commands)), None)
@@ -364,17 +367,17 @@ def _prog_of(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> str
         parser = action.choices[name]
 
 
-# Parsers of values
+# Value parsers
 
 
 def shown(value: object) -> str:
-    """A value that was refused, quoted, as much of it as a message may repeat."""
+    """A rejected value, quoted and shortened for a message."""
     text = str(value)
     return repr(text) if len(text) <= _LIMIT else f"{text[:_LIMIT]!r}…"
 
 
 def refuse(text: str, allowed: str) -> argparse.ArgumentTypeError:
-    """The error for a value that is not one of ``allowed``, in words."""
+    """Error for a value that is not ``allowed`` (in words)."""
     return argparse.ArgumentTypeError(f"{shown(text)} given; allowed: {allowed}")
 
 
@@ -385,7 +388,7 @@ def number(
     least: float | None = None,
     most: float | None = None,
 ) -> Callable[[str], float]:
-    """Parser of a finite number of ``unit``, above ``above`` or from ``least``, to ``most``."""
+    """Parser of a finite number of ``unit`` within the given bounds."""
     bounds = [f"above {above:g}"] if above is not None else []
     if least is not None and most is not None:
         bounds.append(f"from {least:g} to {most:g}")
@@ -444,12 +447,12 @@ fraction = number(least=0, most=1)
 
 
 def speed(text: str) -> float:
-    """Parser of a speed: times real time above 0, or inf."""
+    """Parser of a speed in multiples of real time: above 0, or inf."""
     return math.inf if text.lower() == "inf" else positive("times real time")(text)
 
 
 def checked(parse: Callable[[str], T]) -> Callable[[str], T]:
-    """``parse`` for argparse, which shows the text of its ValueError."""
+    """Adapt ``parse`` for argparse, so that the text of its ValueError is shown."""
 
     def convert(text: str) -> T:
         try:
@@ -461,7 +464,7 @@ def checked(parse: Callable[[str], T]) -> Callable[[str], T]:
 
 
 def loaded(place: str) -> Callable[[str], Any]:
-    """Parser "module:function", imported when there is a value to parse; ValueErrors are shown."""
+    """Parser "module:function", imported on first use; the text of its ValueError is shown."""
 
     def convert(text: str) -> Any:
         module, _, function = place.partition(":")
@@ -471,14 +474,14 @@ def loaded(place: str) -> Callable[[str], Any]:
 
 
 def named_value(text: str) -> tuple[str, str]:
-    """Parser of NAME=VALUE: name and value."""
+    """Parser of NAME=VALUE; returns name and value."""
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
         raise refuse(text, "NAME=VALUE")
     return name.strip(), value
 
 
-# Options that several commands have
+# Options shared by several commands
 
 Adding = argparse._ActionsContainer
 
@@ -507,7 +510,7 @@ def add_json(parser: Adding, what: str = "print JSON on standard output") -> Non
 def add_seeds(
     parser: Adding, *, default: int = 0, what: str = "of the trial's chance", scene: bool = True
 ) -> None:
-    """Add --seed and --scene-seed; `seeds_of` says what they come to."""
+    """Add --seed and --scene-seed; `seeds_of` resolves them."""
     shown_default = f"(default {default})" if not scene else f"(default: --scene-seed, {default})"
     parser.add_argument(
         "--seed",
@@ -523,7 +526,7 @@ def add_seeds(
 
 
 def seeds_of(options: argparse.Namespace, default: int = 0) -> tuple[int, int]:
-    """Seeds of scene and trial: each is the other's where only one is given."""
+    """Seeds of scene and trial; if only one is given, it serves as both."""
     scene, trial = options.scene_seed, options.seed
     if scene is None:
         scene = default if trial is None else trial
@@ -540,16 +543,16 @@ def add_board(parser: Adding, what: str, **options: Any) -> None:
     parser.add_argument("--board", metavar="NAME", help=f"name of the board {what}", **options)
 
 
-# Names that options take. A test holds them equal to the code, whose modules take long to import.
+# Names that options accept. A test keeps them equal to the code, whose modules are slow to import.
 
 KINDS: Final = ("auto", "tactile", "anyskin", "reskin", "eflesh")
-"""What --kind takes besides a layout; the last three are the same boards."""
+"""Values of --kind besides a layout; the last three mean the same boards."""
 
 STRATEGIES: Final = ("straight", "burrow", "excavate", "hybrid_clock", "hybrid_event")
-"""Strategies that come with reachd."""
+"""Strategies built into reachd."""
 
 DEFAULT_STRATEGY: Final = "hybrid_event"
-"""The paper's best."""
+"""The best strategy of the paper."""
 
 SETS: Final = ("hardware", "authors_sim")
 """Parameter sets."""
@@ -603,18 +606,19 @@ def _add_bus(group: Adding, role: str) -> None:
     )
 
 
-# What is shown while a command runs
+# Output while a command runs
 
 PLAIN_EVERY_S: Final = 5.0
-"""Between plain lines of a daemon where there is no terminal."""
+"""Interval of a daemon's plain status lines without a terminal."""
 
 Report = Callable[[int, int], None]
-"""Told how much is done, and of how much."""
+"""Called with the amount done and the total."""
 
 
 @contextmanager
 def progress(what: str, unit: str = "bytes") -> Iterator[Report | None]:
-    """A progress bar on a terminal, else None; it goes away when done. ``unit``: or "items"."""
+    """Progress bar on a terminal, removed at the end; yields None elsewhere. ``unit``: "bytes" or
+    "items"."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -637,7 +641,7 @@ def progress(what: str, unit: str = "bytes") -> Iterator[Report | None]:
 
 @contextmanager
 def working(what: str) -> Iterator[None]:
-    """A line with the time that has passed, on a terminal alone; it goes away when done."""
+    """Line with the elapsed time on a terminal, removed at the end; nothing elsewhere."""
     if not sys.stderr.isatty():
         yield
         return
@@ -651,9 +655,9 @@ def working(what: str) -> Iterator[None]:
 
 
 class LiveLines(ABC):
-    """What people see while a daemon runs: live lines on a terminal, else plain ones now and then.
+    """Display of a running daemon: live lines on a terminal, otherwise a plain line now and then.
 
-    A context manager, used from the main thread. Below the lines stands the log of ``recorder``.
+    A context manager, used from the main thread. The state of ``recorder``'s log is shown below.
     """
 
     def __init__(self, console: Console, recorder: Recorder | None = None) -> None:
@@ -678,9 +682,9 @@ class LiveLines(ABC):
             self._live.stop()
 
     def show(self) -> None:
-        """Refresh the live lines, or log plain ones when it is time; to be called often.
+        """Refresh the live lines, or log plain ones when due; call it often.
 
-        What cannot be shown is told once, and ends nothing.
+        An error in the display is logged once and never stops the daemon.
         """
         try:
             self._show()
@@ -703,11 +707,11 @@ class LiveLines(ABC):
 
     @abstractmethod
     def table(self) -> Table | None:
-        """The live lines; None while there is nothing to show."""
+        """Content of the live display; None while there is nothing to show."""
 
     @abstractmethod
     def lines(self) -> Iterable[str]:
-        """The plain lines."""
+        """Content of the plain lines."""
 
     def _above_the_log(self, table: Table) -> Table:
         if self._recorder is None:
@@ -726,7 +730,7 @@ class LiveLines(ABC):
 
 
 def set_up_logging(console: Console, *, verbose: bool) -> None:
-    """Log above the live lines of a terminal, or plain lines with their time elsewhere."""
+    """Log above the live lines on a terminal, otherwise as plain lines with time stamps."""
     level = logging.DEBUG if verbose else logging.INFO
     if console.is_terminal:
         from rich.logging import RichHandler
@@ -742,7 +746,7 @@ def set_up_logging(console: Console, *, verbose: bool) -> None:
 
 
 def drops_text(drops: Mapping[str, int]) -> str:
-    """Counts by reason, the largest first."""
+    """Format counts by reason, the largest first."""
     if not drops:
         return "0"
     ordered = sorted(drops.items(), key=lambda item: -item[1])
@@ -751,7 +755,7 @@ def drops_text(drops: Mapping[str, int]) -> str:
 
 
 def describe_log(recorder: Recorder) -> str:
-    """State of the log in one line."""
+    """Describe the state of the log in one line."""
     stats = recorder.stats
     text = f"{stats.path}  {stats.bytes_written / 1e6:.1f} MB"
     if stats.state != "recording":

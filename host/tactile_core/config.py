@@ -1,17 +1,17 @@
-"""The configuration layer: every TOML file of the project is read, checked and described here.
+"""Configuration layer: reads, checks and describes every TOML file of the project.
 
-A schema is a frozen `msgspec.Struct` that forbids unknown fields; a class variable ``replaced`` may
-hold the remedy for keys that older versions had. The types of its fields carry
-everything there is to say about a key: unit (`Seconds`, `Newtons`, ...), range and meaning
-(`msgspec.Meta`). That one description serves three purposes:
+A schema is a frozen `msgspec.Struct` that forbids unknown fields. Its class variable ``replaced``
+may hold remedies for keys of older versions. The types of its fields describe each key completely:
+unit (`Seconds`, `Newtons`, ...), range and meaning (`msgspec.Meta`). This one description serves
+three purposes:
 
-- `load_toml` reads a file in bounded time and memory and converts it,
-- whatever is wrong is refused in one sentence that names file, line, key, what was found and what
-  is allowed (`ConfigError`); commands print it and exit with 2,
+- `load_toml` reads a file in bounded time and memory and converts it.
+- Any error is one sentence that names file, line, key, value and what is allowed (`ConfigError`);
+  commands print it and exit with 2.
 - `describe` lists the keys for the reference in ``docs/configuration.md``.
 
-Frozen dataclasses whose fields are annotated in the same way are checked with `check_fields` when
-they are made, and `table_of` makes the schema of a TOML table that overrides some of their fields.
+Frozen dataclasses whose fields are annotated in the same way are checked by `check_fields` when
+created, and `table_of` derives the schema of a TOML table that overrides some of their fields.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from msgspec import inspect as types
 
 T = TypeVar("T")
 KeyPath = tuple[str | int, ...]
-"""Keys of the tables and indices of the arrays that lead to a value."""
+"""Keys of tables and indices of arrays that lead to a value."""
 
 
 class ConfigError(ValueError):
-    """A configuration, or one value, that is refused; the message says where and why.
+    """Rejected configuration or value; the message says where and why.
 
-    ``keys``: where the value is, as far as whoever raised it knows.
+    ``keys``: path of the value, as far as known.
     """
 
     def __init__(self, message: str, keys: KeyPath = ()) -> None:
@@ -52,16 +52,16 @@ class ConfigError(ValueError):
         self.keys = keys
 
 
-# --- Types of fields: unit and range. Narrow them, and say what a key means, with another Meta. ---
+# --- Types of fields: unit and range. Another Meta narrows them and explains a key. ---
 
 
 def unit(name: str) -> Meta:
-    """A unit, for messages and the reference."""
+    """Unit of a value, for messages and the reference."""
     return Meta(extra={"unit": name})
 
 
 def allowed_values(words: str) -> Meta:
-    """What is allowed, in words, where the type and its range do not say it well."""
+    """Allowed values in words, if type and range do not express them well."""
     return Meta(extra={"allowed": words})
 
 
@@ -91,31 +91,33 @@ MinusInfinity = Annotated[
     float,
     Meta(le=sys.float_info.max, extra={"infinite": True, "allowed": "a finite number or -inf"}),
 ]
-"""A lower bound that may be left open."""
+"""Lower bound that may be open (-inf)."""
 
 
-# --- Reading a file in bounded time and memory. `tomllib` parses; what it leaves to its caller ---
-# --- is done here: what is not a plain file, numbers no program can hold, endless nesting. -------
+# --- Reading a file in bounded time and memory. `tomllib` parses; the code here rejects special ---
+# --- files, numbers that are too large, and endless nesting. --------------------------------------
 
 MAX_CONFIG = 1 << 20
-"""Bytes of a configuration file: real ones have a few kB, a mistaken path may be a log of GBs."""
+"""Largest configuration file in bytes: real ones have a few kB, but a wrong path may be a log of
+GBs."""
 
 MAX_DEPTH = 32
-"""Tables and arrays within one another; the deepest of our own files have five."""
+"""Deepest nesting of tables and arrays; the project's own files use five levels."""
 
 MAX_PARTS = 256
-"""Parts of a dotted key that are worth parsing, which takes time with the square of them."""
+"""Most parts of a dotted key; parsing time grows with their square."""
 
 INTEGERS = range(-(1 << 63), 1 << 63)
-"""What TOML asks of every reader; longer ones Python would take, up to 4300 digits."""
+"""Integer range that TOML requires; Python would accept up to 4300 digits."""
 
 SHOWN = 60
-"""Characters that a message quotes."""
+"""Most characters of a value quoted in a message."""
 
 TOML_LINE = re.compile(r" \(at line (\d+), column \d+\)$")
 LONG_NUMBER = re.compile(r"[0-9_]{1000,}")
 _PART = r"(?:[A-Za-z0-9_-]++|\"[^\"\n]*+\"|'[^'\n]*+')"
-# Possessive, and begun only where a key may begin: else a line is read again from each part on.
+# Possessive, and tried only where a key may begin; otherwise each line is scanned again from every
+# part.
 DEEP_KEY = re.compile(
     rf"(?:^|[\[{{,])[ \t]*+{_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_PARTS}}}", re.MULTILINE
 )
@@ -125,30 +127,30 @@ KINDS = (
     (stat.S_ISFIFO, "it is a pipe, not a file"),
     (lambda _: True, "it is a device, not a file"),
 )
-"""What is not a plain file, in words."""
+"""Descriptions of files that are not regular."""
 
 
 def load_toml(path: Path | str, kind: type[T]) -> T:
-    """Read ``path`` as a ``kind`` (a msgspec struct). `ConfigError` for anything wrong with it."""
+    """Load ``path`` as a ``kind`` (a msgspec struct). Raises `ConfigError` for any error in it."""
     return Document.read(path).convert(kind)
 
 
 def parse_toml(text: str, kind: type[T], name: str = "configuration") -> T:
-    """Like `load_toml`, from a text; ``name`` stands for the file in messages."""
+    """Like `load_toml`, from text; ``name`` replaces the file name in messages."""
     return Document.parse(text, name).convert(kind)
 
 
 def convert(values: Mapping[str, Any], kind: type[T]) -> T:
-    """Like `load_toml`, from plain values that came from no file."""
+    """Like `load_toml`, from plain values without a file."""
     return Document(dict(values)).convert(kind)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Document:
-    """Plain values of a file, and what is needed to say where in it something is wrong.
+    """Plain values of a file, with what is needed to locate errors in it.
 
-    ``name`` and ``text``: of the file, empty for values that came from none. `ConfigError` for
-    what no schema allows: nesting without end, numbers that do not fit into 64 bits.
+    ``name`` and ``text``: of the file, empty for values without one. Raises `ConfigError` for what
+    no schema allows: endless nesting, numbers beyond 64 bits.
     """
 
     data: dict[str, Any]
@@ -157,7 +159,7 @@ class Document:
     not_finite: tuple[tuple[KeyPath, float], ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Look at every value once."""
+        """Check every value once."""
         found = []
         for keys, value in leaves(self.data):
             if len(keys) > MAX_DEPTH:
@@ -171,16 +173,16 @@ class Document:
 
     @classmethod
     def read(cls, path: Path | str, limit: int = MAX_CONFIG) -> Document:
-        """Parse a file of at most ``limit`` bytes; `ConfigError`."""
+        """Parse a file of at most ``limit`` bytes. Raises `ConfigError`."""
         return cls.parse(read_text(path, limit), str(path))
 
     @classmethod
     def parse(cls, text: str, name: str) -> Document:
-        """Parse a text; ``name`` stands for the file in messages. `ConfigError`."""
+        """Parse text; ``name`` replaces the file name in messages. Raises `ConfigError`."""
         return cls(_tables(text, name), name, text)
 
     def convert(self, kind: type[T]) -> T:
-        """The values as a ``kind``; `ConfigError` for what it does not allow."""
+        """Convert the values to a ``kind``. Raises `ConfigError` for anything it does not allow."""
         for keys, value in self.not_finite:
             info = _type_at(types.type_info(kind), keys)
             if math.isnan(value) or not _extra(info).get("infinite"):
@@ -191,19 +193,19 @@ class Document:
             raise self._explained(error, kind) from error
 
     def error(self, keys: KeyPath, problem: str) -> ConfigError:
-        """What to raise about the value at ``keys``, with its file and line in front."""
+        """Error about the value at ``keys``, with file and line in front."""
         if not self.name:
             return ConfigError(problem, keys)
         line = f":{line_of(key_lines(self.text), keys)}" if self.text else ""
         return ConfigError(f"{self.name}{line}: {problem}", keys)
 
     def wrong(self, keys: KeyPath, wanted: str, found: str | None = None) -> ConfigError:
-        """What to raise about a value that is not one of the ``wanted``; ``found``: in words."""
+        """Error about a value that is not one of ``wanted``; ``found``: the value in words."""
         given = _shown(self.value(keys)) if found is None else found
         return self.error(keys, f"{dotted(keys)} = {given}; allowed: {wanted}")
 
     def missing(self, keys: KeyPath, wanted: str) -> ConfigError:
-        """What to raise about a key that is not there; the line is that of its table."""
+        """Error about a missing key, located at its table."""
         problem = f"{dotted(keys)} is missing; it must be {wanted}"
         return self.error(keys[:-1], problem)
 
@@ -215,7 +217,7 @@ class Document:
         return found
 
     def _explained(self, error: msgspec.ValidationError, kind: Any) -> ConfigError:
-        """Our words for what msgspec found."""
+        """Translate an error of msgspec into the project's words."""
         reason, keys = self._place(error, kind)
         info = types.type_info(kind)
         if (match := MISSING.fullmatch(reason)) is not None:
@@ -225,7 +227,7 @@ class Document:
             return self._unknown((*keys, match.group(1)), _type_at(info, keys))
         if REFUSED.match(reason) is not None:
             return self.wrong(keys, allowed(_type_at(info, keys)) or reason)
-        more = getattr(error.__cause__, "keys", ())  # a check of the schema's own
+        more = getattr(error.__cause__, "keys", ())  # from a check in the schema
         return self.error((*keys, *more), f"{dotted(keys)}: {reason}" if keys else reason)
 
     def _unknown(self, keys: KeyPath, table: Any) -> ConfigError:
@@ -240,7 +242,7 @@ class Document:
         )
 
     def _place(self, error: msgspec.ValidationError, kind: Any) -> tuple[str, KeyPath]:
-        """What msgspec says, and where."""
+        """Message of msgspec, and the path of the value."""
         text = str(error)
         match = LOCATION.search(text)
         if match is None:
@@ -251,7 +253,7 @@ class Document:
         return LOCATION.sub("", text), self._resolved(keys, kind)
 
     def _resolved(self, keys: KeyPath, kind: Any) -> KeyPath:
-        """``keys`` with the key for ``...``, which stands for any key of a table of tables."""
+        """Replace ``...`` in ``keys`` (any key of a table of tables) by the actual key."""
         if "..." not in keys:
             return keys
         at = keys.index("...")
@@ -271,7 +273,7 @@ REFUSED = re.compile(r"Expected |Invalid ")
 
 
 def _with(data: Any, keys: KeyPath, value: Any) -> Any:
-    """Copy of tables and arrays with ``value`` at ``keys``."""
+    """Copy of ``data`` with ``value`` at ``keys``."""
     if not keys:
         return value
     copy: Any = dict(data) if isinstance(data, dict) else list(data)
@@ -280,11 +282,11 @@ def _with(data: Any, keys: KeyPath, value: Any) -> Any:
 
 
 def read_text(path: Path | str, limit: int) -> str:
-    """Text of a file of at most ``limit`` bytes. Never waits: a pipe or a device is refused."""
+    """Read a text file of at most ``limit`` bytes. Never blocks: pipes and devices are rejected."""
     path = Path(path)
     try:
         fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
-    except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
+    except (OSError, ValueError) as error:  # ValueError: zero byte in the name
         why = str(error.strerror) if isinstance(error, OSError) else str(error)
         raise ConfigError(_unreadable(path, why)) from error
     mode = os.fstat(fd).st_mode
@@ -319,7 +321,7 @@ def _tables(text: str, source: str) -> dict[str, Any]:
         raise ConfigError(f"{source}:{line}: {shown}") from error
     except RecursionError:
         raise ConfigError(_too_deep(source, None)) from None
-    except ValueError as error:  # of int(), which reads no more than 4300 digits
+    except ValueError as error:  # from int(), which accepts at most 4300 digits
         number = LONG_NUMBER.search(text)
         if number is None:
             raise ConfigError(f"{source}: {printable(str(error), 200)}") from error
@@ -328,9 +330,9 @@ def _tables(text: str, source: str) -> dict[str, Any]:
 
 
 def leaves(data: Any) -> Iterator[tuple[KeyPath, Any]]:
-    """Every value that is not a table or an array, with its path, in the order of the file.
+    """Yield every value that is not a table or an array, with its path, in file order.
 
-    Of what is nested too deeply, the first thing too deep.
+    Of a structure nested too deeply, only the first value too deep.
     """
     waiting: list[tuple[KeyPath, Any]] = [((), data)]
     while waiting:
@@ -344,7 +346,7 @@ def leaves(data: Any) -> Iterator[tuple[KeyPath, Any]]:
 
 
 def printable(text: str, limit: int = SHOWN) -> str:
-    """A text for a message: what a terminal would act on is escaped, and the rest kept short."""
+    """Prepare text for a message: shorten it and escape what a terminal would interpret."""
     if len(text) > limit:
         text = text[: limit - 3] + "..."
     return "".join(
@@ -372,7 +374,7 @@ def _too_deep(source: str, line: int | None) -> str:
 
 
 def dotted(keys: KeyPath) -> str:
-    """A path of keys as people write it."""
+    """Format a path of keys as users write it."""
     text = ""
     for key in keys:
         shown = printable(str(key))
@@ -399,7 +401,7 @@ LISTS = types.ListType | types.VarTupleType | types.SetType | types.FrozenSetTyp
 
 
 def allowed(info: Any, unit: str = "") -> str:
-    """What a type (of `msgspec.inspect`) allows, in words."""
+    """Describe what a type (of `msgspec.inspect`) allows."""
     match info:
         case types.Metadata():
             own = info.extra or {}
@@ -433,7 +435,7 @@ def allowed(info: Any, unit: str = "") -> str:
 
 
 def allowed_range(info: Any) -> str:
-    """Range of a number's type, in words; empty where there is none."""
+    """Describe the range of a number's type; empty if it has none."""
     gt, ge, lt, le = (getattr(info, name, None) for name in ("gt", "ge", "lt", "le"))
     if ge is not None and le is not None:
         return f"from {_plain(ge)} to {_plain(le)}"
@@ -460,7 +462,7 @@ def _extra(info: Any) -> dict[str, Any]:
 
 
 def _fields(info: Any) -> tuple[types.Field, ...] | None:
-    """Fields of a schema, or of the schema in a union; None where there is none."""
+    """Fields of a schema, or of the schema in a union; None if there is none."""
     if isinstance(info, types.Metadata):
         return _fields(info.type)
     if isinstance(info, types.UnionType):
@@ -469,7 +471,7 @@ def _fields(info: Any) -> tuple[types.Field, ...] | None:
 
 
 def _struct(info: Any) -> Any:
-    """Class of the schema, or of the schema in a union; None where there is none."""
+    """Class of the schema, or of the schema in a union; None if there is none."""
     if isinstance(info, types.Metadata):
         return _struct(info.type)
     if isinstance(info, types.UnionType):
@@ -478,7 +480,7 @@ def _struct(info: Any) -> Any:
 
 
 def _step(info: Any, key: str | int) -> Any:
-    """Type of one member of a schema, table or array; None where it has none."""
+    """Type of one member of a schema, table or array; None if there is none."""
     match info:
         case types.Metadata():
             return _step(info.type, key)
@@ -510,23 +512,23 @@ def _hints(kind: Any) -> dict[str, Any]:
 
 
 def check_fields(settings: object) -> None:
-    """Check every field of a frozen dataclass against its type, as the file would be.
+    """Check every field of a frozen dataclass against its type, as if it came from a file.
 
-    `ConfigError` names the first field that is out of its range. Meant for ``__post_init__``.
+    The `ConfigError` names the first field out of range. Meant for ``__post_init__``.
     """
     made: Any = type(settings)
     for name, kind in _hints(made).items():
         value = getattr(settings, name)
         try:
             msgspec.convert(_finite(value), kind, strict=True)
-        except ValueError as error:  # a ValidationError is one
+        except ValueError as error:  # includes ValidationError
             words = allowed(types.type_info(kind)) or kind.__name__
             problem = f"{name} = {_shown(value)}; allowed: {words}"
             raise ConfigError(problem, (name,)) from error
 
 
 def _finite(value: Any) -> Any:
-    """``value`` as msgspec takes it, which knows no floats of numpy; ValueError for nan and inf."""
+    """Convert numpy floats, which msgspec does not accept. Raises ValueError for nan and inf."""
     if isinstance(value, tuple):
         return tuple(_finite(item) for item in value)
     if not isinstance(value, float):
@@ -546,10 +548,10 @@ def table_of(
     rename: Mapping[str, str] | None = None,
     **others: Any,
 ) -> type[Any]:
-    """Schema of a table in which any field of a dataclass may be given, and none must.
+    """Schema of a table in which any field of a dataclass may be given and none is required.
 
-    ``doc``: what the table is for. ``only``, ``without``: which fields. ``rename``: keys by field.
-    ``others``: types of fields that a file writes in another way. What a file left out is
+    ``doc``: purpose of the table. ``only``, ``without``: selection of fields. ``rename``: keys by
+    field. ``others``: types of fields that a file writes differently. Keys absent from the file are
     `msgspec.UNSET`; see `given`.
     """
     hints = _hints(settings)
@@ -558,7 +560,7 @@ def table_of(
     for key in chosen:
         default = others[key]() if isinstance(others.get(key), type) else UNSET
         kind = others.get(key, hints[key])
-        if key in others and hasattr(hints[key], "__metadata__"):  # the meaning stays
+        if key in others and hasattr(hints[key], "__metadata__"):  # keep the description
             kind = Annotated[(kind, *hints[key].__metadata__)]
         members.append((key, kind | UnsetType, default))
     return msgspec.defstruct(
@@ -573,20 +575,20 @@ def table_of(
 
 
 def given(table: Any) -> dict[str, Any]:
-    """What a file says in a table made by `table_of`, by field."""
+    """Values given in a table made by `table_of`, by field."""
     values = ((name, getattr(table, name)) for name in table.__struct_fields__)
     return {name: value for name, value in values if value is not UNSET}
 
 
-# --- What a schema allows, for the reference. -----------------------------------------------------
+# --- Description of a schema, for the reference. -------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """One key of a table, in words.
+    """Description of one key of a table.
 
-    ``default``: as it is written in a file; empty where there is none, None where the key must be
-    given. ``range``: what is allowed beyond the ``type``; empty where there is no limit.
+    ``default``: as written in a file; empty if there is none, None if the key is required.
+    ``range``: limits beyond the ``type``; empty if there are none.
     """
 
     name: str
@@ -599,7 +601,8 @@ class Key:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One table of a file: its header (empty for the keys above all tables), meaning and keys."""
+    """Description of one table of a file: header (empty for the top-level keys), meaning and
+    keys."""
 
     header: str
     meaning: str
@@ -607,7 +610,7 @@ class Section:
 
 
 def describe(kind: type) -> list[Section]:
-    """Every table of a schema, each after the one it is in."""
+    """Describe every table of a schema, each after its parent."""
     return list(_sections(types.type_info(kind), "", ""))
 
 
@@ -633,7 +636,7 @@ def _key(each: types.Field, owner: Any) -> Key:
 
 
 def _said(info: Any) -> dict[str, Any]:
-    """What `Meta` says of a type, or of what it is made of: unit and description."""
+    """Unit and description from the `Meta` of a type or of its elements."""
     match info:
         case types.Metadata():
             own = {**(info.extra_json_schema or {}), **(info.extra or {})}
@@ -648,7 +651,7 @@ def _said(info: Any) -> dict[str, Any]:
 
 
 def _in_words(info: Any) -> tuple[str, str]:
-    """Type and range of what is no table."""
+    """Type and range, in words, of anything but a table."""
     match info:
         case types.Metadata():
             kind, extent = _in_words(info.type)
@@ -676,7 +679,7 @@ def _in_words(info: Any) -> tuple[str, str]:
 
 
 def _table_in(info: Any) -> tuple[Any, bool]:
-    """The schema of a table or of an array of tables, and whether it is an array."""
+    """Schema of a table or of an array of tables, and whether it is an array."""
     if isinstance(info, types.Metadata):
         return _table_in(info.type)
     if isinstance(info, types.UnionType):
@@ -694,13 +697,13 @@ def _default(each: types.Field, kind: Any) -> str | None:
     if each.required:
         return None
     value = each.default
-    if value is NODEFAULT and hasattr(kind, "overrides"):  # of `table_of`: UNSET is not told
+    if value is NODEFAULT and hasattr(kind, "overrides"):  # of `table_of`: UNSET stands for it
         value = {f.name: f.default for f in fields(kind.overrides)}[each.name]
     return "" if value in (None, NODEFAULT, NO_DEFAULT) else written(value)
 
 
 def written(value: Any) -> str:
-    """A plain value as TOML."""
+    """Format a plain value as TOML."""
     match value:
         case bool():
             return "true" if value else "false"
@@ -714,14 +717,14 @@ def written(value: Any) -> str:
 
 
 def quoted(value: str) -> str:
-    """A text as TOML: quoted and escaped."""
+    """Format a text as TOML: quoted and escaped."""
     escaped = "".join(
         f"\\u{ord(c):04x}" if c in '"\\' or ord(c) < 32 or ord(c) == 127 else c for c in value
     )
     return f'"{escaped}"'
 
 
-# --- On which line of a TOML text each key stands; `tomllib` has checked the syntax. --------------
+# --- Line numbers of the keys of a TOML text, whose syntax `tomllib` has checked. ----------------
 
 BARE = re.compile(r"[A-Za-z0-9_-]+")
 SPACE = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
@@ -730,21 +733,21 @@ MULTILINE_QUOTES = ('"""', "'''")
 
 
 def key_lines(text: str) -> dict[KeyPath, int]:
-    """Line (from 1) of every key, table and array element of a valid TOML text, by its path."""
+    """Line number (from 1) of every key, table and array element of valid TOML, by path."""
     scanner = _Scanner(text)
     scanner.run()
     return scanner.lines
 
 
 def line_of(lines: dict[KeyPath, int], keys: KeyPath) -> int:
-    """Line of a key, or of the nearest thing around it."""
+    """Line of a key, or of its nearest known parent."""
     while keys and keys not in lines:
         keys = keys[:-1]
     return lines.get(keys, 1)
 
 
 class _Scanner:
-    """Walks over valid TOML, noting the line of each key, table and element of an array."""
+    """Scans valid TOML and records the line of each key, table and array element."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -765,7 +768,8 @@ class _Scanner:
         return self.text.startswith(token, self.at)
 
     def string(self) -> str:
-        """A quoted string; its raw text, which is the key itself unless it has escapes."""
+        """Skip a quoted string and return its raw text, which is the key itself unless it has
+        escapes."""
         quote = self.text[self.at]
         if self.text[self.at : self.at + 3] in MULTILINE_QUOTES:
             quote = self.text[self.at : self.at + 3]
@@ -779,7 +783,7 @@ class _Scanner:
         return self.text[start:end]
 
     def key(self) -> tuple[str, ...]:
-        """A key, maybe dotted."""
+        """Parse a key, which may be dotted."""
         parts = []
         while True:
             self.skip_space()
@@ -795,7 +799,7 @@ class _Scanner:
             self.at += 1
 
     def absolute(self, key: tuple[str, ...]) -> KeyPath:
-        """Full path of a table's key: within arrays of tables, that of the last table."""
+        """Full path of a table's key; in arrays of tables, that of the last table."""
         path: KeyPath = ()
         for part in key:
             path = (*path, part)
@@ -804,7 +808,7 @@ class _Scanner:
         return path
 
     def pair(self, table: KeyPath) -> None:
-        """``key = value``."""
+        """Parse ``key = value``."""
         start = self.at
         path: KeyPath = table
         for part in self.key():

@@ -1,9 +1,9 @@
-"""How a daemon starts, is watched, is told to end, and ends: the same for every daemon.
+"""Life cycle shared by all daemons: start, supervision, signals, orderly end.
 
-`run` is the whole process of a command: signals first, then the command, then the end. `serve`
-brings a `Service` up, tells the service manager, lets it work, and ends it in order. What the
-service manager is told (ready, alive, stopping) follows systemd's sd_notify: lines in a datagram to
-the socket that ``NOTIFY_SOCKET`` names; started by hand, there is none and nothing is sent.
+`run` is the whole process of a command: it installs signal handlers, runs the command and ends the
+process. `serve` starts a `Service`, notifies the service manager, lets the service work and stops
+it in order. Notifications (ready, alive, stopping) follow systemd's sd_notify: lines in a datagram
+to the socket named by ``NOTIFY_SOCKET``; without that variable nothing is sent.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""They end a daemon in order; a second one ends it at once."""
+"""Signals that end a daemon in order; a second one ends it at once."""
 
 
 class StartError(CommandError):
@@ -48,9 +48,10 @@ class StartError(CommandError):
 
 
 class Ending:
-    """Whether the process has been told to end. ``told``: set by the first signal.
+    """Tracks whether a signal asked the process to end; the first one sets ``told``.
 
-    Before `orderly` there is nothing to end in order, and a signal ends the process at once.
+    Until ``orderly`` is set there is nothing to stop in order, and a signal ends the process at
+    once.
     """
 
     def __init__(self) -> None:
@@ -65,7 +66,7 @@ class Ending:
 
     @contextlib.contextmanager
     def listening(self) -> Iterator[Ending]:
-        """Hear the signals. A hang-up that the parent ignores (nohup) stays ignored."""
+        """Handle the signals. A hang-up that the parent ignores (nohup) stays ignored."""
         former = {}
         for number in SIGNALS:
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
@@ -80,7 +81,7 @@ class Ending:
 def run(
     make_parser: Callable[[Ending], argparse.ArgumentParser], argv: Sequence[str] | None
 ) -> int:
-    """Run a daemon's command; the exit status. Without ``argv`` the process ends here."""
+    """Run a daemon's command and return the exit status. Without ``argv`` the process ends here."""
     with Ending().listening() as ending:
         code = run_command(make_parser(ending), argv)
     if argv is None:
@@ -91,22 +92,22 @@ def run(
 def leave(code: int) -> NoReturn:
     """End the process with ``code``; the last call of a command.
 
-    The interpreter is not taken down piece by piece: a thread of zenoh, or of a driver, that comes
-    back into it meanwhile would hang or abort the process after everything was closed in order.
+    The interpreter is not shut down step by step: a thread of zenoh or of a driver that re-enters
+    it meanwhile would hang or abort the process after everything was closed in order.
     """
     logging.shutdown()
     for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError, AttributeError):  # its reader has gone
+        with contextlib.suppress(OSError, ValueError, AttributeError):  # the reader is gone
             stream.flush()
     os._exit(code)
 
 
 class Service(ABC):
-    """What a daemon does between `start` and `stop`; used from the main thread.
+    """Work of a daemon between `start` and `stop`; used from the main thread.
 
-    ``failure``: the thread that failed, and of what. ``done``: set when there is nothing more to
-    do. ``recorder``: writes the log, None for none. ``prog``: name of the command. ``refusals``:
-    errors of `_start` that say in a sentence why the environment does not allow it.
+    ``failure``: the thread that failed, and the error. ``done``: set when there is nothing left to
+    do. ``recorder``: writes the log; None for no log. ``prog``: name of the command. ``refusals``:
+    errors of `_start` whose text already tells users why the environment does not allow it.
     """
 
     prog: ClassVar[str]
@@ -119,7 +120,7 @@ class Service(ABC):
         self.watchdog = Watchdog()
 
     def start(self) -> None:
-        """Bring everything up; `StartError`, and everything down again, when that cannot be."""
+        """Start everything. If that fails, stop everything again and raise `StartError`."""
         try:
             self._start()
         except StartError:
@@ -131,14 +132,14 @@ class Service(ABC):
 
     @abstractmethod
     def _start(self) -> None:
-        """Bring everything up."""
+        """Start everything."""
 
     @abstractmethod
     def stop(self) -> bool:
-        """End in order what was begun, also half of it; False when a thread must be left behind."""
+        """Stop in order, also after a partial start; False if a thread had to be left running."""
 
     def fail(self, error: BaseException) -> None:
-        """A thread, the caller's or the one it speaks for, has failed: the daemon must end."""
+        """Report that the current thread has failed; the daemon must end."""
         if self.failure is None:
             name = threading.current_thread().name
             self.failure = (name, error)
@@ -146,7 +147,7 @@ class Service(ABC):
         self.done.set()
 
     def verdict(self, code: int) -> int:
-        """Say how it ended, after `stop`; ``code``, or a worse exit status."""
+        """Report after `stop` how the daemon ended; returns ``code`` or a worse exit status."""
         if self.recorder is not None:
             log.info("log: %s", self.recorder.stats.path)
         if self.failure is not None:
@@ -159,9 +160,9 @@ class Service(ABC):
 
 
 def serve(service: Service, ending: Ending, status: str, work: Callable[[], int]) -> int:
-    """Start ``service``, let it ``work``, end it in order; the exit status.
+    """Start ``service``, run ``work``, stop it in order; returns the exit status.
 
-    ``status``: what the service manager shows once it is ready. `CommandError` in ``work`` is told.
+    ``status``: text for the service manager once ready. A `CommandError` from ``work`` is reported.
     """
     ending.orderly = True
     service.start()
@@ -180,7 +181,7 @@ def serve(service: Service, ending: Ending, status: str, work: Callable[[], int]
     return code
 
 
-# What the service manager is told
+# Notifications to the service manager
 
 SOCKET_VARIABLE = "NOTIFY_SOCKET"
 WATCHDOG_VARIABLE = "WATCHDOG_USEC"
@@ -188,7 +189,7 @@ WATCHDOG_PID_VARIABLE = "WATCHDOG_PID"
 
 
 def notify(*lines: str) -> bool:
-    """Tell the service manager, never waiting for it; False where there is none, or it is busy."""
+    """Notify the service manager without waiting; False if there is none or it is busy."""
     place = os.environ.get(SOCKET_VARIABLE)
     if not place:
         return False
@@ -201,11 +202,11 @@ def notify(*lines: str) -> bool:
 
 
 class Watchdog:
-    """Says that the work goes on. ``beat`` it from the thread that does the work, nowhere else.
+    """Watchdog notifications. Call ``beat`` only from the thread that does the work.
 
-    When that thread is stuck the beats end, and the service manager kills and restarts the daemon.
-    ``period_s``: between two beats that are passed on, half of what the manager allows; None where
-    it asked for none.
+    If that thread is stuck, the beats stop, and the service manager kills and restarts the daemon.
+    ``period_s``: between two forwarded beats, half of what the manager allows; None if it requested
+    none.
     """
 
     def __init__(self) -> None:
@@ -213,25 +214,25 @@ class Watchdog:
         self._next = Instant(0)
 
     def beat(self, now: Instant) -> None:
-        """The work has just gone on; cheap, and passed on when it is time to."""
+        """Report that the work goes on; cheap, and forwarded only when due."""
         if self.period_s is None or now < self._next:
             return
         self._next = Instant(now + round(self.period_s * NS_PER_S))
         notify("WATCHDOG=1")
 
     def ready(self, status: str) -> None:
-        """The daemon serves now."""
+        """Report that the daemon is ready."""
         self._next = monotonic_now()
         notify("READY=1", f"STATUS={status}")
 
     @staticmethod
     def stopping(status: str) -> None:
-        """The daemon ends in order; beats are not expected any more."""
+        """Report that the daemon is stopping; no further beats are expected."""
         notify("STOPPING=1", f"STATUS={status}")
 
 
 def _period_s() -> float | None:
-    """Between beats: half of the time after which systemd takes this process for stuck."""
+    """Time between beats: half of the time after which systemd considers this process stuck."""
     if os.environ.get(WATCHDOG_PID_VARIABLE, str(os.getpid())) != str(os.getpid()):
         return None
     try:

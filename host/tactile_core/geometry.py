@@ -1,9 +1,9 @@
-"""Where the taxels of a skin are, in the end-effector's frame.
+"""Places of the taxels of a skin, in the end-effector's frame.
 
 End-effector frame ``ee``: origin at the wrist pivot, x along the finger towards its tip, y to the
 left, z up (ROS REP 103). Taxel frame: z is the outward normal of the skin, x and y lie in it.
-A force is what the environment exerts on the skin, so a press has a negative z in the taxel frame
-and the normal force is ``-z``.
+Forces are those that the environment exerts on the skin, so a press has a negative z in the taxel
+frame and the normal force is ``-z``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tactile_core.arrays import FloatArray
 
 
 class Side(IntEnum):
-    """Part of the end-effector that an array covers, and where a contact is felt."""
+    """Part of the end-effector that an array covers or a contact is on."""
 
     NONE = 0
     LEFT = 1
@@ -28,15 +28,14 @@ class Side(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArrayGeometry:
-    """Taxels of one array, numbered row by row.
+    """Geometry of one array; taxels are numbered row by row.
 
     ``position``: (n, 3) m in ``ee``. ``rotation``: (n, 3, 3), taxel axes to ``ee`` axes (columns
     are the taxel's x, y, z in ``ee``). ``surface``: (n, 2) m, coordinates of the taxels on the
-    unrolled skin, over which planes are fitted. ``chip_yaw``: (n,) rad, turn of each chip about
-    its z from the taxel's axes, so that v_taxel = Rz(chip_yaw) v_chip. ``posed``: whether the
-    array's place and attitude in ``ee`` are known. Where they are not (False), the taxels lie to
-    one another as said, but the array as a whole sits anywhere: it must not be told from another
-    array which way a field points, or where a contact of both is.
+    unrolled skin, over which planes are fitted. ``chip_yaw``: (n,) rad, rotation of each chip about
+    its z from the taxel's axes: v_taxel = Rz(chip_yaw) v_chip. ``posed``: whether the array's pose
+    in ``ee`` is known. If it is not, only the relative places of its taxels are valid: neither
+    field directions nor contact places may be compared with other arrays.
     """
 
     name: str
@@ -50,7 +49,7 @@ class ArrayGeometry:
     posed: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse arrays whose shapes disagree."""
+        """Reject inconsistent shapes."""
         n = self.rows * self.columns
         shapes = {
             "position": (self.position, (n, 3)),
@@ -72,7 +71,8 @@ class ArrayGeometry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkinGeometry:
-    """All arrays of one board, in the order of their array numbers. ``frame`` names ``ee``."""
+    """All arrays of one board, in the order of their numbers. ``frame``: name of the frame
+    ``ee``."""
 
     model: str
     frame: str
@@ -85,13 +85,13 @@ class SkinGeometry:
 
     @property
     def slices(self) -> tuple[slice, ...]:
-        """Where each array stands in arrays that hold all taxels one after another."""
+        """Slice of each array within data of all taxels."""
         ends = np.cumsum([0, *(a.taxels for a in self.arrays)]).tolist()
         return tuple(slice(a, b) for a, b in itertools.pairwise(ends))
 
     @property
     def posed(self) -> bool:
-        """Whether the arrays' poses relative to one another are known; True for a lone array."""
+        """Whether the relative poses of the arrays are known; True for a single array."""
         return len(self.arrays) == 1 or all(a.posed for a in self.arrays)
 
 
@@ -137,13 +137,13 @@ FINGER_OUTLINE: tuple[tuple[float, float], ...] = (
     (-0.0060, 0.02850),
 )
 """Convex outline of the finger seen from above, counter-clockwise from the right rear corner, m in
-``ee``: the authors' simulator at true scale (15.8 cm long, 5.7 cm wide)."""
+``ee``; the authors' simulator at true scale (15.8 cm long, 5.7 cm wide)."""
 
 FINGER_HEIGHT = 0.080
-"""m, along z (authors' simulator: z 1.11 to 1.91, × 10 cm)."""
+"""Height in m, along z (authors' simulator: z 1.11 to 1.91, × 10 cm)."""
 
 TIP_X = 0.158
-"""m, the point that is steered to the target: pivot + 1.58 × 10 cm along the heading."""
+"""x in m of the point that is steered to the target: pivot + 1.58 × 10 cm along the heading."""
 
 
 def grid_on_outline(
@@ -154,7 +154,7 @@ def grid_on_outline(
     centre: float,
     outline: tuple[tuple[float, float], ...] = FINGER_OUTLINE,
 ) -> ArrayGeometry:
-    """Grid of taxels wrapped round an outline: columns follow it, rows are stacked along z.
+    """Grid of taxels wrapped around an outline: columns follow it, rows are stacked along z.
 
     ``pitch``: m along the outline, along z. ``centre``: arc length in m from the outline's first
     point to the middle of the grid. Each taxel's x is the outline's direction of travel, its y is
@@ -194,10 +194,10 @@ def grid_on_outline(
 
 
 def finger() -> SkinGeometry:
-    """Default end-effector: 4 × 8 taxels on each side, 4 × 4 round the tip of the finger.
+    """Default end-effector: 4 × 8 taxels on each side, 4 × 4 around the tip of the finger.
 
     Columns are 16.5 mm apart on the sides and 11.5 mm at the tip, rows 16 mm. The foremost column
-    of each side lies on the slanted shoulder.
+    of each side is on the slanted shoulder.
     """
     total = float(np.linalg.norm(np.diff(np.asarray(FINGER_OUTLINE), axis=0), axis=1).sum())
     middle = 0.0755  # arc length of the sides' centre: 17.8 to 133.3 mm from the rear corner
@@ -216,10 +216,10 @@ ANYSKIN_CHIPS = 5
 """Magnetometers of one AnySkin board: centre, left, right, up, down."""
 
 ANYSKIN_OFFSET = 0.008
-"""m from the centre to the other four."""
+"""Distance in m from the centre to the other four."""
 
 ANYSKIN_YAW_DEG = (-90.0, -90.0, 180.0, 90.0, 0.0)
-"""How each chip is mounted."""
+"""Yaw of each chip in degrees, as mounted."""
 
 
 def anyskin() -> SkinGeometry:
@@ -261,7 +261,7 @@ def _mount(side: Side) -> tuple[FloatArray, FloatArray]:
 
 
 MOUNTS = (Side.LEFT, Side.RIGHT, Side.TIP, Side.TIP)
-"""Sides of the finger on which up to four simulated AnySkin boards of a controller sit."""
+"""Sides of the finger for up to four simulated AnySkin boards of a controller."""
 
 
 def anyskin_jaws(boards: int) -> SkinGeometry:

@@ -1,4 +1,4 @@
-"""Tables that the configuration files of all daemons have, and what options make of them."""
+"""Tables shared by the configuration files of all daemons, and their combination with options."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tactile_core.cli import DEFAULT_LOG
 from tactile_core.log.recorder import RecorderSettings
 
 DEFAULT_LOG_BYTES = 32 << 30
-"""Bytes that the logs of one name may take in a folder before the oldest go: about 18 h of one
-board at 100 Hz."""
+"""Default limit in bytes for the logs of one name in a folder; beyond it the oldest are deleted.
+About 18 h of one board at 100 Hz."""
 
 
 class LogTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[log]``: where the log is written; ``[log.recorder]``: how it is cut."""
+    """``[log]``: where the log is written; ``[log.recorder]``: how it is split."""
 
     enabled: Annotated[bool, Meta(description="whether a log is written")] = True
     destination: Annotated[
@@ -30,7 +30,7 @@ class LogTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class BusTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[bus]``: zenoh endpoints, and who is let in (see security.md)."""
+    """``[bus]``: zenoh endpoints, and who may join (see security.md)."""
 
     listen: Annotated[
         tuple[str, ...] | None,
@@ -51,7 +51,7 @@ class BusTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def bus_config(options: argparse.Namespace, table: BusTable, role: Role) -> BusConfig:
-    """How to join the bus; flags win over the file."""
+    """Bus configuration of ``role``; options override the file."""
     return BusConfig(
         role=role,
         listen=tuple(options.listen) if options.listen else table.listen,
@@ -63,7 +63,7 @@ def bus_config(options: argparse.Namespace, table: BusTable, role: Role) -> BusC
 
 
 def log_destination(options: argparse.Namespace, table: LogTable) -> Path | None:
-    """Folder or file of the log, None for none; flags win over the file."""
+    """Folder or file of the log, None for no log; options override the file."""
     if options.no_log:
         return None
     if options.log is not None:

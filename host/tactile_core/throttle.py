@@ -1,4 +1,4 @@
-"""How often something may be said: a burst, then a steady rate; what is held back is counted."""
+"""Rate limit for messages: a burst, then a steady rate; suppressed ones are counted."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from tactile_core.types import Instant, seconds_between
 
 
 class Throttle:
-    """Pure. ``burst`` times at once, then ``rate`` times a second.
+    """Rate limiter. Pure. Allows ``burst`` messages at once, then ``rate`` per second.
 
-    ``held``: what was held back since `take_held` was last asked.
+    ``held``: number suppressed since the last `take_held`.
     """
 
     def __init__(self, rate: float, burst: int) -> None:
@@ -19,7 +19,8 @@ class Throttle:
         self._at: Instant | None = None
 
     def allow(self, now: Instant) -> bool:
-        """Whether it may be said now; if not, it is counted. An earlier ``now`` changes nothing."""
+        """Whether a message may be sent now; counts it if not. An earlier ``now`` changes
+        nothing."""
         if not self.ready(now):
             self.held += 1
             return False
@@ -27,7 +28,7 @@ class Throttle:
         return True
 
     def ready(self, now: Instant) -> bool:
-        """Whether it might be said now; nothing is counted."""
+        """Whether a message could be sent now; counts nothing."""
         if self._at is None:
             self._at = now
         passed = seconds_between(self._at, now)
@@ -37,6 +38,6 @@ class Throttle:
         return self._left >= 1.0
 
     def take_held(self) -> int:
-        """How often it was held back since this was last asked."""
+        """Return and reset the number of suppressed messages."""
         held, self.held = self.held, 0
         return held

@@ -1,1 +1,1 @@
-"""Logs: writing them crash-safe, reading any, salvaging damaged ones."""
+"""Logs: crash-safe writing, reading any MCAP file, salvaging damaged ones."""

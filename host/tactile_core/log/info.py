@@ -1,4 +1,4 @@
-"""What a log holds: channels, rates, times, losses and where they are. Constant memory."""
+"""Content of a log: channels, rates, times, losses and their places. Constant memory."""
 
 from __future__ import annotations
 
@@ -28,54 +28,55 @@ DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 EVENT_TYPE = "tactile_msgs/msg/ReachEvent"
 
 FILE = "file"
-"""Table that tells which file of which log this is."""
+"""Metadata table that identifies a file within its log."""
 
 MAX_NAME = 4096
-"""Letters of an attachment's name that are kept."""
+"""Most characters kept of an attachment's name."""
 
 MAX_EXTRAS = 65_536
-"""Tables and attachments that are recognized when a later file repeats them."""
+"""Most tables and attachments remembered to recognise repetitions in later files."""
 
 MAX_LISTED = 1000
-"""Gaps, silences, tables and attachments kept one by one; beyond that only counted."""
+"""Most gaps, silences, tables and attachments kept individually; further ones are only counted."""
 
 MAX_TABLE_BYTES = 16 << 20
-"""Of all tables that are kept: real ones have some kB."""
+"""Most bytes of all kept tables; real ones have a few kB."""
 
 MAX_STAMP_NS = (1 << 63) - 1
-"""The last time that a signed number of ns tells (in the year 2262): ROS has no later one."""
+"""Latest time in signed 64-bit ns (in the year 2262); ROS cannot express a later one."""
 
 MAX_HOLES = 256
-"""Stretches of missing numbers of a channel in which late messages are looked for."""
+"""Most ranges of missing numbers per channel in which late messages are recognised."""
 
 MASK = 0xFFFFFFFF
 HALF = 1 << 31
 
 ONE_COUNTER_SHARE = 0.99
-"""Of the changes from one channel to another, those at which the number rises where one counter
-runs over all channels: where each has its own, it falls about as often as it rises."""
+"""Fraction of changes between channels at which the number rises if one counter serves all
+channels. With one counter per channel it falls about as often as it rises."""
 
 SETTLED = 20
 """Messages after which a channel's usual period is known well enough to call a pause a silence."""
 
 BACK_LEAST_NS = NS_PER_S // 100
-"""Times of a channel that go back by less are threads overtaking one another."""
+"""Smaller backward steps of a channel's times come from threads overtaking one another."""
 
 CLOCK_WINDOW = 100
-"""Messages of which the one logged soonest after its stamp tells how the two clocks stand: delays
-only add."""
+"""Messages per window in which the smallest delay from stamp to logging shows the offset of the
+clocks, as delays only add."""
 
 CLOCK_STEP_NS = NS_PER_S // 2
-"""How much that must change from one such window to the next to be a clock that was set."""
+"""Change between two windows that means a clock was set."""
 
 SILENCE_PERIODS = 10
 SILENCE_LEAST_NS = NS_PER_S // 2
-"""A silence is a pause of over ten usual periods and half a second: shorter ones are jitter."""
+"""A silence is a pause of more than ten usual periods and half a second; shorter ones are
+jitter."""
 
 
 @dataclass(frozen=True, slots=True)
 class Silence:
-    """A pause in a stream, longer than its rate explains."""
+    """Pause in a stream that is too long for its rate."""
 
     first_ns: int
     last_ns: int
@@ -83,11 +84,12 @@ class Silence:
 
 @dataclass(slots=True)
 class ChannelInfo:
-    """One stream of a log. ``missing``: messages whose sequence numbers are not in the log; 0
-    where the number is always the same, for then nothing is counted.
+    """One stream of a log.
 
-    ``steady``: it is meant to have a rate, so that a pause says something. ``impossible``: messages
-    stamped later than `MAX_STAMP_NS`, the first of them at ``impossible_ns``.
+    ``missing``: messages whose sequence numbers are not in the log; 0 if the number never changes,
+    as then nothing is counted. ``steady``: whether the stream should have a rate, so that pauses
+    are significant. ``impossible``: messages stamped later than `MAX_STAMP_NS`, the first of them
+    at ``impossible_ns``.
     """
 
     topic: str
@@ -109,8 +111,8 @@ class ChannelInfo:
     _holes: list[tuple[int, int]] = field(default_factory=list)  # first and last missing number
     _period: float = 0.0
     _prior_ns: int = 0
-    _least: int | None = None  # of log time less stamp, in this window
-    _before: int | None = None  # and in the one before
+    _least: int | None = None  # log time minus stamp, in this window
+    _before: int | None = None  # the same in the previous window
 
     @property
     def rate(self) -> float:
@@ -156,7 +158,7 @@ class ChannelInfo:
         self.messages += 1
 
     def _number(self, sequence: int, last: int) -> None:
-        """Take a number that does not follow: after missing ones, or a late one of those."""
+        """Handle a number out of sequence: after missing ones, or a late one of those."""
         if (sequence - last) & MASK < HALF:
             self._sequence = sequence
             self._skipped((last + 1) & MASK, sequence)
@@ -169,14 +171,14 @@ class ChannelInfo:
                 return
 
     def _skipped(self, first: int, sequence: int) -> None:
-        """The numbers from ``first`` to before ``sequence`` are missing so far."""
+        """Count the numbers from ``first`` to before ``sequence`` as missing so far."""
         self.missing += (sequence - first) & MASK
         if first < sequence:
             self._holes.append((first, sequence - 1))
             del self._holes[:-MAX_HOLES]
 
     def _watch_clock(self, log_ns: int, publish_ns: int) -> None:
-        """Notice when the clock of the stamps and that of the log have parted."""
+        """Detect a step between the clock of the stamps and that of the log."""
         if not publish_ns:
             return
         late = log_ns - publish_ns
@@ -191,7 +193,7 @@ class ChannelInfo:
 
 @dataclass(frozen=True, slots=True)
 class GapInfo:
-    """What the recorder says it could not write; see `tactile_core.log.writer`."""
+    """Losses reported by the recorder; see `tactile_core.log.writer`."""
 
     reason: str
     first_ns: int
@@ -203,7 +205,7 @@ class GapInfo:
 
 @dataclass(frozen=True, slots=True)
 class TableInfo:
-    """A table of texts within a log."""
+    """A metadata table in a log."""
 
     name: str
     values: dict[str, str]
@@ -211,7 +213,7 @@ class TableInfo:
 
 @dataclass(frozen=True, slots=True)
 class AttachmentInfo:
-    """A file within a log; ``size`` in bytes."""
+    """An attachment in a log; ``size`` in bytes."""
 
     name: str
     media_type: str
@@ -220,14 +222,15 @@ class AttachmentInfo:
 
 @dataclass(slots=True)
 class LogInfo:
-    """Everything `tactile log info` shows. ``drops``: the last counts by source and reason.
+    """Everything that `tactile log info` shows.
 
-    ``path``: the first file, ``files``: how many. ``missing_files``: numbers not there between the
-    first and the last. ``outcomes``: of the reaches in it. ``tables`` and ``files_within``: each of
-    them, the first MAX_LISTED, without those that a later file repeats; ``metadata`` and
-    ``attachments``: the last of each name. ``indexed``: all messages are in chunks, of which the
-    summaries tell, and all channels. ``one_counter``: the messages are numbered over all
-    channels; then ``numbers_missing`` counts instead of what is missing of each channel.
+    ``drops``: last counts by source and reason. ``path``: the first file; ``files``: how many.
+    ``missing_files``: missing numbers between the first and the last. ``outcomes``: of the reaches
+    in it. ``tables`` and ``files_within``: the first MAX_LISTED of each, without repetitions in
+    later files; ``metadata`` and ``attachments``: the last of each name. ``indexed``: all messages
+    are in chunks known to the summaries, as are all channels. ``one_counter``: messages are
+    numbered across all channels; then ``numbers_missing`` counts instead of each channel's
+    ``missing``.
     """
 
     path: Path
@@ -260,12 +263,12 @@ class LogInfo:
 
     @property
     def messages(self) -> int:
-        """Messages of all channels."""
+        """Number of messages of all channels."""
         return sum(channel.messages for channel in self.channels)
 
     @property
     def span_ns(self) -> tuple[int, int] | None:
-        """Times of the first and the last message."""
+        """Times of the first and the last message; None without messages."""
         with_messages = [channel for channel in self.channels if channel.messages]
         if not with_messages:
             return None
@@ -273,12 +276,12 @@ class LogInfo:
 
     @property
     def whole(self) -> bool:
-        """Whether every file was finished in order and every byte of it is readable."""
+        """Whether every file was finished in order and is fully readable."""
         return self.closed and not self.damage_count
 
 
 def info(path: Path, progress: Progress | None = None) -> LogInfo:
-    """Read a log from end to end, checking its checksums. `LogError` when it is none."""
+    """Read a log from end to end and verify its checksums. Raises `LogError` if it is not a log."""
     return info_of([path], progress)
 
 
@@ -287,7 +290,7 @@ def info_of(
     progress: Progress | None = None,
     watch: Callable[[ChannelRecord, SchemaRecord | None, Message], None] | None = None,
 ) -> LogInfo:
-    """The same of a log in several files, in their order. ``watch``: is shown every message."""
+    """Like `info`, for a log in several files, in order. ``watch``: called with every message."""
     taker = _Taker(LogInfo(paths[0], len(paths)), watch)
     sizes = [_size(path) for path in paths]
     numbers: list[int] = []
@@ -313,11 +316,11 @@ def _size(path: Path) -> int:
     try:
         return path.stat().st_size
     except OSError:
-        return 0  # opening it will say why
+        return 0  # opening it will report why
 
 
 class Extras:
-    """Tells tables and attachments that a later file of a log repeats at its start."""
+    """Recognises tables and attachments repeated at the start of a log's later files."""
 
     def __init__(self) -> None:
         self._seen: set[Hashable] = set()
@@ -325,24 +328,24 @@ class Extras:
         self._amid = False
 
     def next_file(self) -> None:
-        """Another file of the log begins."""
+        """Start the next file of the log."""
         self._seen |= self._now
         self._now.clear()
         self._amid = False
 
     def begin_messages(self) -> None:
-        """What comes from here on is not repeated."""
+        """Note that nothing after this point is a repetition."""
         self._amid = True
 
     def is_repeat(self, key: Hashable) -> bool:
-        """Whether ``key``, which stands for a name and the contents, was in a file before."""
+        """Whether ``key``, which identifies name and contents, was in an earlier file."""
         if len(self._seen) + len(self._now) < MAX_EXTRAS:
             self._now.add(key)
         return not self._amid and key in self._seen
 
 
 class _Taker:
-    """Takes the files of a log one after another."""
+    """Collects the information from the files of a log."""
 
     def __init__(
         self,
@@ -352,22 +355,22 @@ class _Taker:
         self.result = result
         self._watch = watch
         self._channels: dict[tuple[str, str], ChannelInfo] = {}
-        self._numbers: dict[int, _Taking] = {}  # by their numbers in this file
-        self._without: set[int] = set()  # channels of which no data are needed any more
+        self._numbers: dict[int, _Taking] = {}  # by channel number in this file
+        self._without: set[int] = set()  # channels whose data is no longer needed
         self._repeats = Repeats()
         self._extras = Extras()
         self._table_bytes = 0
         self._number = (-1, -1)  # channel and sequence number of the last message
-        self._changes = 0  # from one channel to another, and those at which the number rose
+        self._changes = 0  # changes of channel, and those at which the number rose
         self._rises = 0
 
     @property
     def watched(self) -> bool:
-        """Whether somebody looks at the first message of each channel."""
+        """Whether the first message of each channel is passed on."""
         return self._watch is not None
 
     def take(self, reader: LogReader, later: bool) -> None:
-        """Read a file; ``later``: it is not the first one given."""
+        """Read a file; ``later``: it is not the first one."""
         result = self.result
         self._numbers.clear()
         self._without.clear()
@@ -399,7 +402,7 @@ class _Taker:
         result.lost_unknown += reader.lost_unknown
 
     def finish(self) -> LogInfo:
-        """The result, once all files have been taken."""
+        """Return the result after all files."""
         result = self.result
         result.channels = sorted(self._channels.values(), key=lambda channel: channel.topic)
         missing = sum(channel.missing for channel in result.channels)
@@ -492,8 +495,8 @@ class _Taker:
 
 
 class _Unneeded:
-    """Channels of which no data are needed, decided before the first of their messages: in a large
-    chunk that may take all the memory there is."""
+    """Channels whose data is not needed, decided before their first message is read, which in a
+    large chunk may fill the memory."""
 
     def __init__(self, taker: _Taker, reader: LogReader, known: set[int]) -> None:
         self._taker = taker
@@ -512,7 +515,7 @@ class _Unneeded:
 
 @dataclass(slots=True)
 class _Taking:
-    """What is needed for every message of a channel of a file."""
+    """State for the messages of one channel of a file."""
 
     channel: ChannelInfo
     record: ChannelRecord
@@ -521,12 +524,12 @@ class _Taking:
 
     @property
     def key(self) -> tuple[str, str]:
-        """Of the stream in all files."""
+        """Key of the stream across all files."""
         return self.channel.topic, self.channel.msgtype
 
 
 def attachment_key(reader: LogReader, record: AttachmentRecord) -> Hashable:
-    """Stands for an attachment's name and contents; reads it once more."""
+    """Key of an attachment's name and contents; reads it once more."""
     digest = hashlib.blake2b(digest_size=16)
     for piece in reader.pieces_at(record.position, record.size):
         digest.update(piece)
@@ -560,7 +563,8 @@ def _take_metadata(result: LogInfo, record: MetadataRecord) -> None:
 
 
 def _take_diagnostics(result: LogInfo, message: Message) -> None:
-    # Imported here: building the type store takes 0.2 s, and most of `log recover` needs none.
+    # Imported here: building the type store takes 0.2 s, and most uses of `log recover` do not need
+    # it.
     from tactile_core.bus.messages import DROPS_PREFIX, DecodeError, codec
 
     try:

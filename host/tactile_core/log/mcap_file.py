@@ -1,8 +1,8 @@
-"""One MCAP file being written, record by record, each of them whole or not at all.
+"""Writer of one MCAP file; each record is written completely or not at all.
 
-Layout: https://mcap.dev/spec. The ``mcap`` package's writer is not used because it keeps its index
-as objects that grow with the log, spends four times as long on a message while it holds the
-interpreter's lock, and leaves half a record behind when the disk is full.
+Layout: https://mcap.dev/spec. The writer of the ``mcap`` package is not used because its index
+consists of objects that grow with the log, it takes four times as long per message while holding
+the interpreter lock, and it leaves a partial record when the disk is full.
 """
 
 from __future__ import annotations
@@ -32,36 +32,36 @@ MESSAGE_FIXED = 22  # bytes of a message record before its payload
 CHUNK_HEAD = struct.Struct("<QQQI")
 
 ZSTD_LEVEL = 1
-"""Takes little more than half the time of level 3, and packs taxel data as tightly."""
+"""Takes little more than half the time of level 3 and compresses taxel data as well."""
 
 
 class Storage(Protocol):
-    """The few calls a log makes of the file system: what a test replaces to fill the disk."""
+    """File-system calls of a log; tests replace them to simulate a full disk."""
 
     def open(self, path: Path) -> int:
-        """Create ``path`` for writing and lock it; FileExistsError when it is there."""
+        """Create ``path`` for writing and lock it. Raises FileExistsError if it exists."""
 
     def write(self, fd: int, data: bytes | memoryview) -> int:
-        """Append; returns how many bytes were taken."""
+        """Append data and return how many bytes were written."""
 
     def sync(self, fd: int) -> None:
-        """Make everything written so far survive a power cut."""
+        """Ensure that everything written so far survives a power cut."""
 
     def truncate(self, fd: int, size: int) -> None:
-        """Cut the file to ``size`` bytes and go on writing there."""
+        """Truncate the file to ``size`` bytes and continue writing there."""
 
     def close(self, fd: int) -> None:
-        """Let go of the file and its lock."""
+        """Release the file and its lock."""
 
     def free(self, directory: Path) -> int:
-        """Bytes that may still be written to the file system of ``directory``."""
+        """Bytes available on the file system of ``directory``."""
 
 
 class DiskStorage:
     """`Storage` on the real file system."""
 
     def open(self, path: Path) -> int:
-        """Create ``path``; the lock tells others (retention) that it is being written."""
+        """Create ``path``; its lock tells others (retention) that it is being written."""
         fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -72,15 +72,15 @@ class DiskStorage:
         return fd
 
     def write(self, fd: int, data: bytes | memoryview) -> int:
-        """Write to the file; other threads run meanwhile."""
+        """Write to the file; other threads can run meanwhile."""
         return os.write(fd, data)
 
     def sync(self, fd: int) -> None:
-        """Write data, and the metadata needed to read it, to the disk."""
+        """Write the data, and the metadata needed to read it, to the disk."""
         os.fdatasync(fd)
 
     def truncate(self, fd: int, size: int) -> None:
-        """Cut the file and set the position."""
+        """Truncate the file and set the position."""
         os.ftruncate(fd, size)
         os.lseek(fd, size, os.SEEK_SET)
 
@@ -95,7 +95,7 @@ class DiskStorage:
 
 
 def _string(text: str) -> bytes:
-    # The name of a file may hold what UTF-8 has no bytes for.
+    # A file name may contain characters that UTF-8 cannot encode.
     data = text.encode("utf-8", "backslashreplace")
     return struct.pack("<I", len(data)) + data
 
@@ -110,7 +110,7 @@ def _record(opcode: int, body: bytes) -> bytes:
 
 
 class ChunkBuffer:
-    """Messages of the chunk to come, already in their final form but for compression."""
+    """Messages of the next chunk, in final form except for compression."""
 
     __slots__ = ("data", "end_ns", "index", "messages", "start_ns")
 
@@ -124,7 +124,7 @@ class ChunkBuffer:
     def add(self, channel: int, sequence: int, log_ns: int, publish_ns: int, data: bytes) -> None:
         """Append one message; channel ids and sequence numbers as in the MCAP records.
 
-        struct.error, and nothing appended, for numbers that a record cannot hold.
+        Raises struct.error, and appends nothing, for numbers that do not fit into a record.
         """
         size = MESSAGE_FIXED + len(data)
         head = MESSAGE_HEAD.pack(MESSAGE, size, channel, sequence, log_ns, publish_ns)
@@ -144,7 +144,7 @@ class ChunkBuffer:
         self.data += data
 
     def seal(self, compressor: zstandard.ZstdCompressor) -> SealedChunk:
-        """Compress (other threads run meanwhile) and add the message indexes."""
+        """Compress (other threads can run meanwhile) and add the message indexes."""
         compressed = compressor.compress(self.data)
         body = (
             CHUNK_HEAD.pack(self.start_ns, self.end_ns, len(self.data), zlib.crc32(self.data))
@@ -178,7 +178,7 @@ class ChunkBuffer:
 
 @dataclass(frozen=True, slots=True)
 class SealedChunk:
-    """A chunk record with its message indexes, ready to be written anywhere in any file."""
+    """A chunk record with its message indexes, which may be written at any place in a file."""
 
     data: bytes
     chunk_length: int
@@ -193,10 +193,10 @@ class SealedChunk:
 
 
 class McapFile:
-    """Writer of one file: ``add_*`` stage records, `commit` writes all of them or none."""
+    """Writer of one file: ``add_*`` stage records; `commit` writes all of them or none."""
 
     def __init__(self, path: Path, storage: Storage, library: str, profile: str = "ros2") -> None:
-        """Create the file and write its start; OSError (FileExistsError) when that fails."""
+        """Create the file and write its start. Raises OSError (FileExistsError) on failure."""
         self.path = path
         self.size = 0
         self.messages = 0
@@ -228,13 +228,13 @@ class McapFile:
     def add_channel(
         self, channel: int, schema: int, topic: str, encoding: str, metadata: Mapping[str, str]
     ) -> None:
-        """Stage a channel under the id ``channel``; its schema must come before it."""
+        """Stage a channel under the id ``channel``; its schema must be staged before it."""
         body = struct.pack("<HH", channel, schema) + _string(topic) + _string(encoding)
         record = _record(CHANNEL, body + _map(metadata))
         self._stage(record, lambda _: self._channels.append(record))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Stage a named table of texts."""
+        """Stage a metadata table."""
         record = _record(METADATA, _string(name) + _map(values))
 
         def note(offset: int) -> None:
@@ -246,7 +246,7 @@ class McapFile:
     def add_attachment(
         self, name: str, media_type: str, data: bytes, log_ns: int, create_ns: int
     ) -> None:
-        """Stage a file within the file."""
+        """Stage an attachment."""
         body = struct.pack("<QQ", log_ns, create_ns) + _string(name) + _string(media_type)
         body += struct.pack("<Q", len(data)) + data
         record = _record(ATTACHMENT, body + struct.pack("<I", zlib.crc32(body)))
@@ -268,9 +268,9 @@ class McapFile:
         log_ns: int,
         create_ns: int,
     ) -> None:
-        """Write a file within the file at once, a piece at a time, after what is staged.
+        """Write an attachment directly, piece by piece, after what is staged.
 
-        OSError: then nothing of it is in the file; so it is where ``pieces`` fail.
+        After an OSError, or an error of ``pieces``, nothing of it remains in the file.
         """
         self.commit()
         start = self.size
@@ -295,11 +295,11 @@ class McapFile:
         self._attachment_index.append(_record(ATTACHMENT_INDEX, index))
 
     def add_chunk(self, chunk: SealedChunk) -> None:
-        """Stage a chunk and its indexes; its channels must come before it."""
+        """Stage a chunk and its indexes; its channels must be staged before it."""
         self._stage(chunk.data, lambda offset: self._note_chunk(chunk, offset))
 
     def commit(self) -> None:
-        """Write what is staged in one go. OSError: then nothing of it is in the file."""
+        """Write everything staged at once. After an OSError nothing of it is in the file."""
         staged, self._staged = self._staged, []
         offset = self.size
         self._put(b"".join(record for record, _ in staged))
@@ -308,13 +308,14 @@ class McapFile:
             offset += len(record)
 
     def sync(self) -> None:
-        """Make what was written survive a power cut."""
+        """Ensure that everything written survives a power cut."""
         if self._dirty:
             self._storage.sync(self._fd)
             self._dirty = False
 
     def finish(self) -> None:
-        """Commit, write the summary and close. After an OSError it is closed without one."""
+        """Commit, write the summary and close. After an OSError the file is closed without a
+        summary."""
         try:
             self.commit()
             self._put(self._summary())
@@ -323,7 +324,7 @@ class McapFile:
             self._storage.close(self._fd)
 
     def forget(self) -> None:
-        """Drop what is staged and was not committed."""
+        """Discard everything staged but not committed."""
         self._staged = []
 
     def abandon(self) -> None:
@@ -331,11 +332,11 @@ class McapFile:
         self._storage.close(self._fd)
 
     def _stage(self, record: bytes, note: Callable[[int], None]) -> None:
-        """Keep a record for `commit`, which calls ``note`` with its offset once it is written."""
+        """Stage a record; `commit` calls ``note`` with its offset once it is written."""
         self._staged.append((record, note))
 
     def _note_chunk(self, chunk: SealedChunk, offset: int) -> None:
-        """Take a chunk that stands at ``offset`` into the summary to come."""
+        """Add a chunk written at ``offset`` to the summary."""
         if not self.messages:
             self._start_ns, self._end_ns = chunk.start_ns, chunk.end_ns
         self._start_ns = min(self._start_ns, chunk.start_ns)
@@ -355,7 +356,7 @@ class McapFile:
         self._chunk_index += _record(CHUNK_INDEX, body)
 
     def _put(self, data: bytes) -> None:
-        """Append all of ``data``, or cut the file back to where it was and raise OSError."""
+        """Append all of ``data``, or truncate the file back and raise OSError."""
         if not data:
             return
         left = memoryview(data)

@@ -1,11 +1,11 @@
-"""Reads MCAP logs as they are: finished, cut off, or damaged, of any writer. Constant memory.
+"""Reads any MCAP log, finished, cut off or damaged, of any writer. Constant memory.
 
-A sound file is read record by record, as the format says: records of unknown types and fields that
-were appended are passed over. Where a record cannot be right, reading goes on at the next chunk,
-found by its header; everything passed over is reported as `Damage`, never silently.
+A sound file is read record by record, as the format says: records of unknown types and appended
+fields are ignored. If a record is invalid, reading continues at the next chunk, found by its
+header; everything skipped is reported as `Damage`, never silently.
 
-The ``mcap`` package takes apart the records of the summary. Its readers are not used for the rest:
-they stop at the first damage, unpack a chunk whatever its size, and take five times as long.
+The ``mcap`` package parses the records of the summary. Its readers are not used for the rest: they
+stop at the first damage, decompress a chunk whatever its size, and take five times as long.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ from tactile_core.log.records import (
     verify,
 )
 
-# The summary at the end of a finished log: read a record at a time, whatever its length.
+# Summary at the end of a finished log, read record by record whatever its length.
 
 
 R = TypeVar("R")
@@ -73,10 +73,10 @@ ALLOWED = frozenset(
         op.SUMMARY_OFFSET,
     )
 )
-"""Records of a summary, beside those of types that this version does not know."""
+"""Record types allowed in a summary, besides unknown ones."""
 
 LARGEST = 16 << 20
-"""Bytes of a summary's record that is looked into; a chunk's index has ten for each channel."""
+"""Largest record of a summary that is parsed, in bytes; a chunk index takes ten per channel."""
 
 FOOTER_SIZE = 9 + 20
 
@@ -85,9 +85,9 @@ CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")
 
 @dataclass(slots=True)
 class Chunks:
-    """What a summary says of the chunks, in its order; stamps in ns, places in bytes.
+    """Chunk index of a summary, in its order; stamps in ns, places in bytes.
 
-    ``length``: of a chunk with the message indexes behind it.
+    ``length``: of a chunk with the message indexes after it.
     """
 
     first_ns: array[int] = field(default_factory=lambda: array("Q"))
@@ -101,10 +101,11 @@ class Chunks:
 
 @dataclass(slots=True)
 class Summary:
-    """What stands between ``start`` and the footer at ``end``. ``checked``: its checksum is right.
+    """Summary between ``start`` and the footer at ``end``.
 
-    ``bad_crc``: it is wrong; then the rest says nothing. ``unindexed``: chunks with messages of
-    which no message index is named. ``troubles``: records that cannot be read, with their places.
+    ``checked``: its checksum is right. ``bad_crc``: its checksum is wrong, and the other fields are
+    empty. ``unindexed``: number of chunks with messages but without message index. ``troubles``:
+    unreadable records (position, length, reason).
     """
 
     start: int
@@ -122,13 +123,13 @@ class Summary:
 
     @property
     def knows_all_channels(self) -> bool:
-        """Whether every channel of the file is defined here, so that chunks may be passed over."""
+        """Whether every channel of the file is defined here, so that chunks may be skipped."""
         statistics = self.statistics
         return statistics is not None and 0 < statistics.channel_count <= len(self.channels)
 
 
 def parse(read: Callable[[ReadDataStream], R], body: bytes) -> R:
-    """A record taken apart by the ``mcap`` package; `BadRecordError` when it is none."""
+    """Parse a record with the ``mcap`` package. Raises `BadRecordError` if it is invalid."""
     try:
         return read(ReadDataStream(io.BytesIO(body)))
     except (McapError, EOFError, struct.error, UnicodeDecodeError):
@@ -136,9 +137,9 @@ def parse(read: Callable[[ReadDataStream], R], body: bytes) -> R:
 
 
 def read_summary(read_at: ReadAt, start: int, end: int, crc: int | None) -> Summary | None:
-    """The summary from ``start`` to the footer at ``end``; None when other records stand there.
+    """Read the summary from ``start`` to the footer at ``end``; None if other records are there.
 
-    ``crc``: of the footer, 0 for none; None when it is not to be checked.
+    ``crc``: from the footer, 0 if there is none; None to skip the check.
     """
     summary = Summary(start, end)
     for position, opcode, length in _records(read_at, start, end):
@@ -165,7 +166,8 @@ def read_summary(read_at: ReadAt, start: int, end: int, crc: int | None) -> Summ
 
 
 def _records(read_at: ReadAt, start: int, end: int) -> Iterator[tuple[int, int, int]]:
-    """Place, type and length of each record; one that ends beyond ``end`` for what is none."""
+    """Position, type and length of each record; an incomplete header counts as a record beyond
+    ``end``."""
     position = start
     window, begin = b"", start
     while position < end:
@@ -200,7 +202,7 @@ def _take(summary: Summary, opcode: int, body: bytes) -> None:
     elif opcode == op.CHUNK_INDEX:
         cursor = Cursor(body)
         first, last, offset, length, indexes = cursor.take(CHUNK_INDEX_HEAD)
-        cursor.at += indexes  # ten bytes a channel, of no use here
+        cursor.at += indexes  # ten bytes per channel, not needed here
         (index_length,) = cursor.take(struct.Struct("<Q"))
         chunks = summary.chunks
         chunks.first_ns.append(first)
@@ -211,57 +213,57 @@ def _take(summary: Summary, opcode: int, body: bytes) -> None:
 
 
 MAX_CHUNK = 256 << 20
-"""Bytes of one chunk, or of a message outside chunks: rosbag2 and Foxglove write chunks of 0.8 to
-4 MB, this project of 1 MB; bounds memory."""
+"""Largest chunk, or message outside chunks, in bytes. rosbag2 and Foxglove write chunks of 0.8 to 4
+MB, this project of 1 MB. Bounds memory."""
 
 MAX_SUSPECT = 64 << 20
-"""Bytes of a damaged chunk in which whole messages are looked for: it is in memory meanwhile."""
+"""Largest damaged chunk, in bytes, that is searched for whole messages; it is held in memory."""
 
 MAX_RECORD = 16 << 20
-"""Bytes of a schema, channel or metadata record: real ones are a few kB."""
+"""Largest schema, channel or metadata record in bytes; real ones have a few kB."""
 
 MAX_DEFINITIONS = 64 << 20
-"""Bytes of all schemas and channels of a file: three thousand topics have some MB."""
+"""Most bytes of all schemas and channels of a file; three thousand topics have some MB."""
 
 MAX_FILE = 1 << 50
-"""Bytes beyond which no file goes: a length that says so is wrong."""
+"""Larger lengths in bytes are wrong, as no file is that large."""
 
 MAX_DAMAGES = 1000
-"""Places reported one by one; beyond that they are only counted."""
+"""Most damages reported individually; further ones are only counted."""
 
 FOOTER = struct.Struct("<QQI")
 
 NO_MESSAGES = frozenset((op.HEADER, op.SCHEMA, op.CHANNEL, op.MESSAGE_INDEX, op.ATTACHMENT,
                          op.METADATA, op.DATA_END))  # fmt: skip
-"""Records whose loss is not that of a message."""
+"""Record types whose loss costs no message."""
 
 DATA_RECORDS = frozenset((op.HEADER, op.SCHEMA, op.CHANNEL, op.METADATA, op.MESSAGE))
 
 
 class _Any:
-    """Contains everything."""
+    """Container of everything."""
 
     def __contains__(self, _: object) -> bool:
         return True
 
 
 ANY: Container[int] = _Any()
-"""All channels, for `LogReader.messages` to hand out none of their data."""
+"""All channels: `LogReader.messages` returns their messages without data."""
 
 
 @dataclass(slots=True)
 class LogReader:
-    """One pass over a log, as a context manager. `LogError` when the file is none.
+    """One pass over a log, as a context manager. Raises `LogError` if the file is not a log.
 
-    ``window``: log times, ns, first and last included; chunks wholly outside may be passed over,
-    and attachments and tables are. ``keep_suspect``: blocks and attachments whose checksum is
-    wrong are handed out all the same, as far as they can be read.
+    ``window``: first and last log time, ns, inclusive. Chunks wholly outside may be skipped;
+    attachments and tables are skipped. ``keep_suspect``: also return blocks and attachments with a
+    wrong checksum, as far as they are readable.
 
-    After the pass: ``schemas`` and ``channels`` by number, ``closed`` (the file was finished in
-    order), ``damages`` (the first MAX_DAMAGES) and their ``damage_count``, ``bytes_damaged``,
+    After the pass: ``schemas`` and ``channels`` by number; ``closed`` (the file was finished in
+    order); ``damages`` (the first MAX_DAMAGES), their ``damage_count`` and ``bytes_damaged``;
     ``messages_lost`` as far as indexes tell, ``lost_unknown`` places where they do not.
-    ``data_crc``: of all bytes up to ``data_end``, 0 where the writer made none. ``suspect``:
-    messages handed out of blocks whose checksum is wrong; ``unchunked``: those outside chunks.
+    ``data_crc``: of all bytes up to ``data_end``, 0 if the writer stored none. ``suspect``:
+    messages returned from blocks with a wrong checksum; ``unchunked``: messages outside chunks.
     """
 
     path: Path
@@ -286,21 +288,21 @@ class LogReader:
     data_crc: int = 0
     data_end: int = 0
     _bytes: LogBytes = field(init=False)
-    _footer: tuple[int, int] | None = None  # where it says that the summary begins; its checksum
+    _footer: tuple[int, int] | None = None  # summary's start as stated, and its checksum
     _lost_chunk: Damage | None = None
-    _suspect_kept: int = 0  # messages of the lost chunk that were handed out all the same
-    _unknown_at: int | None = None  # the last record, if its type is not known
+    _suspect_kept: int = 0  # messages of the lost chunk that were returned
+    _unknown_at: int | None = None  # position of the last record, if its type is unknown
     _bad_crc: bool = False
-    _ended: bool = False  # the end mark was passed
+    _ended: bool = False  # the end mark was read
     _definition_bytes: int = 0
     _redefined: set[tuple[int, int]] = field(default_factory=set)
-    _skips: dict[int, int] | None = None  # places of chunks outside the window, and their ends
-    _blocks: int = 0  # handed out, and read to their ends
+    _skips: dict[int, int] | None = None  # starts of chunks outside the window, and their ends
+    _blocks: int = 0  # blocks returned, and those read to their ends
     _read: int = 0
     _messages: int = 0
 
     def __post_init__(self) -> None:
-        """Prepare; the file is opened on entering the context."""
+        """Prepare reading; the file is opened on entering the context."""
         self._bytes = LogBytes(self.path, self.progress)
 
     def __enter__(self) -> LogReader:
@@ -318,8 +320,8 @@ class LogReader:
 
     @property
     def indexed(self) -> bool:
-        """After the pass: whether the summary tells of all channels and types, and has an index of
-        every chunk and of its messages, so that programs that need one find every message."""
+        """After the pass: whether the summary lists all channels and types, and indexes every chunk
+        and its messages, so that programs that need an index find every message."""
         summary = self.summary
         if summary is None or self.unchunked or not summary.knows_all_channels:
             return False
@@ -332,26 +334,27 @@ class LogReader:
 
     @property
     def lossy(self) -> bool:
-        """Whether messages were lost so far, as far as is known."""
+        """Whether known losses of messages occurred so far."""
         return bool(self.messages_lost or self.lost_unknown)
 
     def read_at(self, position: int, size: int) -> bytes:
-        """Bytes of the file; fewer at its end. `LogError` when the disk fails."""
+        """Read bytes at ``position``; fewer at the end of the file. Raises `LogError` on a disk
+        error."""
         return self._bytes.read_at(position, size)
 
     def pieces_at(self, position: int, size: int) -> Iterator[bytes]:
-        """``size`` bytes of the file, a piece at a time, for what may be of any size."""
+        """Yield ``size`` bytes of the file piece by piece, for data of any size."""
         for at in range(position, position + size, WINDOW):
             yield self.read_at(at, min(WINDOW, position + size - at))
 
     def summarize(self) -> Summary | None:
-        """The summary alone, without reading the rest; None where there is none to be believed."""
+        """Read only the summary; None if there is none or it is unreliable."""
         self._start()
         summary = self.summary
         return None if summary is None or summary.troubles else summary
 
     def events(self) -> Iterator[Event]:
-        """Everything readable, in the order of the file."""
+        """Yield everything readable, in file order."""
         position = self._start()
         self._plan_window()
         while position < self._bytes.end:
@@ -378,9 +381,9 @@ class LogReader:
             self.progress(self.size, self.size)
 
     def messages(self, block: Block, without: Container[int] = ()) -> Iterator[Message]:
-        """Messages of a block; schemas and channels in it are taken up on the way.
+        """Yield the messages of a block; also collects the schemas and channels in it.
 
-        ``without``: channels whose messages come with no data, for who only counts them.
+        ``without``: channels whose messages are returned without data, for counting.
         """
         if block.suspect:
             yield from self._suspected(block)
@@ -411,7 +414,7 @@ class LogReader:
             self.note_damage(Damage(block.offset, 0, "a chunk whose records do not fit into it"))
 
     def check_structure(self) -> None:
-        """`LogError` unless the records follow one another soundly; chunks are not unpacked."""
+        """Raise `LogError` unless the sequence of records is valid; does not decompress chunks."""
         position = self._start()
         while position < self._bytes.end and not self.damage_count:
             opcode, length = op.RECORD.unpack(self.read_at(position, 9).ljust(9, b"\0"))
@@ -426,10 +429,11 @@ class LogReader:
         if self.damage_count:
             raise LogError(f"{self.path}: {self.damages[0].reason}")
 
-    # How a file begins and ends
+    # Start and end of a file
 
     def _start(self) -> int:
-        """Where the first record is; finds out whether the file was finished, and how it ends."""
+        """Return the position of the first record; determines whether and how the file was
+        finished."""
         if self.size == 0:
             raise LogError(f"{self.path} is empty: its writer ended before the first byte")
         self._bytes.end = self.size
@@ -452,7 +456,7 @@ class LogReader:
         return 8
 
     def _read_end(self) -> None:
-        """Find the footer of a finished file, and the summary where it says that one is."""
+        """Find the footer of a finished file, and the summary to which it points."""
         at = self.size - FOOTER_SIZE - 8
         tail = self.read_at(max(at, 0), FOOTER_SIZE + 8)
         if at < 8 or len(tail) != FOOTER_SIZE + 8 or tail[-8:] != op.MAGIC or tail[0] != op.FOOTER:
@@ -465,7 +469,7 @@ class LogReader:
             return
         summary = read_summary(self.read_at, start, at, crc) if 8 < start <= at else None
         if summary is None:
-            return  # the end mark will tell where it is
+            return  # the end mark will show where it is
         if summary.bad_crc:
             self.closed, self._bad_crc = False, True
             self._bytes.end = self.size
@@ -485,7 +489,7 @@ class LogReader:
             self.note_damage(Damage(position, length, f"in the summary: {reason}", 0))
 
     def _end_mark(self, position: int, length: int) -> int:
-        """The end of the data at ``position``; returns where reading ends."""
+        """Handle the end mark at ``position``; returns where reading ends."""
         after = position + 9 + length
         if length < 4:
             raise BadRecordError("an end mark that is too short")
@@ -495,7 +499,7 @@ class LogReader:
             reason = "cut off within the summary"
             self.note_damage(Damage(position, self.size - position, reason, 0))
         elif self._bad_crc and after == self._footer[0]:
-            pass  # it was reported
+            pass  # already reported
         elif after != self._bytes.end:
             footer = self.size - FOOTER_SIZE - 8
             start, crc = self._footer
@@ -516,7 +520,7 @@ class LogReader:
         return self._bytes.end
 
     def _check_end(self) -> None:
-        """What the summary says against what was found, once all is read."""
+        """Compare the summary with what was found, after the pass."""
         if self.closed and not self._ended and self._footer is not None:
             reason = "the data have no end mark where the footer says that the summary begins"
             self.note_damage(Damage(self._bytes.end, 0, reason, 0))
@@ -531,10 +535,10 @@ class LogReader:
             self.note_damage(Damage(place, 0, reason, lost))
 
     def data_checksum_is_right(self) -> bool:
-        """Whether the bytes of the data have their checksum; reads them all where there is one.
+        """Whether the data matches its checksum, if there is one; reads all of it.
 
-        Writers differ in where the data begin: with the file, behind its first eight bytes, or
-        behind the header.
+        Writers differ in where the data starts: with the file, after its first eight bytes, or
+        after the header.
         """
         if not self.data_crc:
             return True
@@ -547,10 +551,10 @@ class LogReader:
                 return True
         return False
 
-    # Passing over what is outside the window
+    # Skipping data outside the window
 
     def _plan_window(self) -> None:
-        """Note which chunks need not be looked at: by an index of all, and channels all known."""
+        """Plan which chunks to skip; needs an index of all chunks and all channels known."""
         summary = self.summary
         if self.window is None or summary is None or not summary.knows_all_channels:
             return
@@ -562,14 +566,14 @@ class LogReader:
         for k in spans:
             start, after = chunks.offset[k], chunks.offset[k] + chunks.length[k]
             if start < before or after > self._bytes.end:
-                return  # an index that cannot be right is none
+                return  # an invalid index is ignored
             before = after
             if chunks.last_ns[k] < first or chunks.first_ns[k] > last:
                 skips[start] = after
         self._skips = skips
 
     def _may_skip(self, position: int, after: int) -> bool:
-        """Whether a chunk is as the index says; where that has a checksum, it is believed."""
+        """Whether a chunk may be skipped as the index says; an index with a checksum is trusted."""
         if self.summary is None or self.summary.checked:
             return True
         found = self._bytes.chunk_head(position)
@@ -581,7 +585,7 @@ class LogReader:
     # Records
 
     def _record(self, position: int) -> tuple[int, Event | None]:
-        """The record at ``position`` and where the next one is."""
+        """Read the record at ``position``; returns the position of the next one and its event."""
         head = self.read_at(position, 9)
         if len(head) < 9:
             raise BadRecordError("cut off within a record")
@@ -615,9 +619,10 @@ class LogReader:
         return after, None
 
     def _unknown(self, position: int, length: int) -> Event | None:
-        """A record of a type of later versions, or somebody's own: passed over.
+        """Skip a record of an unknown type (of a later version, or private).
 
-        If it is a chunk in all but its type, a bit of that was flipped, and the checksum tells.
+        If it looks like a chunk in all but its type, a bit of the type was flipped, and the chunk's
+        checksum decides.
         """
         self._unknown_at = position
         if not self._bytes.looks_like_chunk(position):
@@ -627,7 +632,7 @@ class LogReader:
         return self._chunk(position, length)[1]
 
     def _single(self, position: int, length: int) -> Event | None:
-        """A message outside chunks."""
+        """Read a message outside chunks."""
         if length < op.MESSAGE_FIXED:
             raise BadRecordError("a message is shorter than its fields")
         self.unchunked += 1
@@ -653,7 +658,7 @@ class LogReader:
             self._keep_channel(parse_channel(body), 1)
 
     def _keep_schema(self, schema: SchemaRecord, from_data: int) -> None:
-        """Take up a schema; the first of a number holds, and 0 is none."""
+        """Store a schema; the first of a number is kept, and number 0 means none."""
         known = self.schemas.get(schema.number)
         if schema.number == 0 or known == schema:
             return
@@ -679,7 +684,7 @@ class LogReader:
             self._differs(op.CHANNEL, channel.number, from_data)
 
     def _differs(self, opcode: int, number: int, from_data: int) -> None:
-        """Say once that a definition is not the same everywhere; a checked summary is right."""
+        """Report once that definitions differ; a checked summary takes precedence."""
         if from_data and self.summary is not None and self.summary.checked:
             return
         if (opcode, number) not in self._redefined:
@@ -724,7 +729,7 @@ class LogReader:
             return after, None
 
     def _cut_chunk(self, position: int, packed: Packed) -> Event | None:
-        """The beginning of a chunk at the end of the file: whole zstd blocks are exact."""
+        """Read the start of a chunk at the end of the file: whole zstd blocks are exact."""
         if self._bytes.find_chunk(position + 1) is not None:
             raise BadRecordError("a chunk that is longer than the file")
         end, head = self._bytes.end, packed.head
@@ -738,15 +743,15 @@ class LogReader:
         return Block(position, b"", False, rest, partial=True)
 
     def _streamed(self, block: Block, without: Container[int]) -> Iterator[Message]:
-        """Messages of a chunk as it is unpacked, no more of it in memory than the largest."""
+        """Yield messages while decompressing a chunk, with only the largest one in memory."""
         packed = block.packed
         if packed is None:
             return
         held = bytearray()
-        at = done = 0  # in what is held; bytes before that
+        at = done = 0  # position within held; bytes before it
         total = packed.head.size
         source = pieces(self.read_at, packed)
-        skip = 0  # bytes to come that are not wanted
+        skip = 0  # coming bytes to skip
         reason = ""
         while True:
             while not reason and len(held) - at >= 9:
@@ -808,13 +813,13 @@ class LogReader:
                 piece = piece[taken:]
             held += piece
         if block.partial:
-            return  # reported
+            return  # already reported
         if reason != "-" and (reason or len(held) > at or done + at != total):
             reason = reason or "a chunk whose records do not fit into it"
             self.note_damage(Damage(block.offset, 0, reason))
 
     def _suspected(self, block: Block) -> Iterator[Message]:
-        """Messages of a chunk that is damaged somewhere: all those that look like one."""
+        """Yield everything that looks like a message from a damaged chunk."""
         packed = block.packed
         if packed is None:
             return
@@ -825,7 +830,7 @@ class LogReader:
             if opcode == op.MESSAGE and self._likely(data, at, packed.head):
                 if after < len(data) and not self._likely(data, after, packed.head):
                     following = self._resume(data, at + 31, packed.head)
-                    if following < after:  # its length is wrong: it would swallow others
+                    if following < after:  # its length is wrong: it would include others
                         at = following
                         continue
                 _, _, channel, *fields = op.MESSAGE_HEAD.unpack_from(data, at)
@@ -842,7 +847,7 @@ class LogReader:
             at = after
 
     def _likely(self, data: bytes, at: int, head: ChunkHead) -> bool:
-        """Whether a message can begin here: of a channel there is, at a time of its chunk."""
+        """Whether a message can begin here: of a known channel, at a time within its chunk."""
         if at + 31 > len(data):
             return False
         _, length, channel, _, log_ns, _ = op.MESSAGE_HEAD.unpack_from(data, at)
@@ -854,7 +859,7 @@ class LogReader:
         )
 
     def _resume(self, data: bytes, at: int, head: ChunkHead) -> int:
-        """Where the next likely message begins; the end where there is none."""
+        """Position of the next likely message; the end if there is none."""
         while (at := data.find(op.MESSAGE, at)) >= 0:
             if self._likely(data, at, head):
                 return at
@@ -862,7 +867,7 @@ class LogReader:
         return len(data)
 
     def _take_inner(self, block: Block, opcode: int, body: bytes) -> bool:
-        """Take up a record within a chunk that is not a message; False when the rest is lost."""
+        """Handle a record within a chunk that is not a message; False if the rest is lost."""
         if opcode in (op.SCHEMA, op.CHANNEL):
             try:
                 self._define(opcode, body)
@@ -878,7 +883,7 @@ class LogReader:
         return True
 
     def _lose_chunk(self, position: int, after: int, head: ChunkHead, reason: str) -> None:
-        """Note a chunk that is lost; the indexes behind it will say how many messages it had."""
+        """Note a lost chunk; the indexes after it tell how many messages it had."""
         self._lost_chunk = Damage(position, after - position, reason, 0, head.start_ns, head.end_ns)
 
     def _settle_lost_chunk(self) -> None:
@@ -886,7 +891,7 @@ class LogReader:
         kept, self._suspect_kept = self._suspect_kept, 0
         if lost is not None:
             known = max(0, lost.messages - kept) if lost.messages else None
-            self.note_damage(replace(lost, messages=known))  # no index followed: nobody knows
+            self.note_damage(replace(lost, messages=known))  # unknown without an index
 
     def _message_index(self, length: int, unknown_at: int | None, position: int) -> None:
         if length < 6:
@@ -898,11 +903,11 @@ class LogReader:
         lost = self._lost_chunk
         if lost is not None:
             self._lost_chunk = replace(lost, messages=(lost.messages or 0) + size // 16)
-        elif unknown_at is not None:  # indexes follow chunks alone
+        elif unknown_at is not None:  # indexes follow only chunks
             reason = "a chunk whose record type is wrong"
             self._lost_chunk = Damage(unknown_at, position - unknown_at, reason, size // 16)
 
-    # What is neither
+    # Other records
 
     def _attachment(self, position: int, length: int) -> AttachmentRecord | None:
         if self.window is not None:
@@ -934,8 +939,8 @@ class LogReader:
         return AttachmentRecord(name, media_type, log_ns, create_ns, start, size)
 
     def _skip(self, position: int, reason: str) -> int:
-        """Pass over what cannot be read: one record where its length leads to another, or else
-        all up to the next chunk or the end of the data."""
+        """Skip an unreadable part: one record if its length leads to another, otherwise everything
+        up to the next chunk or the end of the data."""
         self._settle_lost_chunk()
         head = self.read_at(position, 9)
         after = position + 9 + op.RECORD.unpack(head)[1] if len(head) == 9 else self._bytes.end
@@ -949,13 +954,13 @@ class LogReader:
         if not self._bytes.plausible(after) and after != self._bytes.end:
             found = self._bytes.find_chunk(position + 1)
             if found is not None or (after < self._bytes.end and not messages):
-                messages = None  # others may have stood there
+                messages = None  # others may have been there
             after = self._bytes.end if found is None else found
         self.note_damage(Damage(position, after - position, reason, messages))
         return after
 
     def note_damage(self, damage: Damage) -> None:
-        """Count a damage, of which the first MAX_DAMAGES are kept."""
+        """Count a damage; the first MAX_DAMAGES are kept."""
         self.damage_count += 1
         self.bytes_damaged += damage.length
         self.messages_lost += damage.messages or 0
@@ -967,9 +972,9 @@ class LogReader:
 def read_messages(
     path: Path, topics: Collection[str] | None = None
 ) -> Iterator[tuple[ChannelRecord, Message]]:
-    """Messages of a log in the order of the file, whole or cut off; all, or those of ``topics``.
+    """Yield the messages of a log in file order, whole or cut off; all, or those of ``topics``.
 
-    `LogError` when the file is no log. Damaged stretches are passed over.
+    Raises `LogError` if the file is not a log. Damaged parts are skipped.
     """
     with LogReader(path) as reader:
         for event in reader.events():
@@ -982,9 +987,9 @@ def read_messages(
 
 
 def check_readable(path: Path) -> None:
-    """`LogError` unless the records of a log follow one another soundly to its end.
+    """Raise `LogError` unless the records of a log form a valid sequence up to its end.
 
-    Chunks are not decompressed: meant to be cheap, before older files are deleted.
+    Chunks are not decompressed: it is a cheap check before older files are deleted.
     """
     with LogReader(path) as reader:
         reader.check_structure()

@@ -1,13 +1,13 @@
-"""The log: MCAP files written by a thread of their own, from a bounded queue.
+"""Recorder of MCAP logs, which are written by a thread of its own from a bounded queue.
 
-Nothing is lost without a trace. Every message gets its channel's next sequence number when it is
-handed over, so a number that is missing in the log is a message that was dropped there; and the
-next flush writes a metadata record called ``gap`` that says why, how many of each channel, and
-the times of the first and last. The sum of ``messages`` over all gap records is the number of
-dropped messages. A file that could not be written on has its gap record in the file after it.
+Every loss leaves a trace. Each message gets its channel's next sequence number when it is handed
+over, so a number missing in the log is a dropped message. The next flush writes a metadata record
+named ``gap`` with the reason, the number lost of each channel, and the times of the first and last.
+The sum of ``messages`` over all gap records is the number of dropped messages. If a file cannot be
+continued, its gap record is in the next file.
 
-Nothing that is handed over ends the log. A message that no log can hold is refused and counted; a
-stamp that none can hold gives way to the time of logging, and is counted as marked.
+No input ends the log. A message that a log cannot hold is refused and counted. A stamp that it
+cannot hold is replaced by the time of logging and counted as marked.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ from tactile_core.log.retention import LogSet
 from tactile_core.log.writer import WRITER_FAILED, Channel, Gaps, Item, LogWriter, RecorderSettings
 from tactile_core.types import WallClock, monotonic_now
 
-# Topics whose last message holds until the next, and their repetition at the start of a file.
+# Latched topics, whose last message stays valid until the next, and its repetition in each file.
 
 
 QOS = "offered_qos_profiles"
-"""Key of a channel's metadata under which rosbag2 keeps the QoS of its publishers, in YAML."""
+"""Key of a channel's metadata in which rosbag2 stores the QoS of its publishers, as YAML."""
 
 LATCHED_QOS = (
     "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n"
     "  deadline: {sec: 0, nsec: 0}\n  lifespan: {sec: 0, nsec: 0}\n  liveliness: 0\n"
     "  liveliness_lease_duration: {sec: 0, nsec: 0}\n  avoid_ros_namespace_conventions: false\n"
 )
-"""That of a latched topic as rosbag2 writes it: keep the last one, reliable, transient local."""
+"""QoS of a latched topic as rosbag2 writes it: keep the last one, reliable, transient local."""
 
 TRANSIENT_LOCAL = re.compile(r"\bdurability['\"]?:\s*['\"]?(?:1\b|transient_local)")
 
 STAYING = ("tf_static", "robot_description")
-"""Topics of other programs that are latched whatever their channel says."""
+"""Topics of other programs that are latched regardless of their channel's metadata."""
 
 
 def is_latched(topic: str, metadata: Mapping[str, str]) -> bool:
-    """Whether the last message of a channel holds: by its QoS, or because its topic is known."""
+    """Whether a channel is latched, judged by its QoS or a known topic."""
     if TRANSIENT_LOCAL.search(metadata.get(QOS, "")) or topic.rpartition("/")[2] in STAYING:
         return True
     found = find_topic(topic)
@@ -59,10 +59,10 @@ def is_latched(topic: str, metadata: Mapping[str, str]) -> bool:
 
 
 class Repeats:
-    """Tells messages that a later file of a log repeats at its start, so that it has what holds.
+    """Recognises latched messages repeated at the start of a log's later files.
 
-    Of every latched channel that is the first message of the file, if it is the last one of the
-    files before it again: same number, same stamp of its sender, same bytes.
+    A repetition is the first message of a latched channel in a file if it equals the last one of
+    the earlier files: same number, same sender's stamp, same bytes.
     """
 
     def __init__(self) -> None:
@@ -70,11 +70,11 @@ class Repeats:
         self._begun: set[Hashable] = set()
 
     def next_file(self) -> None:
-        """Another file of the log begins."""
+        """Start the next file of the log."""
         self._begun.clear()
 
     def is_repeat(self, channel: Hashable, message: Message) -> bool:
-        """Whether a message of a latched channel is one that was there before."""
+        """Whether a message of a latched channel repeats an earlier one."""
         told = message.sequence, message.publish_ns, zlib.crc32(message.data)
         if channel in self._begun:
             self._last[channel] = told
@@ -90,23 +90,24 @@ __all__ = ["Recorder", "RecorderError", "RecorderSettings", "RecorderStats"]
 log = logging.getLogger(__name__)
 
 BATCH = 512
-"""Messages the writer takes at once, about 1 ms of work: then other threads may run."""
+"""Messages that the writer takes at once, about 1 ms of work, before other threads may run."""
 
 POLL = 0.02
-"""s between looks at the queue: waking the writer for every message would cost both threads."""
+"""Polling period of the queue in s: waking the writer for every message would cost both threads."""
 
 MAX_CHANNELS = 1024
-"""Streams of one log: a dozen a board, more boards than one host has. MCAP ends at 65,535."""
+"""Most streams of one log: a dozen per board, for more boards than one host has. The limit of MCAP
+is 65,535."""
 
 TIME_END_NS = 1 << 64
-"""First time, in ns since 1970, that an MCAP file cannot hold."""
+"""First time, in ns since 1970, that does not fit into an MCAP file."""
 
 REFUSALS = ("too_large", "not_bytes", "bad_name", "unknown_type", "too_many_channels", "unwritable")
-"""Why a message is refused: for what it is, whatever the disk does."""
+"""Reasons to refuse a message for itself, regardless of the disk."""
 
 
 class RecorderError(Exception):
-    """The log cannot be started as asked; the message names the remedy."""
+    """The log cannot be started; the message names the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,9 +115,9 @@ class RecorderStats:
     """State of a log.
 
     ``state``: recording, disk_full, io_error, low_space, writer_failed or closed. ``written``:
-    messages in the files. ``dropped``: messages lost, by reason; their sum is that of the log's gap
-    records once it is closed. ``queued``: messages not yet there. ``marked``: messages whose stamp
-    no log can hold; theirs is the time of logging.
+    messages in the files. ``dropped``: lost messages by reason; their sum equals that of the gap
+    records once the log is closed. ``queued``: messages not yet written. ``marked``: messages whose
+    stamp a log cannot hold; they have the time of logging.
     """
 
     state: str
@@ -134,8 +135,9 @@ class RecorderStats:
 class Recorder:
     """Writes messages to a set of MCAP files. `write`, `attach` and `metadata` never block.
 
-    ``destination``: a ``.mcap`` file, which must not exist, or a directory, made when missing, for
-    files called ``<prefix>_<UTC time>_<number>.mcap``. `RecorderError` when it cannot be written.
+    ``destination``: a ``.mcap`` file, which must not exist, or a directory, created if missing, for
+    files named ``<prefix>_<UTC time>_<number>.mcap``. Raises `RecorderError` if it cannot be
+    written.
     """
 
     def __init__(
@@ -188,10 +190,10 @@ class Recorder:
 
     @property
     def trouble(self) -> str | None:
-        """Why what was written is not all that was to be; None while nothing went wrong.
+        """Why the log is incomplete; None if nothing went wrong.
 
-        After `close` it also tells of a file that was not finished. Messages refused for what they
-        are, and those a slow disk had no time for, are counted in `stats` alone.
+        After `close` it also reports an unfinished file. Messages refused for themselves, and those
+        for which a slow disk had no time, are only counted in `stats`.
         """
         stats = self.stats
         if stats.errors:
@@ -207,9 +209,10 @@ class Recorder:
         return None
 
     def write(self, topic: Topic, name: str, data: bytes, log_ns: int, publish_ns: int) -> None:
-        """Hand over CDR bytes of ``topic``; stamps in wall-clock ns. Drops the oldest when full.
+        """Queue CDR bytes of ``topic``; stamps in wall-clock ns. Drops the oldest when the queue is
+        full.
 
-        Whatever is wrong with a message costs that message, which is counted; nothing is raised.
+        An invalid message is only counted; nothing is raised.
         """
         with self._lock:
             good_ns = log_ns if _is_time(log_ns) else self._now_ns()
@@ -225,7 +228,7 @@ class Recorder:
             if len(data) > MAX_PAYLOAD:
                 self._refuse("too_large", channel.path, good_ns)
                 return
-            # The format has a sender that knows no time use that of logging.
+            # In MCAP, a sender without a time uses that of logging.
             good_publish_ns = publish_ns if _is_time(publish_ns) else good_ns
             self._marked += good_ns != log_ns or good_publish_ns != publish_ns
             item = Item(channel, sequence, good_ns, good_publish_ns, data)
@@ -244,7 +247,7 @@ class Recorder:
                 self._drop(oldest, "queue_full" if state == "recording" else state)
 
     def _channel(self, topic: Topic, name: str) -> Channel | str:
-        """The channel of a stream, or why there is none (the lock is held)."""
+        """Channel of a stream, or the reason why there is none; needs the lock."""
         channel = self._channels.get((topic.template, name))
         if channel is not None:
             return channel
@@ -263,20 +266,21 @@ class Recorder:
         return channel
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
-        """Embed a file (calibration, configuration) in this and every later file of the log."""
+        """Attach a file (calibration, configuration) to this and every later file of the log."""
         with self._lock:
             self._extras.append(lambda: self._writer.attach(name, media_type, data))
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
-        """Write a table of texts to this and every later file of the log."""
+        """Write a metadata table to this and every later file of the log."""
         table = dict(values)
         with self._lock:
             self._extras.append(lambda: self._writer.set_metadata(name, table))
 
     def close(self, timeout: float = 1.0) -> bool:
-        """Write what is queued and finish the file; False when that takes over ``timeout`` s.
+        """Write everything queued and finish the file; False if that takes longer than ``timeout``
+        s.
 
-        Then, or when the disk refuses, the file may miss its summary: ``tactile log recover``
+        In that case, or on a disk error, the file may lack its summary: ``tactile log recover``
         makes it whole.
         """
         with self._lock:
@@ -291,7 +295,7 @@ class Recorder:
         return min(max(self._clock.wall_ns(monotonic_now()), 0), TIME_END_NS - 1)
 
     def _open(self, log_set: LogSet, storage: Storage) -> None:
-        """Open the first file in the caller's thread, so that its errors reach the user."""
+        """Open the first file on the caller's thread, so that its errors reach the user."""
         software = {
             "name": "tactile-reach",
             "version": version("tactile-reach"),
@@ -321,17 +325,17 @@ class Recorder:
             ) from error
 
     def _drop(self, item: Item, reason: str) -> None:
-        """Count a lost message (the lock is held)."""
+        """Count a lost message; needs the lock."""
         self._refuse(reason, item.channel.path, item.log_ns)
 
     def _refuse(self, reason: str, path: str, log_ns: int) -> None:
-        """Count a message that is not in the log (the lock is held)."""
+        """Count a message missing from the log; needs the lock."""
         if reason in REFUSALS and reason not in self._dropped:
             log.error("log: messages of %s are refused: %s; they are counted", path, reason)
         self._dropped[reason] = self._dropped.get(reason, 0) + 1
         self._gaps.count(reason, path, log_ns)
 
-    # What follows runs in the writer's thread.
+    # The rest runs on the writer's thread.
 
     def _run(self) -> None:
         period = self._settings.flush_period
@@ -350,14 +354,14 @@ class Recorder:
         self._count_unwritten()
 
     def _guarded(self, work: Callable[[], None]) -> None:
-        """Do one step; whatever goes wrong in it costs what is in hand, never the log."""
+        """Do one step; an error in it costs the data in hand, never the log."""
         try:
             work()
         except Exception as error:  # noqa: BLE001 - thread boundary: the log goes on
             self._writer.give_up(error)
 
     def _take(self) -> None:
-        """Move what is queued into the writer, in batches so that other threads can run."""
+        """Move the queue into the writer, in batches so that other threads can run."""
         with self._lock:
             extras, self._extras = self._extras, []
             gaps, self._gaps = self._gaps, Gaps()
@@ -371,7 +375,7 @@ class Recorder:
             if not batch:
                 return
             for at, item in enumerate(batch):
-                if self._writer.blocked:  # the chunk to come must not outgrow the disk's limit
+                if self._writer.blocked:  # the next chunk must not outgrow the disk's limit
                     with self._lock:
                         self._queue.extendleft(reversed(batch[at:]))
                         self._queued_bytes += sum(len(each.data) for each in batch[at:])
@@ -382,12 +386,13 @@ class Recorder:
             time.sleep(0)
 
     def _drain(self) -> None:
-        """Write all that is queued. A file that fails gets one successor, then the rest is lost."""
+        """Write everything queued. A failing file gets one successor; after that the rest is
+        lost."""
         failures = 0
         while failures < 2:
             self._take()
             self._writer.flush(last=True)
-            if self._writer.blocked or self._writer.gaps:  # gap records that still wait
+            if self._writer.blocked or self._writer.gaps:  # gap records still to be written
                 failures += 1
                 continue
             failures = 0
@@ -396,7 +401,7 @@ class Recorder:
                     return
 
     def _count_unwritten(self) -> None:
-        """At the end: what is still in hand is lost."""
+        """Count at the end what could not be written."""
         with self._lock:
             reason = self._writer.state
             lost = len(self._queue) + self._writer.waiting
@@ -407,5 +412,5 @@ class Recorder:
 
 
 def _is_time(value: object) -> bool:
-    """Whether a number of ns can stand in an MCAP record."""
+    """Whether a time in ns fits into an MCAP record."""
     return isinstance(value, int) and 0 <= value < TIME_END_NS

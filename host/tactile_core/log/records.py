@@ -1,7 +1,7 @@
-"""Chunks unpacked: small ones at once, large or doubtful ones piece by piece. Bounded memory.
+"""Records and chunks of a log: parsing, searching, decompressing. Bounded memory.
 
-What a chunk says of its size is never believed: nothing beyond it is unpacked, and nothing is
-allocated for it in advance.
+Small chunks are decompressed at once, large or doubtful ones piece by piece. The size stated in a
+chunk is never trusted: nothing beyond it is decompressed, and no memory is allocated in advance.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ import zstandard
 
 from tactile_core.log import mcap_file as op
 
-# What a log consists of, and how its records are taken apart. Pure: bytes in, values out.
+# Elements of a log and the parsing of their records. Pure: bytes in, values out.
 #
-# A record may be longer than its fields: later versions of the format append fields, which a reader
-# ignores.
+# A record may be longer than its fields: later versions of the format append fields, which readers
+# ignore.
 
 
 U16 = struct.Struct("<H")
@@ -34,7 +34,7 @@ ATTACHMENT_HEAD = struct.Struct("<QQ")
 
 
 class LogError(Exception):
-    """The file is no log, or cannot be read; the message says which."""
+    """The file is not a log or cannot be read; the message says which."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class SchemaRecord:
 
 @dataclass(frozen=True, slots=True)
 class ChannelRecord:
-    """One stream. ``schema``: number of its schema, 0 for none."""
+    """One stream. ``schema``: number of its schema, 0 if none."""
 
     number: int
     schema: int
@@ -60,7 +60,7 @@ class ChannelRecord:
 
 @dataclass(frozen=True, slots=True)
 class MetadataRecord:
-    """A named table of texts."""
+    """A metadata table."""
 
     name: str
     values: dict[str, str]
@@ -68,7 +68,7 @@ class MetadataRecord:
 
 @dataclass(frozen=True, slots=True)
 class AttachmentRecord:
-    """A file within the file; its bytes are ``size`` long from ``position`` on."""
+    """An attachment; its ``size`` bytes start at ``position``."""
 
     name: str
     media_type: str
@@ -80,7 +80,7 @@ class AttachmentRecord:
 
 @dataclass(frozen=True, slots=True)
 class ChunkHead:
-    """Fields of a chunk record before its data. ``size``, ``crc``: of the data unpacked."""
+    """Fields of a chunk record before its data. ``size``, ``crc``: of the decompressed data."""
 
     start_ns: int
     end_ns: int
@@ -92,7 +92,7 @@ class ChunkHead:
 
 @dataclass(frozen=True, slots=True)
 class Packed:
-    """Where the compressed bytes of a chunk stand, for one that is unpacked piece by piece."""
+    """Place of a chunk's compressed bytes, for decompression piece by piece."""
 
     head: ChunkHead
     place: int
@@ -101,10 +101,10 @@ class Packed:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Messages, schemas and channels, as a run of records: ``data``, or ``packed`` for a large one.
+    """A run of message, schema and channel records: ``data``, or ``packed`` if large.
 
-    ``verified``: its checksum was right. ``partial``: its end is not there, which was reported.
-    ``suspect``: its checksum is wrong, and it is read all the same.
+    ``verified``: its checksum was right. ``partial``: its end is missing, which was reported.
+    ``suspect``: its checksum is wrong, but it is read nevertheless.
     """
 
     offset: int
@@ -117,7 +117,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """Bytes that could not be read. ``messages`` lost there, None where that is not known."""
+    """Unreadable bytes. ``messages``: number of messages lost there, None if unknown."""
 
     offset: int
     length: int
@@ -141,18 +141,18 @@ Event = Block | MetadataRecord | AttachmentRecord
 
 
 class BadRecordError(Exception):
-    """A record that cannot be right; caught within the reader."""
+    """An invalid record; caught within the reader."""
 
 
 @dataclass(slots=True)
 class Cursor:
-    """Takes fields off a record's body."""
+    """Reads the fields of a record one after another."""
 
     data: bytes
     at: int = 0
 
     def take(self, layout: struct.Struct) -> tuple[int, ...]:
-        """Numbers of a fixed layout."""
+        """Read numbers of a fixed layout."""
         try:
             values = layout.unpack_from(self.data, self.at)
         except struct.error:
@@ -161,21 +161,21 @@ class Cursor:
         return values
 
     def bytes(self, size: int) -> bytes:
-        """The next ``size`` bytes."""
+        """Read the next ``size`` bytes."""
         if size > len(self.data) - self.at:
             raise BadRecordError("a record is shorter than its fields")
         self.at += size
         return self.data[self.at - size : self.at]
 
     def string(self) -> str:
-        """A text with its length before it."""
+        """Read a text preceded by its length."""
         try:
             return self.bytes(*self.take(U32)).decode()
         except UnicodeDecodeError:
             raise BadRecordError("a text is no UTF-8") from None
 
     def map(self) -> dict[str, str]:
-        """A table of texts with its length before it."""
+        """Read a table of texts preceded by its length."""
         (size,) = self.take(U32)
         end = self.at + size
         found = {}
@@ -188,7 +188,7 @@ class Cursor:
 
 
 def parse_schema(body: bytes) -> SchemaRecord:
-    """Schema record; BadRecordError when it is none."""
+    """Parse a schema record. Raises BadRecordError if it is invalid."""
     cursor = Cursor(body)
     (number,) = cursor.take(U16)
     name, encoding = cursor.string(), cursor.string()
@@ -196,7 +196,7 @@ def parse_schema(body: bytes) -> SchemaRecord:
 
 
 def parse_channel(body: bytes) -> ChannelRecord:
-    """Channel record; BadRecordError when it is none."""
+    """Parse a channel record. Raises BadRecordError if it is invalid."""
     cursor = Cursor(body)
     number, schema = cursor.take(CHANNEL_HEAD)
     topic, encoding = cursor.string(), cursor.string()
@@ -204,29 +204,29 @@ def parse_channel(body: bytes) -> ChannelRecord:
 
 
 def parse_metadata(body: bytes) -> MetadataRecord:
-    """Metadata record; BadRecordError when it is none."""
+    """Parse a metadata record. Raises BadRecordError if it is invalid."""
     cursor = Cursor(body)
     return MetadataRecord(cursor.string(), cursor.map())
 
 
-# A log as bytes: reading at a place, and finding where chunks begin.
+# Random access to the bytes of a log, and the search for chunks.
 
 
 Progress = Callable[[int, int], None]
-"""Called with the bytes done and those there are in all."""
+"""Called with the bytes done and the total."""
 
 WINDOW = 1 << 20
-"""Bytes read at once while looking for the next chunk."""
+"""Bytes read at once in the search for the next chunk."""
 
 CHUNK_START = re.compile(rb"(?=\x06.{4}\x00{4})", re.DOTALL)
-CHUNK_FIXED = 40  # bytes of a chunk record but for its compression's name and its data
-MAX_NAME = 40  # bytes read of that name and the size behind it
+CHUNK_FIXED = 40  # bytes of a chunk record without the name of its compression and its data
+MAX_NAME = 40  # bytes read of that name and the size after it
 
 FRAME_STARTS = {"zstd": b"\x28\xb5\x2f\xfd", "lz4": b"\x04\x22\x4d\x18"}
 
 
 class LogBytes:
-    """Random access to a log. ``end``: where its data ends, for all that searches."""
+    """Random access to a log. ``end``: end of its data, for searches."""
 
     def __init__(self, path: Path, progress: Progress | None) -> None:
         self.path = path
@@ -236,7 +236,7 @@ class LogBytes:
         self._file: BinaryIO | None = None
 
     def open(self) -> None:
-        """Open the file; `LogError` when it is none or cannot be read."""
+        """Open the file. Raises `LogError` if it is not a file or cannot be read."""
         try:
             if not stat.S_ISREG(os.stat(self.path).st_mode) and not self.path.is_dir():
                 raise LogError(f"{self.path} is no file but a device or a pipe")
@@ -246,12 +246,13 @@ class LogBytes:
             raise LogError(f"{self.path}: {error.strerror}") from error
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         if self._file is not None:
             self._file.close()
 
     def read_at(self, position: int, size: int) -> bytes:
-        """Bytes of the file; fewer at its end. `LogError` when the disk fails."""
+        """Read bytes at ``position``; fewer at the end of the file. Raises `LogError` on a disk
+        error."""
         if self._file is None:
             raise ValueError("the log is not open")
         try:
@@ -261,9 +262,9 @@ class LogBytes:
             raise LogError(f"{self.path}: {error.strerror} at byte {position}") from error
 
     def chunk_head(self, position: int) -> tuple[ChunkHead, int] | None:
-        """Header of a chunk at ``position`` and where its data begins; None when it is none.
+        """Header of a chunk at ``position`` and start of its data; None if there is no chunk.
 
-        The record type is not looked at.
+        The record type is ignored.
         """
         raw = self.read_at(position, 9 + CHUNK_FIXED + MAX_NAME)
         if len(raw) < 9 + CHUNK_FIXED:
@@ -271,10 +272,10 @@ class LogBytes:
         return _chunk_head(raw, position)
 
     def looks_like_chunk(self, position: int) -> bool:
-        """Whether a chunk begins here for all that can be told: for searching amid other bytes.
+        """Whether a chunk seems to begin here, for searches in arbitrary bytes.
 
-        Its sizes agree to the byte, or (fields may have been appended) its data begin as such do.
-        The record type is not looked at.
+        Its sizes must agree exactly, or (as fields may have been appended) its data must begin as
+        chunk data does. The record type is ignored.
         """
         raw = self.read_at(position, 9 + CHUNK_FIXED + MAX_NAME)
         if len(raw) < 9 + CHUNK_FIXED:
@@ -310,9 +311,9 @@ class LogBytes:
         return None
 
     def plausible(self, position: int, steps: int = 4) -> bool:
-        """Whether a record seems to begin here; a chance hit is one in 10^10.
+        """Whether a record seems to begin here; the chance of a false match is one in 10^10.
 
-        A record of a type that is not known must be followed by one that is.
+        A record of an unknown type must be followed by one of a known type.
         """
         if position >= self.end:
             return False
@@ -346,20 +347,20 @@ def _chunk_head(raw: bytes, position: int) -> tuple[ChunkHead, int] | None:
 
 
 COMPRESSIONS = ("", "zstd", "lz4")
-"""Names of the compressions that are unpacked here: all that the format's specification lists."""
+"""Supported compressions: all that the format's specification lists."""
 
 SMALL = 8 << 20
-"""Bytes of a chunk that is unpacked at once: writers make chunks of 0.8 to 4 MB."""
+"""Largest chunk, in bytes, that is decompressed at once; writers make chunks of 0.8 to 4 MB."""
 
 PIECE = 1 << 16
-"""Bytes handed over at a time."""
+"""Bytes processed at a time."""
 
 MAX_WINDOW = 1 << 27
-"""Bytes that a zstd frame may look back, which the unpacker keeps: the most that zstd itself takes
-without being told otherwise."""
+"""Largest window of a zstd frame in bytes, held in memory: the most that zstd accepts by
+default."""
 
 ReadAt = Callable[[int, int], bytes]
-"""Reads so many bytes at a place of the file."""
+"""Reads bytes: position, size."""
 
 
 def _lz4() -> Any:
@@ -372,9 +373,10 @@ def _lz4() -> Any:
 
 
 def pieces(read_at: ReadAt, packed: Packed) -> Iterator[bytes]:
-    """A chunk's records, a piece at a time; `BadRecordError` where they cannot be unpacked.
+    """Yield a chunk's records piece by piece. Raises `BadRecordError` if they cannot be
+    decompressed.
 
-    Ends without an error where the packed bytes end early: that is for the caller to notice.
+    Ends without an error if the packed bytes end early; the caller must notice that.
     """
     head = packed.head
     left = head.size
@@ -408,13 +410,13 @@ def _source(read_at: ReadAt, packed: Packed) -> Iterator[bytes]:
 
 
 class _Stream:
-    """The little of a file that zstandard's reader asks for."""
+    """The file interface that zstandard's reader needs."""
 
     def __init__(self, source: Iterator[bytes]) -> None:
         self._source = source
 
     def read(self, _: int = -1) -> bytes:
-        """The next bytes, whatever was asked for; none at the end."""
+        """Return the next piece, of any size; empty at the end."""
         return next(self._source, b"")
 
 
@@ -453,7 +455,7 @@ def _unlz4(source: Iterator[bytes]) -> Iterator[bytes]:
 
 
 def verify(read_at: ReadAt, packed: Packed) -> None:
-    """`BadRecordError` unless a chunk unpacks to its size and its checksum."""
+    """Raise `BadRecordError` unless a chunk decompresses to its stated size and checksum."""
     crc = size = 0
     for piece in pieces(read_at, packed):
         crc = zlib.crc32(piece, crc)
@@ -462,14 +464,14 @@ def verify(read_at: ReadAt, packed: Packed) -> None:
 
 
 def unpack(read_at: ReadAt, packed: Packed) -> bytes:
-    """Records of a whole chunk of at most `SMALL` bytes, checked; `BadRecordError`."""
+    """Decompress and check a whole chunk of at most `SMALL` bytes. Raises `BadRecordError`."""
     head = packed.head
     raw = read_at(packed.place, packed.length)
     data: bytes | None = None
     if head.compression == "":
         data = raw
     elif head.compression == "zstd" and _told_size(raw) == head.size > 0:
-        try:  # one frame that tells its size, as nearly every writer makes them: at once
+        try:  # one frame that states its size, as from nearly every writer: decompress at once
             data = zstandard.ZstdDecompressor().decompress(raw, max_output_size=head.size)
         except (zstandard.ZstdError, MemoryError):
             raise BadRecordError("a chunk that does not decompress") from None
@@ -480,7 +482,7 @@ def unpack(read_at: ReadAt, packed: Packed) -> bytes:
 
 
 def unpack_what_can_be(read_at: ReadAt, packed: Packed) -> bytes:
-    """Records of a chunk up to where it cannot be unpacked any more, unchecked."""
+    """Decompress a chunk as far as possible, unchecked."""
     data = bytearray()
     try:
         for piece in pieces(read_at, packed):

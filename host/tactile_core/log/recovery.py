@@ -1,4 +1,4 @@
-"""Makes a whole log of one that was cut off or damaged."""
+"""Recovers a complete log from one that was cut off or damaged."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from tactile_core.log.records import (
 )
 
 CHUNK_BYTES = 1 << 18
-"""Bytes of messages that are put together: of small blocks, or outside chunks."""
+"""Size in bytes of chunks made from small blocks and from messages outside chunks."""
 
 SUSPECT = "suspect"
-"""Table of a recovered log that tells of a block whose checksum was wrong and which was kept."""
+"""Metadata table of a recovered log that marks a kept block with a wrong checksum."""
 
 
 class RecoveryError(Exception):
@@ -35,10 +35,10 @@ class RecoveryError(Exception):
 
 @dataclass(slots=True)
 class RecoveryReport:
-    """What was carried over from ``source`` to ``target`` and what was not.
+    """What was copied from ``source`` to ``target`` and what was not.
 
-    ``messages_lost``: those known from indexes; ``lost_unknown``: damaged places whose messages
-    nobody can count. ``orphans``: messages of a channel that is defined nowhere, left out.
+    ``messages_lost``: those known from indexes; ``lost_unknown``: damaged places with an unknown
+    number of messages. ``orphans``: messages left out because their channel is not defined.
     ``suspect``: messages kept although the checksum of their block is wrong.
     """
 
@@ -70,11 +70,11 @@ def recover(
 ) -> RecoveryReport:
     """Write everything readable of ``source`` to the new file ``target``. Constant memory.
 
-    ``keep_suspect``: of blocks and attachments whose checksum is wrong too what looks readable; a
-    table ``suspect`` in the target tells which messages these are. ``mend``: the metadata that a
-    channel is to have in the target; None leaves them.
-    `LogError` when the source is no log or holds nothing, `RecoveryError` when the target exists
-    or cannot be written; then no target is left behind. The source is only read.
+    ``keep_suspect``: also keep what looks readable in blocks and attachments with a wrong checksum;
+    a table ``suspect`` in the target marks these messages. ``mend``: returns the metadata of a
+    channel in the target; None keeps it. Raises `LogError` if the source is not a log or holds
+    nothing, `RecoveryError` if the target exists or cannot be written; no target is left behind
+    then. The source is only read.
     """
     report = RecoveryReport(source, target, 0)
     with LogReader(source, progress, keep_suspect=keep_suspect) as reader:
@@ -104,7 +104,7 @@ def recover(
 
 
 class _Copy:
-    """The target of a recovery; made with the first thing that is worth keeping."""
+    """The target of a recovery, created with the first thing worth keeping."""
 
     def __init__(
         self,
@@ -124,7 +124,7 @@ class _Copy:
         self._chunk = ChunkBuffer()
 
     def take(self, event: Block | MetadataRecord | AttachmentRecord) -> None:
-        """Write one event over."""
+        """Copy one event."""
         file = self._file or self._open()
         report = self._report
         if not isinstance(event, Block):
@@ -147,13 +147,13 @@ class _Copy:
             raise
         except OSError:
             with contextlib.suppress(OSError):
-                os.unlink(self._target)  # it was made, but not even its start could be written
+                os.unlink(self._target)  # created, but its start could not be written
             raise
         self._file = file
         return file
 
     def finish(self) -> None:
-        """Close the target; `LogError` when there is nothing in it."""
+        """Close the target. Raises `LogError` if it is empty."""
         if self._file is None:
             reader = self._reader
             hint = ""
@@ -202,7 +202,7 @@ class _Copy:
             self._flush(file, suspect=True)
 
     def _flush(self, file: McapFile, suspect: bool = False) -> None:
-        """Write the messages in hand as one chunk."""
+        """Write the collected messages as one chunk."""
         chunk, report = self._chunk, self._report
         if not chunk.messages:
             return
@@ -220,7 +220,7 @@ class _Copy:
         file.commit()
 
     def _define(self, file: McapFile, channel: ChannelRecord) -> None:
-        """Have the target know the channel; without a type when its schema is lost."""
+        """Define the channel in the target, without a type if its schema is lost."""
         if channel.number in self._channels:
             return
         schema = self._reader.schemas.get(channel.schema)

@@ -1,4 +1,4 @@
-"""Which files make up a log, and which of them may go: never one that is being written."""
+"""Files of a log and deletion of old ones, except those being written."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class LogSet:
-    """Files of one log, and of earlier ones of the same name, oldest first by their names.
+    """Files of one log and of earlier ones of the same name, oldest first by their names.
 
-    ``number``: of the current file. In a directory all files are numbered and dated; a log to a
-    named file has that name first and ``<name>_0001.mcap`` and so on after it.
+    ``number``: of the current file. In a directory all files are numbered and dated. A log to a
+    named file starts with that name, followed by ``<name>_0001.mcap`` and so on.
     """
 
     directory: Path
@@ -36,7 +36,7 @@ class LogSet:
 
     @classmethod
     def at(cls, destination: Path, prefix: str, now_ns: int) -> LogSet:
-        """The log that ``destination`` (a ``.mcap`` file or a directory) asks for."""
+        """Log set for ``destination``, a ``.mcap`` file or a directory."""
         if destination.suffix == ".mcap":
             stem = destination.name.removesuffix(".mcap")
             pattern = re.compile(re.escape(stem) + r"(_\d{4,})?\.mcap")
@@ -53,11 +53,11 @@ class LogSet:
         return self.directory / f"{self.stem}_{self.number:04d}.mcap"
 
     def advance(self) -> None:
-        """Go on to the next file."""
+        """Move on to the next file."""
         self.number += 1
 
     def older(self) -> list[Path]:
-        """All files of the set but the current one, oldest first."""
+        """All files of the set except the current one, oldest first."""
         found = [
             path
             for path in self.directory.iterdir()
@@ -66,7 +66,7 @@ class LogSet:
         return sorted(found, key=self._age)
 
     def _age(self, path: Path) -> tuple[str, int]:
-        """Sorts files of the set from the oldest to the newest."""
+        """Sort key of the files of the set, oldest first."""
         name = path.name.removesuffix(".mcap")
         if self.named:
             number = name.removeprefix(self.stem).lstrip("_")
@@ -78,8 +78,8 @@ class LogSet:
 def enforce(log_set: LogSet, max_files: int | None, max_bytes: int | None) -> list[Path]:
     """Delete the oldest files of the set above either limit; returns those deleted.
 
-    Nothing goes before the newest of the others was verified readable, and never the current file
-    or one that another process writes. Trouble is logged, never raised.
+    Nothing is deleted before the newest of the others was verified readable, and never the current
+    file or one that another process writes. Errors are logged, never raised.
     """
     if max_files is None and max_bytes is None:
         return []
@@ -122,22 +122,23 @@ def _in_use(path: Path) -> bool:
     return False
 
 
-# How long the disk of a log will do, looked at from a thread that may hang with it.
+# Watch on the free space of a log's disk, on a thread that may hang with it.
 
 
 LOOK_EVERY = 10.0
-"""s between looks."""
+"""Interval of checks in s."""
 
 SILENT_AFTER = 30.0
-"""s without an answer after which a disk is called silent."""
+"""Time in s without an answer after which a disk is reported as silent."""
 
 LOW_BYTES = 4 << 30
-"""Free bytes at which the alarm goes off: logs stop at 1 GiB, and somebody must have time to come.
-At the 7 MB a minute of one board that is seven hours before."""
+"""Free bytes below which the alarm is raised. Logs stop at 1 GiB, and there must be time to react:
+at the 7 MB a minute of one board, seven hours."""
 
 
 class DiskWatch:
-    """Looks at the free space of a folder. ``free_bytes``: of the last look, None before it."""
+    """Checks the free space of a folder. ``free_bytes``: at the last check, None before the
+    first."""
 
     def __init__(
         self,
@@ -157,15 +158,15 @@ class DiskWatch:
         self._thread = threading.Thread(target=self._run, name="disk-watch", daemon=True)
 
     def start(self) -> None:
-        """Begin to look."""
+        """Start checking."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End without waiting: the thread may hang in a look."""
+        """Stop without waiting, as the thread may hang in a check."""
         self._stopping.set()
 
     def alarm(self, now: Instant) -> str | None:
-        """What is wrong with the disk, None: nothing."""
+        """Problem with the disk; None if there is none."""
         silent = seconds_between(self._looked, now)
         if silent > self._every + SILENT_AFTER:
             return f"the log's disk has not answered for {silent:.0f} s"

@@ -1,4 +1,4 @@
-"""Chunks into files: opening, splitting, disk trouble. Owns no thread; one thread may use it."""
+"""Writes chunks to files: opening, splitting, disk errors. Starts no thread; used by one thread."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from tactile_core.config import Bytes, Count, Duration, Seconds
 from tactile_core.log.mcap_file import ZSTD_LEVEL, ChunkBuffer, McapFile, SealedChunk, Storage
 from tactile_core.log.retention import LogSet, enforce
 
-# What a log says of its losses: one metadata record called ``gap`` a reason and flush.
+# Losses as reported in a log: one metadata record ``gap`` per reason and flush.
 
 
 GAP = "gap"
-"""Name of those metadata records."""
+"""Name of these metadata records."""
 
 DROPPED = "dropped:"
-"""Keys of a gap record that start so count the messages one channel lost."""
+"""Prefix of the keys of a gap record that count the messages lost per channel."""
 
 
 MAX_CHANNELS = 64
-"""Channels that one gap record names; what others lost is counted under `OTHERS`."""
+"""Most channels named in one gap record; losses of further ones are counted under `OTHERS`."""
 
 OTHERS = "others"
 
 
 @dataclass(slots=True)
 class Gap:
-    """Losses of one kind. ``first_ns`` to ``last_ns``: wall-clock times it covers, ends included.
+    """Losses for one reason. ``first_ns`` to ``last_ns``: wall-clock span, inclusive.
 
-    ``messages`` is 0 where writing failed but nothing was lost.
+    ``messages`` is 0 if writing failed but nothing was lost.
     """
 
     first_ns: int
@@ -52,19 +52,19 @@ class Gap:
     channels: dict[str, int] = field(default_factory=dict)
 
     def count(self, channel: str, messages: int) -> None:
-        """Add what one channel lost."""
+        """Add the losses of one channel."""
         self.messages += messages
         if channel not in self.channels and len(self.channels) >= MAX_CHANNELS:
             channel = OTHERS
         self.channels[channel] = self.channels.get(channel, 0) + messages
 
     def cover(self, first_ns: int, last_ns: int) -> None:
-        """Stretch over another span."""
+        """Extend to cover another span."""
         self.first_ns = min(self.first_ns, first_ns)
         self.last_ns = max(self.last_ns, last_ns)
 
     def metadata(self, reason: str) -> dict[str, str]:
-        """Contents of the record."""
+        """Content of the metadata record."""
         head = {
             "reason": reason,
             "first_ns": str(self.first_ns),
@@ -76,7 +76,7 @@ class Gap:
 
 
 class Gaps:
-    """Losses not yet written, one `Gap` a reason."""
+    """Losses not yet written, one `Gap` per reason."""
 
     def __init__(self) -> None:
         self._gaps: dict[str, Gap] = {}
@@ -94,19 +94,19 @@ class Gaps:
         del self._gaps[reason]
 
     def count(self, reason: str, channel: str, log_ns: int, messages: int = 1) -> None:
-        """One message of ``channel`` was lost, or several at about that time."""
+        """Count one or more lost messages of ``channel`` at about ``log_ns``."""
         gap = self._gaps.setdefault(reason, Gap(log_ns, log_ns))
         gap.cover(log_ns, log_ns)
         gap.count(channel, messages)
 
     def note(self, reason: str, detail: str, now_ns: int) -> None:
-        """Something went wrong at ``now_ns``, whether or not messages are lost by it."""
+        """Note a failure at ``now_ns``, whether or not messages were lost."""
         gap = self._gaps.setdefault(reason, Gap(now_ns, now_ns))
         gap.cover(now_ns, now_ns)
         gap.detail = detail
 
     def merge(self, other: Gaps) -> None:
-        """Add what another has."""
+        """Add the losses of another `Gaps`."""
         for reason, gap in other._gaps.items():
             mine = self._gaps.setdefault(reason, Gap(gap.first_ns, gap.last_ns))
             mine.cover(gap.first_ns, gap.last_ns)
@@ -118,20 +118,21 @@ class Gaps:
 log = logging.getLogger(__name__)
 
 WRITER_FAILED = "writer_failed"
-"""Reason of what is lost when writing fails for no fault of the disk."""
+"""Reason of losses when writing fails for causes other than the disk."""
 
 RETRY_MAX = 10.0
-"""s: longest pause between attempts to open a file again."""
+"""Longest pause in s between attempts to reopen a file."""
 
 SYNC_PERIOD = 0.5
-"""s: data is on the disk, not only in the kernel, at least this often. A `kill -9` spares what the
-kernel has; a power cut does not."""
+"""Longest time in s until data is on the disk, not only in the kernel. A `kill -9` spares what the
+kernel holds; a power cut does not."""
 
 SPACE_PERIOD = 1.0
-"""s between looks at the free space: a dozen boards log some 10 MB in that time."""
+"""Interval in s of checks of the free space: a dozen boards log some 10 MB in that time."""
 
 LATCHED_MAX = 64
-"""Latched messages repeated in each file: one geometry a board, more boards than one host has."""
+"""Most latched messages repeated in each file: one geometry per board, for more boards than one
+host has."""
 
 
 class RecorderSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -184,7 +185,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One message on its way into a log; stamps in wall-clock ns."""
+    """One message to be logged; stamps in wall-clock ns."""
 
     channel: Channel
     sequence: int
@@ -194,11 +195,11 @@ class Item:
 
 
 class LogWriter:
-    """The files of one log.
+    """Writer of the files of one log.
 
-    When a file cannot be written on, the chunk in hand is kept for the next file, which begins
-    with a gap record; `blocked` says so, and whoever feeds the writer must hold on to the rest.
-    Whatever else goes wrong costs what is in hand, which is counted, and the next file begins.
+    If a file cannot be continued, the chunk in hand is kept for the next file, which begins with a
+    gap record; `blocked` tells so, and the caller must hold back the rest. Any other error costs
+    the data in hand, which is counted, and the next file begins.
     """
 
     def __init__(
@@ -208,14 +209,14 @@ class LogWriter:
         storage: Storage,
         now_ns: Callable[[], int],
     ) -> None:
-        codec()  # takes 0.2 s once: now rather than at the first flush
+        codec()  # takes 0.2 s once: do it now rather than at the first flush
         self.state = "recording"
         self.last_error = ""
         self.errors = 0
         self.written = 0
         self.files = 0
         self.lost = 0
-        """Messages counted in ``gaps`` here, for `WRITER_FAILED`."""
+        """Messages counted in ``gaps`` by this class, for `WRITER_FAILED`."""
         self.gaps = Gaps()
         self._set = log_set
         self._settings = settings
@@ -230,7 +231,7 @@ class LogWriter:
         self._new_latched: dict[int, Item] = {}
         self._channels: dict[int, Channel] = {}
         self._extras: dict[tuple[str, str], Callable[[McapFile], None]] = {}
-        self._unwritten: dict[tuple[str, str], None] = {}  # in the order they came
+        self._unwritten: dict[tuple[str, str], None] = {}  # in order of arrival
         self._schemas: dict[str, int] = {}
         self._in_file: set[int] = set()
         self._file: McapFile | None = None
@@ -242,31 +243,31 @@ class LogWriter:
 
     @property
     def blocked(self) -> bool:
-        """Whether a chunk waits for a file that can be written."""
+        """Whether a chunk waits for a writable file."""
         return self._pending is not None
 
     @property
     def waiting(self) -> int:
-        """Messages taken in but not yet on the disk."""
+        """Messages accepted but not yet on the disk."""
         return self._chunk.messages + (self._pending.messages if self._pending else 0)
 
     @property
     def path(self) -> str:
-        """The present file, or the next one where there is none."""
+        """Current file, or the next one if none is open."""
         return str(self._set.current)
 
     @property
     def bytes_written(self) -> int:
-        """Bytes of all files so far, without the summaries of those that were finished."""
+        """Bytes of all files so far, without the summaries of finished ones."""
         return self._bytes + (self._file.size if self._file else 0)
 
     def set_metadata(self, name: str, values: dict[str, str]) -> None:
-        """A table of texts for this and every later file."""
+        """Set a metadata table for this and every later file."""
         self._extras["metadata", name] = lambda file: file.add_metadata(name, values)
         self._unwritten["metadata", name] = None
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
-        """A file to embed in this and every later file."""
+        """Attach a file to this and every later file."""
         now_ns = self._now_ns()
         self._extras["attachment", name] = lambda file: file.add_attachment(
             name, media_type, data, now_ns, now_ns
@@ -274,10 +275,10 @@ class LogWriter:
         self._unwritten["attachment", name] = None
 
     def open_first(self) -> None:
-        """Open the first file; OSError when that fails.
+        """Open the first file. Raises OSError on failure.
 
-        FileExistsError when the user named it and it is there; files in a directory get the next
-        free number, since another daemon may have started in the same second.
+        FileExistsError means that the user named an existing file; files in a directory get the
+        next free number, as another daemon may have started in the same second.
         """
         while True:
             try:
@@ -290,9 +291,9 @@ class LogWriter:
         enforce(self._set, self._settings.max_files, self._settings.max_bytes)
 
     def add(self, item: Item) -> bool:
-        """Take one message into the chunk to come; flushes when that is full.
+        """Add one message to the next chunk; flushes when that is full.
 
-        False, and nothing else, for a message that no record can hold.
+        Returns False, and does nothing else, for a message that does not fit into a record.
         """
         channel = item.channel
         try:
@@ -309,7 +310,7 @@ class LogWriter:
         return True
 
     def flush(self, last: bool = False) -> None:
-        """Write all that waits. ``last``: try at once, without the pause after a failure."""
+        """Write everything pending. ``last``: try at once, without the pause after a failure."""
         try:
             if self._pending is None and self._chunk.messages:
                 self._pending = self._chunk.seal(self._compressor)
@@ -322,7 +323,7 @@ class LogWriter:
             self.give_up(error)
 
     def give_up(self, error: Exception) -> None:
-        """Count what is in hand as lost, leave the file, and go on with the next one."""
+        """Count the data in hand as lost, leave the file, and continue with the next one."""
         now_ns = self._now_ns()
         counts = {c: len(times) // 2 for c, times in self._chunk.index.items()}
         for held in (counts, self._pending.counts if self._pending else {}):
@@ -338,7 +339,8 @@ class LogWriter:
         self._leave(WRITER_FAILED, f"{type(error).__name__}: {error}", "going on in another file")
 
     def finish(self) -> None:
-        """Finish the file after the last flush; ``state`` is closed unless something went wrong."""
+        """Finish the file after the last flush; ``state`` becomes closed unless something went
+        wrong."""
         try:
             self._end_file()
         except OSError as error:
@@ -349,7 +351,7 @@ class LogWriter:
             self.state = "closed"
 
     def _ready(self, last: bool) -> bool:
-        """Whether there is a file with room for what waits; ends and opens files."""
+        """Whether there is a file with room for the pending data; ends and opens files."""
         now = time.monotonic()
         if self._file is None and now < self._retry_at and not last:
             return False
@@ -373,7 +375,7 @@ class LogWriter:
         return self._file is not None
 
     def _open_next(self) -> None:
-        self._set.directory.mkdir(parents=True, exist_ok=True)  # it may have been deleted, too
+        self._set.directory.mkdir(parents=True, exist_ok=True)  # it may have been deleted as well
         while True:
             try:
                 self._open()
@@ -388,7 +390,7 @@ class LogWriter:
         enforce(self._set, self._settings.max_files, self._settings.max_bytes)
 
     def _open(self) -> None:
-        """Open the current file of the set and write what every file starts with."""
+        """Open the current file of the set and write the start that every file has."""
         file = McapFile(
             self._set.current, self._storage, f"tactile-reach {version('tactile-reach')}"
         )
@@ -412,7 +414,7 @@ class LogWriter:
         self.files += 1
 
     def _write_waiting(self) -> None:
-        """Write all that waits in one go: the fewer calls, the less waiting for other threads."""
+        """Write everything pending at once: fewer calls keep other threads waiting less."""
         file, pending = self._file, self._pending
         if file is None:
             return
@@ -438,7 +440,7 @@ class LogWriter:
             self._synced = now
 
     def _write_extra(self, extra: tuple[str, str], file: McapFile) -> None:
-        """Stage a table or an attachment; one that cannot be written is left out for good."""
+        """Stage a table or an attachment; one that fails is never tried again."""
         write = self._extras.get(extra)
         if write is None:
             return
@@ -451,7 +453,7 @@ class LogWriter:
             log.error("log: %s", self.last_error)
 
     def _define(self, file: McapFile, numbers: Iterable[int]) -> None:
-        """Stage the schemas and channels that this file does not have yet."""
+        """Stage the schemas and channels that this file lacks."""
         types = {self._channels[number].topic.msgtype for number in self._in_file}
         for number in numbers:
             if number in self._in_file:
@@ -462,12 +464,13 @@ class LogWriter:
             if schema.name not in types:
                 file.add_schema(identity, schema.name, schema.encoding, schema.data)
                 types.add(schema.name)
-            # Both keys are those rosbag2 writes.
+            # rosbag2 writes both keys.
             metadata = {"offered_qos_profiles": "", "topic_type_hash": schema.type_hash}
             file.add_channel(number, identity, channel.path, "cdr", metadata)
 
     def _repeat_latched(self) -> None:
-        """Give a new file the values that hold: with their old numbers, so no gap is seen."""
+        """Repeat the latched messages in a new file, with their old numbers so that no gap
+        appears."""
         if self._file is None or self._pending is None or not self._latched:
             return
         chunk = ChunkBuffer()
@@ -483,7 +486,7 @@ class LogWriter:
             file.finish()
 
     def _fail(self, error: OSError) -> None:
-        """Leave the file that cannot be written on, and try another one later."""
+        """Leave a file that cannot be continued, and try another one later."""
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         remedy = "make room" if full else "check the disk; trying another file"
         self._leave(
@@ -491,7 +494,7 @@ class LogWriter:
         )
 
     def _stop_for_space(self) -> None:
-        """Close the file while there is still room to close it in order."""
+        """Close the file while there is room to close it in order."""
         free = self._storage.free(self._set.directory) / 1e9
         kept = self._settings.min_free_bytes / 1e9
         text = f"{free:.2f} GB free in {self._set.directory}, logs stop at {kept:.2f}"
