@@ -1,4 +1,4 @@
-"""The skin in a program of your own.
+"""Python interface to the skin for your own programs.
 
     import tactile_reach as tr
 
@@ -6,9 +6,9 @@
         for f in bus.board("left").features():
             print(f.normal_force)
 
-`connect` joins the daemons of this machine. `Bus.board` gives newest values and streams of one
-board, tares it and records it; `Bus.reach` gives goals; `read_log` reads a log into arrays. Errors
-are `TactileError`, whose text is one sentence that names the remedy.
+`connect` joins the daemons of this machine. `Bus.board` gives access to one board: newest values,
+streams, tare, recording. `Bus.reach` gives goals; `read_log` reads a log into arrays. Errors are
+`TactileError`, whose text is one sentence that names the remedy.
 """
 
 from __future__ import annotations

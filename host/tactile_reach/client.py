@@ -1,8 +1,8 @@
-"""A program's connection to running daemons: newest values, streams, services.
+"""Connection of a program to running daemons: newest values, streams, services.
 
-Nothing here can slow a daemon: a stream holds a bounded number of messages, the oldest go first,
-and what went is counted. A `Bus` and everything made from it may be used from any thread; one
-stream belongs to one thread at a time.
+A client cannot slow a daemon: a stream holds a bounded number of messages, drops the oldest and
+counts them. A `Bus` and everything made from it may be used from any thread; one stream belongs to
+one thread at a time.
 """
 
 from __future__ import annotations
@@ -41,46 +41,46 @@ from tactile_reach.values import Ambient, Arm, Features, Field, Forces, Geometry
 T = TypeVar("T")
 
 MAX_QUEUE = 100_000
-"""Messages a stream may hold: a quarter of an hour of one board at 100 Hz."""
+"""Largest queue of a stream in messages: a quarter of an hour of one board at 100 Hz."""
 
 FIND_S = 3.0
-"""To find a daemon on the bus."""
+"""Time to find a daemon on the bus."""
 
 GATHER_S = 0.2
-"""More for other daemons, once one has been found."""
+"""Further time for other daemons, once one was found."""
 
 STATUS_S = 3.0
-"""For a daemon to answer what takes it no time."""
+"""Time for a daemon to answer simple requests."""
 
 TARE_S = 120.0
-"""For a tare to end: several times eight frames of a board at 0.5 Hz."""
+"""Time for a tare: several times eight frames of a board at 0.5 Hz."""
 
 RECORD_S = 10.0
-"""For a recording to be opened, or finished on the disk."""
+"""Time to start a recording, or to finish it on the disk."""
 
 
 class TactileError(Exception):
-    """Something cannot be done; the text is one sentence that names the remedy."""
+    """Request that cannot be fulfilled; the text is one sentence that names the remedy."""
 
 
 class NotThereError(TactileError):
-    """Nobody on the bus is called that, or nobody is there at all."""
+    """No daemon of that name, or none at all, was found on the bus."""
 
 
 class RefusedError(TactileError):
-    """The daemon was asked and refuses, or fails; the text is its reason."""
+    """The daemon refused the request or failed; the text is its reason."""
 
 
 class SilentError(TactileError):
-    """No message came in the time given."""
+    """No message arrived in time."""
 
 
 class Stream(Generic[T]):
     """Messages of one key, as an iterator that waits for the next; also a context manager.
 
-    ``queue``: messages held for a reader that is slower than the sender; 1 (the default of every
-    method that makes one) means that the reader always gets the newest. ``dropped`` counts those
-    that were not read in time, ``refused`` those that cannot be decoded or are too large.
+    ``queue``: messages held for a reader slower than the sender. With 1, the default of every
+    method that makes a stream, the reader always gets the newest. ``dropped`` counts messages not
+    read in time, ``refused`` those that are undecodable or too large.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Stream(Generic[T]):
         queue: int = 1,
         timeout_s: float | None = None,
     ) -> None:
-        """``timeout_s``: iteration raises `SilentError` after so long without a message."""
+        """``timeout_s``: iteration raises `SilentError` after this time without a message."""
         if not 1 <= queue <= MAX_QUEUE:
             raise ValueError(f"queue is {queue}; allowed: 1 to {MAX_QUEUE}")
         self.key = key
@@ -122,7 +122,7 @@ class Stream(Generic[T]):
         return self
 
     def __next__(self) -> T:
-        """The next message; waits for it."""
+        """Wait for the next message and return it."""
         message = self.get(self._timeout_s)
         if message is None:
             if self._closed:
@@ -134,7 +134,8 @@ class Stream(Generic[T]):
         return message
 
     def get(self, timeout_s: float | None = 0.0) -> T | None:
-        """The next message, or None when none came within ``timeout_s`` (None: wait for ever)."""
+        """Return the next message, or None if none arrives within ``timeout_s`` (None: wait
+        forever)."""
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             with self._arrived:
@@ -152,19 +153,19 @@ class Stream(Generic[T]):
                 return self._last
 
     def newest(self) -> T | None:
-        """The newest message there has been, read before or not; None before the first."""
+        """The newest message, already read or not; None before the first."""
         while self.get(0.0) is not None:
             pass
         return self._last
 
     def close(self) -> None:
-        """End the stream; whoever waits for its next message gets the end of the iteration."""
+        """Close the stream; a reader waiting for the next message gets the end of the iteration."""
         with self._arrived:
             if self._closed:
                 return
             self._closed = True
             self._arrived.notify_all()
-        with contextlib.suppress(zenoh.ZError):  # the session has closed by itself
+        with contextlib.suppress(zenoh.ZError):  # the session is already closed
             self._subscriber.undeclare()
 
     def _hear(self, sample: zenoh.Sample) -> None:
@@ -179,69 +180,73 @@ class Stream(Generic[T]):
 
 
 class Board:
-    """One board of a running tactiled. Streams are those of `Stream`."""
+    """A board of a running tactiled. Its streams are `Stream` objects."""
 
     def __init__(self, bus: Bus, name: str) -> None:
         self.name = name
         self._bus = bus
 
     def features(self, *, queue: int = 1, timeout_s: float | None = None) -> Stream[Features]:
-        """Contact features, once a cycle of the board."""
+        """Stream of contact features, one message per cycle of the board."""
         return self._bus.topic(FEATURES, self.name, values.features, queue, timeout_s)
 
     def forces(self, *, queue: int = 1, timeout_s: float | None = None) -> Stream[Forces]:
-        """Force on every taxel."""
+        """Stream of the forces on every taxel."""
         return self._bus.topic(FORCES, self.name, values.forces, queue, timeout_s)
 
     def field(self, *, queue: int = 1, timeout_s: float | None = None) -> Stream[Field]:
-        """Field at every taxel before the ambient field is removed."""
+        """Stream of the field at every taxel, before the ambient field is removed."""
         return self._bus.topic(FIELD, self.name, values.field, queue, timeout_s)
 
     def ambient(self, *, queue: int = 1, timeout_s: float | None = None) -> Stream[Ambient]:
-        """The ambient field that was removed."""
+        """Stream of the ambient field that was removed."""
         return self._bus.topic(AMBIENT, self.name, values.ambient, queue, timeout_s)
 
     def newest(self, timeout_s: float = STATUS_S) -> Features:
-        """The next contact features; `SilentError` when none come in time."""
+        """Return the next contact features. Raises `SilentError` if none arrive in time."""
         with self.features(timeout_s=timeout_s) as stream:
             return next(stream)
 
     def geometry(self, timeout_s: float = STATUS_S) -> Geometry:
-        """Where the taxels are; asks tactiled to say it again."""
+        """Return the places of the taxels, requested from tactiled."""
         with self._bus.topic(GEOMETRY, self.name, values.geometry, 1, timeout_s) as stream:
             self._ask("geometry", None, timeout_s)
             return next(stream)
 
     def status(self) -> dict[str, Any]:
-        """Everything tactiled knows of the board: state, rate, losses, clock, calibration, log."""
+        """Return tactiled's status of the board: state, rate, losses, clock, calibration, log."""
         return dict(self._ask("status", None, STATUS_S))
 
     def tare(self, *, force: bool = False) -> str:
-        """Take what the untouched skin reads now for its rest; returns what tactiled says of it.
+        """Tare: take the current reading of the untouched skin as its rest field; returns
+        tactiled's report.
 
-        `RefusedError` with the reason when something speaks against it, unless ``force``.
+        Raises `RefusedError` with the reason if the skin seems touched or unsteady, unless
+        ``force``.
         """
         return str(self._ask("tare", {"force": force}, TARE_S)["message"])
 
     def set_rate(self, rate_hz: float) -> float:
-        """Samples a second of a board that takes commands."""
+        """Set the sample rate in Hz of a board that takes commands; returns the rate set."""
         return float(self._ask("set_rate", {"rate_hz": rate_hz}, STATUS_S + 2.0)["rate_hz"])
 
     def start_recording(self, name: str | None = None, *, limit_s: float = 3600.0) -> Path:
-        """Begin a log called ``name`` (dated without one) beside the daemon's own; its path.
+        """Start a log called ``name`` (default: dated) beside the daemon's own, and return its
+        path.
 
-        It holds all boards of this tactiled, and ends by itself after ``limit_s``.
+        It holds all boards of this tactiled and ends by itself after ``limit_s``.
         """
         request = {"action": "start", "name": name, "limit_s": limit_s}
         return Path(self._ask("record", request, RECORD_S)["path"])
 
     def stop_recording(self) -> dict[str, Any]:
-        """End it: ``path``, ``messages``, ``bytes``, ``seconds`` and what was ``dropped``."""
+        """Stop the recording; returns ``path``, ``messages``, ``bytes``, ``seconds`` and
+        ``dropped``."""
         return dict(self._ask("record", {"action": "stop"}, RECORD_S))
 
     @contextlib.contextmanager
     def record(self, name: str | None = None, *, limit_s: float = 3600.0) -> Iterator[Path]:
-        """Record while the block runs. The path is that of tactiled's machine and folder."""
+        """Record while the block runs. The path is on tactiled's machine."""
         path = self.start_recording(name, limit_s=limit_s)
         try:
             yield path
@@ -253,28 +258,29 @@ class Board:
 
 
 class Reach:
-    """A running reachd: goals, and what it does about them."""
+    """A running reachd: goals and its state."""
 
     def __init__(self, bus: Bus, name: str) -> None:
         self.name = name
         self._bus = bus
 
     def states(self, *, queue: int = 1, timeout_s: float | None = None) -> Stream[ReachState]:
-        """State, once a control cycle."""
+        """Stream of its state, one message per control cycle."""
         return self._bus.topic(REACH_STATE, self.name, values.reach_state, queue, timeout_s)
 
     def arm(self, *, free_air: bool = True) -> None:
-        """Let commands pass. ``free_air`` False: the finger touches something already."""
+        """Let commands pass. ``free_air`` False: the finger already touches something."""
         self._ask("arm", {"free_air": free_air})
 
     def goal(
         self, x: float, y: float, *, radius: float | None = None, time_limit: float | None = None
     ) -> None:
-        """Reach for a target: m in ``cupboard``, s; radius and time limit of its settings."""
+        """Reach for a target: m in ``cupboard``, s; radius and time limit default to its
+        settings."""
         self._ask("goal", {"x": x, "y": y, "radius": radius, "time_limit": time_limit})
 
     def stop(self, reason: str = "stopped by a program") -> None:
-        """End whatever moves."""
+        """Stop all motion."""
         self._ask("stop", {"reason": reason})
 
     def reset(self) -> None:
@@ -282,7 +288,7 @@ class Reach:
         self._ask("reset", None)
 
     def status(self) -> dict[str, Any]:
-        """Everything reachd says of itself."""
+        """Return reachd's status."""
         return dict(self._ask("status", None))
 
     def _ask(self, service: str, request: object) -> Any:
@@ -317,7 +323,7 @@ class Bus:
         close_session(self.session)
 
     def boards(self) -> list[str]:
-        """Names of the boards of every running tactiled; empty when there is none."""
+        """Names of the boards of all running tactiled processes; empty if there are none."""
         names = set(list_alive(self.session, self._find_s))
         if names:
             time.sleep(GATHER_S)
@@ -325,7 +331,10 @@ class Bus:
         return sorted(names)
 
     def board(self, name: str | None = None) -> Board:
-        """The board called ``name``; the only one without a name. `NotThereError` lists them."""
+        """Return the board called ``name``, or the only one if no name is given.
+
+        Raises `NotThereError`, which lists the boards, if there is no such board or several.
+        """
         there = self.boards()
         if not there:
             raise NotThereError(
@@ -341,7 +350,7 @@ class Bus:
         return Board(self, name)
 
     def reach(self, name: str = "reach") -> Reach:
-        """The reachd called ``name``; `NotThereError` when it does not answer."""
+        """Return the reachd called ``name``. Raises `NotThereError` if it does not answer."""
         found = Reach(self, name)
         found.status()
         return found
@@ -349,7 +358,7 @@ class Bus:
     def arm_states(
         self, name: str = "arm", *, queue: int = 1, timeout_s: float | None = None
     ) -> Stream[Arm]:
-        """State of an arm."""
+        """Stream of an arm's state."""
         return self.topic(ARM_STATE, name, values.arm, queue, timeout_s)
 
     def stream(
@@ -360,10 +369,10 @@ class Bus:
         queue: int = 1,
         timeout_s: float | None = None,
     ) -> Stream[Any]:
-        """Messages of any key, as plain message classes.
+        """Stream of any key, as plain message classes.
 
-        ``msgtype``: ``package/msg/Name``; without it the type that the sender or the table of
-        topics says.
+        ``msgtype``: ``package/msg/Name``; by default the type given by the sender or the table of
+        topics.
         """
 
         def read(sample: zenoh.Sample) -> Any:
@@ -372,7 +381,7 @@ class Bus:
         return Stream(self.session, key, read, queue=queue, timeout_s=timeout_s)
 
     def call(self, key: str, request: object = None, *, timeout_s: float = STATUS_S) -> Any:
-        """Ask any service and return its reply."""
+        """Call any service and return its reply."""
         try:
             return call_service(self.session, key, request, timeout=timeout_s)
         except NoAnswerError as error:
@@ -388,7 +397,7 @@ class Bus:
         queue: int,
         timeout_s: float | None,
     ) -> Stream[T]:
-        """Messages of a topic of the table, made into values."""
+        """Stream of a topic, with messages converted by ``make``."""
 
         def read(sample: zenoh.Sample) -> T:
             return make(self._codec.decode(topic, sample.payload.to_bytes()))
@@ -398,7 +407,8 @@ class Bus:
 
 
 def type_of(sample: zenoh.Sample) -> str:
-    """Message type of a sample; `DecodeError` when neither sender nor table says."""
+    """Message type of a sample. Raises `DecodeError` if neither sender nor table of topics gives
+    one."""
     _, _, schema = str(sample.encoding).partition(";")
     if schema:
         return schema
@@ -409,7 +419,7 @@ def type_of(sample: zenoh.Sample) -> str:
 
 
 def stamp_of(sample: zenoh.Sample) -> tuple[int, int] | None:
-    """Sequence number and Unix time (ns) that the publisher attached; None without them."""
+    """Sequence number and Unix time (ns) attached by the publisher; None without them."""
     attachment = sample.attachment
     if attachment is None or len(attachment) != ATTACHMENT.size:
         return None
@@ -427,7 +437,7 @@ def connect(
     """Join the bus of this machine's daemons, or of those at ``to`` (zenoh endpoints).
 
     ``keys``: folder of keys for TLS. ``insecure``: as the daemons' ``--insecure``. Returns at once,
-    whether or not a daemon is there; `TactileError` when the bus itself cannot be joined.
+    whether or not a daemon is running. Raises `TactileError` if the bus cannot be joined.
     """
     endpoints = None if to is None else (to,) if isinstance(to, str) else tuple(to)
     config = BusConfig(

@@ -1,4 +1,4 @@
-"""Logs as arrays: every topic a table of numpy columns."""
+"""Logs as numpy arrays: each topic is a table of columns."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
     import pandas
 
 NAME = 2
-"""Kind of a field that is a message of its own, as rosbags numbers them."""
+"""Kind of a field that is a nested message, in rosbags' numbering."""
 
 TIME = "builtin_interfaces/msg/Time"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table(Mapping[str, NDArray[Any]]):
-    """One topic: columns by name, all of one length.
+    """One topic: columns by name, all of the same length.
 
-    ``time_s``: when each message was logged, s since the log's first message of any topic.
-    Nested fields have dotted names (``wrench.force.x``), stamps end in ``_ns`` (int64 ns). A field
-    that holds a list is (n, k) where every message has k elements, else an array of arrays; a list
-    of nested messages (``patches``) is an array of lists of those messages.
+    ``time_s``: when each message was logged, s since the log's first message of any topic. Nested
+    fields have dotted names (``wrench.force.x``), stamps end in ``_ns`` (int64 ns). A list field is
+    (n, k) if every message has k elements, otherwise an array of arrays; a list of nested messages
+    (``patches``) is an array of lists of messages. ``undecodable``: number of messages left out.
     """
 
     topic: str
@@ -61,7 +61,8 @@ class Table(Mapping[str, NDArray[Any]]):
         return len(self.columns)
 
     def to_pandas(self) -> pandas.DataFrame:
-        """A frame indexed by ``time_s``; lists of k numbers become columns ``name[0]`` and so on.
+        """Convert to a DataFrame indexed by ``time_s``; lists of k numbers become ``name[0]`` and
+        so on.
 
         Needs pandas, which is not installed with this package.
         """
@@ -82,7 +83,8 @@ class Table(Mapping[str, NDArray[Any]]):
 class Log(Mapping[str, Table]):
     """A log: its topics by name. ``start_ns``: Unix time of its first message.
 
-    ``closed``: it was finished in order. ``left_out``: topics whose type is not known here.
+    ``closed``: the log was finished in order. ``left_out``: topics of unknown types, with the
+    reason.
     """
 
     path: Path
@@ -107,7 +109,8 @@ class Log(Mapping[str, Table]):
         return len(self.tables)
 
     def board(self, name: str) -> dict[str, Table]:
-        """Tables of one board by their last word: features, forces, field and so on."""
+        """Tables of one board by the last word of their topic: features, forces, field and so
+        on."""
         head = f"/tactile/{name}/"
         found = {t.removeprefix(head): table for t, table in self.tables.items() if head in t}
         if not found:
@@ -117,10 +120,10 @@ class Log(Mapping[str, Table]):
 
 
 def read_log(path: str | Path, topics: Collection[str] | None = None) -> Log:
-    """Read a log into memory: all topics but the raw bytes, or those named.
+    """Read a log into memory: all topics except the raw bytes, or those named.
 
-    `TactileError` when the file cannot be read, is not a log, or holds nothing of what was asked
-    for. Damaged stretches are passed over (`tactile log doctor` tells of them).
+    Raises `TactileError` if the file cannot be read, is not a log, or holds nothing requested.
+    Damaged parts are skipped (`tactile log doctor` reports them).
     """
     wanted = None if topics is None else {t if t.startswith("/") else f"/{t}" for t in topics}
     path = Path(path)
@@ -171,10 +174,10 @@ def _is_wanted(topic: str, wanted: set[str] | None) -> bool:
 
 
 class _Rows:
-    """Messages of one topic on their way into columns."""
+    """Collects the messages of one topic into columns."""
 
     def __init__(self, schema: SchemaRecord | None) -> None:
-        """ValueError when the type cannot be read."""
+        """Raises ValueError if the type cannot be read."""
         if schema is None:
             raise ValueError("no definition of its type in the log")
         self.msgtype = schema.name
@@ -201,20 +204,20 @@ class _Rows:
 
 
 Fields = Callable[[str], tuple[tuple[str, Any], ...]]
-"""Names and descriptions of the fields of a type, as rosbags has them."""
+"""Names and rosbags descriptions of the fields of a type."""
 
 
 def _reader_of(schema: SchemaRecord) -> tuple[Callable[[bytes], Any], Fields]:
-    """Decoder and fields of a type: ours where the log has the same, else as the log defines it.
+    """Decoder and fields of a type: ours if the log has the same, otherwise as the log defines it.
 
-    Logs of earlier versions lack fields that types have got since.
+    Logs of earlier versions lack fields added since.
     """
     name = schema.name
     try:
         if schema.data == codec().schema(name).data:
             return (lambda data: codec().decode(name, data)), codec().fields
     except ValueError:
-        pass  # a type of somebody else's
+        pass  # a type of another program
     if schema.encoding != "ros2msg":
         raise ValueError(f"{name} is defined in {schema.encoding or 'nothing'}, not in ros2msg")
     try:
@@ -234,7 +237,7 @@ def _reader_of(schema: SchemaRecord) -> tuple[Callable[[bytes], Any], Fields]:
 def _columns(
     fields: Fields, msgtype: str, path: str, prefix: str
 ) -> Iterator[tuple[str, Callable[[Any], Any]]]:
-    """Name and getter of every column of a type."""
+    """Yield name and getter of every column of a type."""
     for name, (kind, arguments) in fields(msgtype):
         here = f"{path}.{name}" if path else name
         get = attrgetter(here)
@@ -255,7 +258,8 @@ def _time(get: Callable[[Any], Any]) -> Callable[[Any], int]:
 
 
 def _column(values: list[Any]) -> NDArray[Any]:
-    """One column: numbers and texts as they are, lists of one length stacked, others apart."""
+    """Build a column: numbers and text directly, lists of equal length stacked, others as
+    objects."""
     if values and isinstance(values[0], np.ndarray):
         if len({len(each) for each in values}) == 1:
             return np.stack(values)

@@ -1,8 +1,8 @@
-"""What the bus says, as typed values. Units: s, ns, m, rad, N, N m, µT. Frames as in the messages.
+"""Typed values of the messages on the bus.
 
-Frame ``ee``: origin at the wrist pivot, x along the finger towards its tip, y to the left, z up.
-Frame ``cupboard``: x into the cupboard, y to the left. A force is what the environment exerts on
-the skin or the end-effector. Arrays are read-only.
+Units: s, ns, m, rad, N, N m, µT. Frame ``ee``: origin at the wrist pivot, x along the finger
+towards its tip, y to the left, z up. Frame ``cupboard``: x into the cupboard, y to the left. Forces
+are those that the environment exerts on the skin or the end-effector. Arrays are read-only.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Floats = NDArray[np.float32]
 SideName = Literal["none", "left", "right", "tip"]
 
 SIDES: dict[int, SideName] = {0: "none", 1: "left", 2: "right", 3: "tip"}
-"""Names of the sides as messages number them; see `tactile_core.geometry.Side`."""
+"""Names of the sides by their number in messages; see `tactile_core.geometry.Side`."""
 
 assert {int(side): side.name.lower() for side in Side} == SIDES
 
@@ -44,12 +44,13 @@ class Patch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features:
-    """What a program needs to know of touch, once a cycle of the board.
+    """Contact features of a board, once per cycle.
 
-    ``valid`` False: do not act on this; ``reasons`` say why and what to do, ``reason_codes`` are
-    the same as stable words. ``normal_force``: N, the sum over the skin. A ``..._bound``: N; in
-    95 % of cycles the true value is within this. ``wrench``: force (N) and moment (N m) about the
-    origin of ``ee``. ``captured_ns``: monotonic clock of tactiled's machine; ``wall_ns``: Unix.
+    If ``valid`` is False, do not act on them; ``reasons`` say why and what to do, and
+    ``reason_codes`` are the same as stable words. ``normal_force``: N, sum over the skin.
+    ``..._bound``: N; in 95 % of cycles the true value is within this. ``wrench``: force (N) and
+    moment (N m) about the origin of ``ee``. ``captured_ns``: monotonic clock of tactiled's machine;
+    ``wall_ns``: Unix time.
     """
 
     sequence: int
@@ -75,9 +76,10 @@ class Features:
 
     @property
     def shear_force(self) -> float:
-        """N: length of the sum of the contacts' forces, without their normal part.
+        """Shear force in N: sum over the patches of the length of the tangential part of their
+        force.
 
-        Exact for contacts on flat arrays; where a contact bends round an edge it is an estimate.
+        Exact for contacts on flat arrays; an estimate if a contact bends around an edge.
         """
         total = 0.0
         for patch in self.patches:
@@ -88,11 +90,11 @@ class Features:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Forces:
-    """Force on every taxel, one cycle of a board.
+    """Forces on every taxel in one cycle of a board.
 
     ``force``: (n, 3) N in each taxel's axes, z outward: a press is negative. ``normal``: (n,) N,
     positive for a press. ``bound``: (n,) N, NaN where masked. ``status``: (n,) bits, 0 for a
-    healthy taxel. ``array_taxels``: taxels of each array, in the order of the arrays.
+    healthy taxel. ``array_taxels``: number of taxels of each array, in the order of the arrays.
     """
 
     sequence: int
@@ -120,7 +122,7 @@ class Forces:
 class Field:
     """Field at every taxel before compensation. ``field_ut``: (n, 3) µT in each taxel's axes.
 
-    ``temperature_c``: °C, one an array (or a taxel where the board says so).
+    ``temperature_c``: °C, one per array (or per taxel if the board reports them).
     """
 
     sequence: int
@@ -133,9 +135,10 @@ class Field:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ambient:
-    """The field that compensation removed, per array: ``field_ut`` (arrays, 3) µT at its centre.
+    """Ambient field removed by compensation: ``field_ut`` (arrays, 3) µT at each array's centre.
 
-    ``support``: share of an array's healthy taxels that agree. ``residual_ut``: rms about the fit.
+    ``support``: fraction of an array's healthy taxels that agree. ``residual_ut``: rms about the
+    fit.
     """
 
     sequence: int
@@ -151,7 +154,7 @@ class Ambient:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArrayLayout:
-    """One array of a skin: ``taxels`` is where it stands in arrays over the whole board."""
+    """One array of a skin. ``taxels``: its slice within data of the whole board."""
 
     name: str
     side: SideName
@@ -163,7 +166,7 @@ class ArrayLayout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Geometry:
-    """Where the taxels are.
+    """Places of the taxels.
 
     ``position``, ``normal``: (n, 3) m and unit vectors in ``ee``. ``surface``: (n, 2) m on the
     unrolled skin; empty for boards of more than 2,000 taxels.
@@ -180,7 +183,7 @@ class Geometry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arm:
-    """What an arm reports: pose of its wrist pivot in ``cupboard`` (m, rad), twist, wrench, limits.
+    """State reported by an arm: pose of its wrist pivot in ``cupboard`` (m, rad), twist, wrench.
 
     ``twist``: m/s, m/s, rad/s. ``wrench``: N, N, N m about the pivot.
     """
@@ -199,7 +202,7 @@ class Arm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReachState:
-    """What reachd is doing. ``distance``: m from tip to goal, NaN without a goal.
+    """State of reachd. ``distance``: m from tip to goal, NaN without a goal.
 
     ``wanted``, ``commanded``: m/s, m/s, rad/s before and after the safety gate.
     """
@@ -246,7 +249,7 @@ def _patch(message: Any) -> Patch:
 
 
 def features(message: Any) -> Features:
-    """A ``ContactFeatures`` message."""
+    """Convert a ``ContactFeatures`` message."""
     m = message
     return Features(
         sequence=m.sequence,
@@ -273,7 +276,7 @@ def features(message: Any) -> Features:
 
 
 def forces(message: Any) -> Forces:
-    """A ``TaxelForces`` message."""
+    """Convert a ``TaxelForces`` message."""
     m = message
     return Forces(
         sequence=m.sequence,
@@ -289,7 +292,7 @@ def forces(message: Any) -> Forces:
 
 
 def field(message: Any) -> Field:
-    """A ``TaxelField`` message."""
+    """Convert a ``TaxelField`` message."""
     m = message
     return Field(
         m.sequence,
@@ -302,7 +305,7 @@ def field(message: Any) -> Field:
 
 
 def ambient(message: Any) -> Ambient:
-    """An ``AmbientField`` message."""
+    """Convert an ``AmbientField`` message."""
     m = message
     return Ambient(
         m.sequence,
@@ -318,7 +321,7 @@ def ambient(message: Any) -> Ambient:
 
 
 def geometry(message: Any) -> Geometry:
-    """A ``SkinGeometry`` message."""
+    """Convert a ``SkinGeometry`` message."""
     m = message
     sizes = (m.array_rows.astype(int) * m.array_columns.astype(int)).tolist()
     arrays, start = [], 0
@@ -346,7 +349,7 @@ def geometry(message: Any) -> Geometry:
 
 
 def arm(message: Any) -> Arm:
-    """An ``ArmState`` message."""
+    """Convert an ``ArmState`` message."""
     m = message
     return Arm(
         m.sequence,
@@ -363,7 +366,7 @@ def arm(message: Any) -> Arm:
 
 
 def reach_state(message: Any) -> ReachState:
-    """A ``ReachState`` message."""
+    """Convert a ``ReachState`` message."""
     m = message
     return ReachState(
         m.sequence,
