@@ -1,1 +1,1 @@
-"""Taxel boards without hardware: field model, firmware, faults, and the ports they appear on."""
+"""Simulated taxel boards: field model, firmware, faults, and the ports they are reached at."""

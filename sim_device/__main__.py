@@ -1,4 +1,4 @@
-"""``python -m sim_device`` is ``simdevice``."""
+"""Run ``simdevice`` as ``python -m sim_device``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``simdevice`` can be told: options, units, defaults, and what is refused."""
+"""Command line of ``simdevice``: options, units, defaults and checks."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ DIALECTS = (
     "overrun",
     "buserror",
 )
-"""Firmware of CAN adapters, as in `sim_device.board.slcan_adapter`; a test compares them, and the
-next likewise."""
+"""Firmware of CAN adapters. Repeats the names in `sim_device.board.slcan_adapter`, so that parsing
+need not import it; a test compares the two. The same holds for `SKETCHES`."""
 
 SKETCHES = (
     "anyskin",
@@ -47,7 +47,7 @@ SKETCHES = (
     "labels-text",
     "adafruit-text",
 )
-"""How people's sketches write: `sim_device.board.anyskin`."""
+"""Output formats of published sketches, as in `sim_device.board.anyskin`."""
 
 COMMANDS = {
     "boards": Command("simulate taxel boards", "sim_device.arguments:_fill_boards"),
@@ -88,7 +88,7 @@ world/WORLD/srv/status. Objects, finger and goal are at world/WORLD/objects at 1
 """
 
 MAX_SPEED = 1000.0
-"""Times real time; beyond, the terminal and not the recording sets the pace."""
+"""Times real time; beyond this, the terminal limits the speed."""
 
 FAULTS_HELP = """\
 faults, separated by commas: flip=1e-5 (per bit), byteloss, byteinsert (per byte), loss, duplicate,
@@ -104,7 +104,7 @@ chips), leap=2000@4s+2s (µT of a field that leaps: a magnet near)."""
 
 
 def make_parser(ending: Ending | None = None) -> argparse.ArgumentParser:
-    """Parser of the command line; ``ending``: whether the process is told to end."""
+    """Parser of the command line. ``ending``: tells whether the process is to end."""
     parser = Parser(
         "simdevice",
         description="Simulated taxel boards on pseudo-terminals and CAN buses, on their own or on "

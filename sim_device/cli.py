@@ -1,4 +1,4 @@
-"""The command ``simdevice``: boards without hardware, for trying out and for testing."""
+"""Command ``simdevice``: simulated boards, arms and robots, to try things out and for tests."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from sim_device.runner import Runner
 
 SWITCH_INTERVAL_S = 0.0005
-"""Time after which Python hands the interpreter on, where several threads work."""
+"""Seconds after which Python may switch threads. The default, 5 ms, exceeds a tick."""
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; 0 done, 2 bad argument, 3 refused by the environment.
+    """Run the command. Returns 0 when done, 2 for a bad argument, 3 if the system refused.
 
-    Without ``argv`` this is the whole process, which then ends here.
+    Without ``argv`` it uses the process's arguments and exits the process.
     """
     return run(make_parser, argv)
 
@@ -229,12 +229,12 @@ def calibration(arguments: argparse.Namespace) -> int:
 
 
 def _serve(planned: Sequence[Planned], arguments: argparse.Namespace) -> int:
-    """Open the ports, say where they are, and run until a signal or the end."""
+    """Open the ports, print where they are, and run until told to end or until done."""
     from sim_device.runner import Runner
     from sim_device.status import StatusLine
 
     ending: Ending = arguments.ending or Ending()
-    # Before the first port is open: a signal in between would leave links behind.
+    # Set before the first port opens: a signal after that must still remove the links.
     ending.orderly = True
     runner = Runner([plan.station for plan in planned])
     status = StatusLine(planned)
@@ -243,7 +243,7 @@ def _serve(planned: Sequence[Planned], arguments: argparse.Namespace) -> int:
         for plan in planned:
             _announce(plan)
         gc.collect()
-        gc.freeze()  # boards live as long as the process: nothing for the collector to look at
+        gc.freeze()  # boards live as long as the process: the collector need not scan them
         with status:
             runner.run(ending.told.is_set, arguments.duration, status.show_at)
     finally:

@@ -1,4 +1,4 @@
-"""What is to go wrong, when and how often: a seeded plan, from text."""
+"""Fault plan of a board, parsed from text: what goes wrong, when and how often. Seeded."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from enum import StrEnum
 from tactile_core.config import ConfigError
 
 DELAY_S = 0.02
-"""s that a delayed frame holds up the line unless told: two samples at 100 Hz."""
+"""Seconds that a delayed frame holds up the line by default: two samples at 100 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +21,7 @@ class Window:
     duration: float = math.inf
 
     def covers(self, seconds: float) -> bool:
-        """Whether ``seconds`` after power-on lie inside."""
+        """Whether the instant ``seconds`` s after power-on lies inside."""
         return self.start <= seconds < self.start + self.duration
 
 
@@ -31,27 +31,27 @@ class TaxelFaultKind(StrEnum):
     STUCK = "stuck"  # repeats its value, unflagged: a chip that stopped converting
     SATURATED = "saturated"  # full scale, flagged
     FAILED = "failed"  # does not answer the bus: flagged, the counts mean nothing
-    ZEROS = "zeros"  # a failed read sent as zeros, temperature and all, unflagged
+    ZEROS = "zeros"  # a failed read sent as zeros, temperature too, unflagged
     ONES = "ones"  # a failed read sent as minus one on every axis, unflagged
     RAIL = "rail"  # z at the end of its range, unflagged
-    WRAP = "wrap"  # z close to the end of its range: a press takes it over, and it wraps
+    WRAP = "wrap"  # z close to the end of its range: a press makes it wrap around
     JUMP = "jump"  # far from where it was, on every axis
     TWIN = "twin"  # the bits of the chip before it (chip 0: of chip 1)
     DITHER = "dither"  # stuck but for the last bits, which toggle
-    HOT = "hot"  # a thermometer that shows 99 °C
+    HOT = "hot"  # its thermometer reads 99 °C
     LOOSE = "loose"  # its magnet has come off
-    INFINITE = "inf"  # what is not a number; boards that send floats only
+    INFINITE = "inf"  # infinities and NaN; only boards that send floats
 
 
 ALL_TAXELS = -1
-"""Stands for every taxel of an array."""
+"""Taxel number that stands for every taxel of an array."""
 
 
 @dataclass(frozen=True, slots=True)
 class TaxelFault:
     """Taxel number ``taxel`` of ``array`` is broken while ``window`` lasts.
 
-    ``share``: of its readings, drawn at random.
+    ``share``: share of its readings affected, drawn at random.
     """
 
     kind: TaxelFaultKind
@@ -66,7 +66,8 @@ class FaultPlan:
     """All faults of one board and its wire. ValueError for probabilities outside 0 to 1.
 
     ``flip`` is per bit, ``byteloss`` and ``byteinsert`` per byte, the other probabilities per
-    frame; ``delay_s`` is how long a delayed frame holds up the line.
+    frame. ``delay_s``: how long a delayed frame holds up the line. ``gain``: factors of all counts;
+    ``leap``: µT added to the field; each with its window.
     """
 
     seed: int = 0
@@ -90,7 +91,7 @@ class FaultPlan:
     taxels: tuple[TaxelFault, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse figures out of range."""
+        """Check ranges; ValueError."""
         for name in PROBABILITIES:
             value = getattr(self, name)
             if not 0 <= value <= 1:
@@ -102,7 +103,7 @@ class FaultPlan:
     def parse(cls, text: str) -> FaultPlan:
         """Plan from text such as ``flip=1e-5,loss=0.01,silence@5s+2s,reset@8s,stuck=left:3@2s``.
 
-        Entries, parted by commas: ``seed=N``; ``NAME=PROBABILITY`` for flip, byteloss,
+        Entries, separated by commas: ``seed=N``; ``NAME=PROBABILITY`` for flip, byteloss,
         byteinsert, loss, duplicate, reorder, splice; ``delay=PROBABILITY:SECONDSs``;
         ``silence@Ts+Ds``, ``busoff@Ts+Ds``, ``copy@Ts+Ds``, ``reset@Ts``; ``skinoff@Ts+Ds``,
         ``newskin@Ts``, ``gain=FACTOR@Ts+Ds``, ``leap=MICROTESLA@Ts+Ds``; a `TaxelFaultKind`
@@ -115,7 +116,7 @@ class FaultPlan:
 
     @property
     def touches_wire(self) -> bool:
-        """Whether any fault is on the wire."""
+        """Whether the plan has faults of the wire."""
         return bool(self.silence) or any(getattr(self, name) > 0 for name in PROBABILITIES)
 
 
@@ -132,9 +133,9 @@ PROBABILITIES = (
 _TAXEL_FAULTS = {**{kind.value: kind for kind in TaxelFaultKind}, "nan": TaxelFaultKind.FAILED}
 TIMED = ("silence", "reset", "busoff", "copy", "skinoff", "newskin")
 STARTING = ("reset", "newskin")
-"""Those that begin and have no end."""
+"""Faults that have a start but no end."""
 SIZED = ("gain", "leap")
-"""A figure, then when: ``gain=FACTOR@Ts+Ds``, ``leap=MICROTESLA@Ts+Ds``."""
+"""Faults with a value, then a time: ``gain=FACTOR@Ts+Ds``, ``leap=MICROTESLA@Ts+Ds``."""
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _ENTRY = re.compile(r"(?P<name>[a-z_]+)\s*(?P<mark>[=@])\s*(?P<rest>.+)")

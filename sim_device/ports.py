@@ -1,6 +1,6 @@
-"""The ends that a simulated board is reached at: pseudo-terminals and CAN buses.
+"""Ports at which hosts reach simulated boards: pseudo-terminals and CAN buses.
 
-None of them ever waits: what a reader does not take in time is dropped, oldest first, and counted.
+No port ever waits: what a reader does not take in time is dropped, oldest first, and counted.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ if TYPE_CHECKING:
     import can
 
 BACKLOG = 4_096
-"""Bytes kept here for a reader that is late, besides those in the terminal: what a board's USB
-buffers hold. More would only reach a host that comes back as stale samples."""
+"""Bytes kept here for a late reader, besides those in the terminal: what a board's USB buffers
+hold. More would only give stale samples to a host that comes back."""
 
 PTY_ROOM = 4_095
-"""Bytes Linux' line discipline holds for a reader. More would pile up in the kernel where nobody
-can drop the oldest, and a late reader would get stale samples."""
+"""Bytes that Linux' line discipline holds for a reader. More would pile up in the kernel, where
+the oldest cannot be dropped, and a late reader would get stale samples."""
 
 READ_LIMIT = 4_096
-"""Bytes taken from a host in one go; what is left comes with the next."""
+"""Bytes taken from a host at once; the rest is taken at the next call."""
 
 BUS_QUEUE = 64
-"""Frames that wait for the bus before boards hold back: 10 ms at 1 Mbit/s, so that the next clock
-reply is never far behind, and the bus never idle between two ticks."""
+"""Frames that wait for the bus before boards hold back: 10 ms at 1 Mbit/s, so that a clock reply
+never waits long and the bus is never idle between two ticks."""
 
 MAX_FRAMES = 256
-"""Frames taken from a bus in one go."""
+"""Frames taken from a bus at once."""
 
 
 class LinkRefused(Exception):  # noqa: N818 - names a state of the path
@@ -56,9 +56,9 @@ class LinkRefused(Exception):  # noqa: N818 - names a state of the path
 
 
 class PtyPort:
-    """A pseudo-terminal in raw mode, reachable by a symbolic link at ``link``.
+    """Pseudo-terminal in raw mode, reached by a symbolic link at ``link``.
 
-    A link left by a killed run is replaced; any other file there, and a link that a live simulator
+    A link left by a killed run is replaced. Any other file there, and a link that a live simulator
     serves, raises `LinkRefused`. The slave end stays open here, so that hosts may come and go.
     """
 
@@ -68,7 +68,7 @@ class PtyPort:
         self._master = self._slave = -1
         self._backlog: deque[bytes] = deque()
         self._backlog_bytes = 0
-        self._begun = False  # the oldest has gone in part
+        self._begun = False  # whether part of the oldest message has been sent
         self._counts: Counter[str] = Counter()
 
     @property
@@ -96,7 +96,7 @@ class PtyPort:
         return self._master
 
     def open(self) -> None:
-        """Make the terminal and the link; raises `LinkRefused` or OSError (no such folder)."""
+        """Make the terminal and the link. Raises `LinkRefused`, or OSError (no such folder)."""
         self._claim = _claim(self.link)
         try:
             _check_replaceable(self.link)
@@ -109,7 +109,7 @@ class PtyPort:
             raise
 
     def close(self) -> None:
-        """Hang up and take the link away; more than once is fine."""
+        """Hang up and remove the link; may be called more than once."""
         if self._slave >= 0:
             if self.link.is_symlink() and os.readlink(self.link) == os.ttyname(self._slave):
                 self.link.unlink()
@@ -125,7 +125,7 @@ class PtyPort:
         self._begun = False
 
     def receive(self) -> bytes:
-        """Bytes from the host, at most `READ_LIMIT`; empty when there are none."""
+        """Bytes from the host, at most `READ_LIMIT`; empty if there are none."""
         try:
             return os.read(self._master, READ_LIMIT) if self.is_open else b""
         except BlockingIOError:
@@ -140,7 +140,7 @@ class PtyPort:
             self._backlog.append(data)
             self._backlog_bytes += len(data)
         self.flush()
-        # A message that has begun goes on, or the reader would take its head and the next for one.
+        # A message that has begun is finished: else the reader would join its head to the next.
         while self._backlog_bytes > BACKLOG and len(self._backlog) > 1 + self._begun:
             oldest = self._backlog[self._begun]
             del self._backlog[self._begun]
@@ -168,10 +168,10 @@ class PtyPort:
 
 
 class SlcanPort:
-    """A simulated USB-CAN adapter on a pseudo-terminal, with a bus behind it.
+    """Simulated USB-CAN adapter on a pseudo-terminal, with a bus behind it.
 
     Frames take their time on the bus, and the lowest identifier goes first. ``fd``: the adapter
-    takes CAN FD. ``dialect``: of its firmware, see `sim_device.board.slcan_adapter.DIALECTS`.
+    takes CAN FD. ``dialect``: its firmware, see `sim_device.board.slcan_adapter.DIALECTS`.
     """
 
     def __init__(self, link: str | Path, fd: bool = True, dialect: str = "lawicel") -> None:
@@ -186,8 +186,8 @@ class SlcanPort:
 
     @property
     def ready(self) -> bool:
-        """Whether boards find the bus free enough to send more; a host that does not read never
-        holds a bus up, for the adapter takes the frames off it and drops them."""
+        """Whether the bus is free enough for boards to send more. A host that does not read never
+        blocks the bus: the adapter takes the frames off it and drops them."""
         return self.bus.waiting < BUS_QUEUE
 
     def fileno(self) -> int:
@@ -209,7 +209,7 @@ class SlcanPort:
         return tuple(frames)
 
     def send(self, frames: tuple[CanFrame, ...], now: Instant) -> None:
-        """Put a board's frames on the bus; a board's bus-off (error frames) befalls the adapter."""
+        """Put a board's frames on the bus. Its error frames (bus-off) put the adapter there too."""
         data = []
         for frame in frames:
             if frame.error:
@@ -246,7 +246,7 @@ class SlcanPort:
 class PythonCanPort:
     """Boards on a bus that python-can opens: ``virtual:0`` in one process, ``socketcan:vcan0``.
 
-    Bus timing and bus-off are then the bus's own affair.
+    Timing and bus-off are then up to that bus.
     """
 
     def __init__(self, spec: CanSpec) -> None:
@@ -256,12 +256,12 @@ class PythonCanPort:
 
     @property
     def losses(self) -> dict[str, int]:
-        """Frames the bus did not take, and foreign ones."""
+        """Frames the bus did not take, and frames that are not the boards'."""
         return dict(self._counts)
 
     @property
     def ready(self) -> bool:
-        """Always: nothing waits here."""
+        """True: nothing waits here."""
         return True
 
     def fileno(self) -> int:
@@ -275,7 +275,7 @@ class PythonCanPort:
         self._bus = open_bus(self.spec)
 
     def close(self) -> None:
-        """Leave the bus; more than once is fine."""
+        """Leave the bus; may be called more than once."""
         bus, self._bus = self._bus, None
         if bus is not None:
             bus.shutdown()
@@ -296,7 +296,7 @@ class PythonCanPort:
         return tuple(frames)
 
     def send(self, frames: tuple[CanFrame, ...], now: Instant) -> None:  # noqa: ARG002 - as SlcanPort
-        """Put a board's frames on the bus, or count them."""
+        """Put a board's frames on the bus; count those that it does not take."""
         import can
 
         bus = self._bus
@@ -311,7 +311,7 @@ class PythonCanPort:
                 return
 
     def flush(self, now: Instant) -> None:
-        """Nothing waits here."""
+        """Do nothing: nothing waits here."""
 
 
 class VirtualCanPort(PythonCanPort):
@@ -326,7 +326,7 @@ def _waiting(slave: int) -> int:
 
 
 def _claim(link: Path) -> socket.socket | None:
-    """Hold ``link`` for this process until it ends, however it ends; None where that cannot be.
+    """Reserve ``link`` for this process until it ends. None where the system has no such names.
 
     An abstract socket name leaves no file behind and is free again after a kill.
     """
@@ -355,7 +355,7 @@ def _check_replaceable(link: Path) -> None:
 
 
 def _replace_link(link: Path, target: str) -> None:
-    """Put the link in place in one step, so that nobody sees none."""
+    """Put the link in place in one step, so that there is one at every moment."""
     fresh = link.with_name(f".{link.name}.{os.getpid()}")
     fresh.unlink(missing_ok=True)
     fresh.symlink_to(target)

@@ -1,4 +1,4 @@
-"""From what a user asks for to stations: which boards are on which ports, and who they are."""
+"""Plan the ports of ``simdevice boards``: which boards are on which port, and their identities."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ from tactile_core.geometry import ANYSKIN_CHIPS, SkinGeometry
 UP = np.array([0.0, 0.0, 1.0])
 
 NODES = range(127)
-"""Node ids a board may have on a CAN bus; 127 addresses all of them."""
+"""Node ids that a board may have on a CAN bus; 127 addresses all boards."""
 
 BUS_SHARE = 0.85
-"""Part of a bus's bit rate that its boards' samples may take together, each an equal share: room
+"""Share of a bus's bit rate that its boards' samples may use together, in equal parts: leaves room
 for stuff bits and the host. A board that has more to send overruns whole cycles, as a real one."""
 
 _WINDOW = re.compile(r"(?P<at>\d+(?:\.\d*)?)s\+(?P<for>\d+(?:\.\d*)?)s")
@@ -45,10 +45,10 @@ _HEX = re.compile(r"(?:0x)?([0-9A-Fa-f]{1,16})")
 
 @dataclass(frozen=True, slots=True)
 class BoardsRequest:
-    """What `simdevice boards` was asked for; units as in its help.
+    """What the user of `simdevice boards` asked for; units as in its help.
 
-    ``touched`` and ``heading``: of boards on a finger that something else moves, contacts on the
-    skin now and rad counter-clockwise from above, instead of ``press`` and ``rotate``.
+    For boards on a finger that something else moves, ``touched`` (contacts on the skin now) and
+    ``heading`` (rad, counter-clockwise from above) take the place of ``press`` and ``rotate``.
     """
 
     ptys: tuple[Path, ...] = ()
@@ -76,9 +76,9 @@ class BoardsRequest:
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """A station not yet open. ``lines``: what to tell the user of each of its boards.
+    """Station not yet open. ``lines``: what to tell the user about each of its boards.
 
-    ``note``: how it is, for a status line.
+    ``connect``: the command that reads it. ``note``: gives its state for a status line.
     """
 
     station: Station
@@ -97,7 +97,7 @@ def parse_window(text: str) -> Window:
 
 
 def parse_serial(text: str) -> bytes:
-    """Unique id of up to 16 hex digits, filled with zeros at the front."""
+    """Unique id from up to 16 hex digits, padded with zeros in front; ValueError."""
     match = _HEX.fullmatch(text)
     if match is None:
         raise ValueError(f"{text!r} given; allowed: 1 to 16 hexadecimal digits")
@@ -105,7 +105,7 @@ def parse_serial(text: str) -> bytes:
 
 
 def parse_bus(text: str) -> CanSpec:
-    """CAN bus to play boards on; ValueError."""
+    """CAN bus on which to simulate boards; ValueError."""
     spec = CanSpec.parse(text)
     if spec.interface == "slcan":
         raise ValueError(f"{text!r} given; to play an slcan adapter use --slcan LINK")
@@ -113,7 +113,7 @@ def parse_bus(text: str) -> CanSpec:
 
 
 def parse_arrays(text: str) -> tuple[int, ...]:
-    """Magnetometers of each board of a controller, as in ``5+5``; ValueError."""
+    """Number of magnetometers on each board of a controller, as in ``5+5``; ValueError."""
     words = text.split("+")
     if not all(word.isdecimal() and int(word) for word in words):
         raise ValueError(f"{text!r} given; allowed: numbers above 0 joined by +, as in 5+5")
@@ -124,7 +124,7 @@ def parse_arrays(text: str) -> tuple[int, ...]:
 
 
 def plan_boards(request: BoardsRequest) -> list[Planned]:
-    """Stations for a request, all boards made; ValueError for what does not fit together."""
+    """Stations for a request, with all boards made. ValueError if options do not fit together."""
     buses: list[tuple[SlcanPort | PythonCanPort, CanSpec]] = [
         (
             SlcanPort(link, dialect=request.adapter),
@@ -178,7 +178,7 @@ def _plan_bus(
 
 
 class _Maker:
-    """Makes boards by their number; what is wrong with the request shows before any port opens."""
+    """Makes boards by number. Errors in the request are raised before any port opens."""
 
     def __init__(self, request: BoardsRequest) -> None:
         self.request = request
@@ -191,11 +191,11 @@ class _Maker:
         self._geometry: SkinGeometry | None = None
 
     def seed(self, number: int) -> int:
-        """Seed of board ``number``: each board is another one."""
+        """Seed of board ``number``: no two boards are alike."""
         return self.request.seed + number
 
     def identity(self, number: int) -> Identity:
-        """Who board ``number`` is."""
+        """Identity of board ``number``."""
         own = identity(self.request.board, self.seed(number))
         if number < len(self.request.serials):
             return replace(own, unique_id=self.request.serials[number])
@@ -221,7 +221,7 @@ class _Maker:
     def can(
         self, number: int, node: int, fd: bool, bits_per_s: float | None
     ) -> MakeBoard[tuple[CanFrame, ...]]:
-        """Board on a CAN bus, with so much of it to itself."""
+        """Board on a CAN bus that may use ``bits_per_s`` of it; None: no limit."""
 
         def make(powered: float) -> Board[tuple[CanFrame, ...]]:
             options = self._options(number, powered)
@@ -238,7 +238,7 @@ class _Maker:
         request = self.request
         chips = sum(request.arrays or (ANYSKIN_CHIPS,))
         write = writer_of(request.format or "anyskin", chips)
-        build_skin("anyskin", 0, request.arrays)  # what is wrong shows now
+        build_skin("anyskin", 0, request.arrays)  # raises now if the arrays are wrong
 
         def make(powered: float) -> Board[bytes]:
             options = self._options(number, powered)
@@ -256,7 +256,7 @@ class _Maker:
         return make
 
     def _options(self, number: int, powered: float) -> BoardOptions:
-        """Options of a board powered ``powered`` s after the start: meanwhile the world goes on."""
+        """Options of a board powered ``powered`` s after the start, when the world already runs."""
         plan = self._plan if self._plan.seed else replace(self._plan, seed=self.seed(number))
         turn = self._turn
         return BoardOptions(
@@ -282,7 +282,7 @@ class _Maker:
 
 
 def _turn(request: BoardsRequest) -> AttitudeScript:
-    """How the boards are turned over time."""
+    """Attitude of the boards over time."""
     heading = request.heading
     if heading is not None:
         return lambda _: rotation_about(UP, heading())

@@ -1,4 +1,4 @@
-"""Boards in real time: what comes from the ports goes to the boards, and back, on a fixed grid."""
+"""Run boards in real time: pass data between ports and boards on a fixed grid of ticks."""
 
 from __future__ import annotations
 
@@ -14,48 +14,50 @@ from sim_device.ports import PtyPort, PythonCanPort, SlcanPort
 from tactile_core.types import Instant, after, monotonic_now, seconds_between
 
 TICK = 0.001
-"""s between two looks at every board, the period of a USB frame: no sample waits longer."""
+"""Seconds between two ticks: the period of a USB frame. No sample waits longer."""
 
 STATUS_PERIOD = 0.5
-"""s between two calls of the status function."""
+"""Seconds between two calls of the status function."""
 
 LONGEST_WAIT = 0.05
-"""s that a board waits for a full terminal at most; then it goes on, and the port drops the oldest,
-so that a host that comes back gets nothing older. A full bus always empties."""
+"""Longest time, s, that a board waits for a full terminal. After that the board goes on and the
+port drops the oldest data, so that a host that comes back gets nothing older. A full bus always
+empties, so there is no limit on a bus."""
 
 STALL = 0.1
-"""s of a full port after which a replay is late for good: its later rows move by as much."""
+"""Seconds that a full port may last before a replay's later rows are moved back by that time."""
 
 DRAIN_TIME = 2.0
-"""s that the last frames of a replay wait for their reader."""
+"""Seconds that the last frames of a replay wait for their reader."""
 
 SETTLE_TIME = 0.25
-"""s for written bytes to show as unread: the kernel hands them over later, on a busy machine much
-later. Without this, a replay would begin before anybody reads, and end before all is read."""
+"""Seconds for written bytes to show as unread: the kernel delivers them later, on a busy machine
+much later. Without this wait, a replay would begin before anybody reads, and end before all is
+read."""
 
 Payload = TypeVar("Payload", bytes, tuple[CanFrame, ...])
 
 
 class Board(Protocol[Payload]):
-    """A simulated board; see `sim_device.board.firmware`."""
+    """Simulated board; see `sim_device.board.firmware`."""
 
     @property
     def counters(self) -> dict[str, int]:
-        """What it counted."""
+        """Counts by name, since power-on."""
 
     def receive(self, data: Payload, now: Instant, /) -> None:
-        """Take what came from the host."""
+        """Take what arrived from the host."""
 
     def tick(self, now: Instant, /) -> Payload:
-        """What goes to the host."""
+        """Data for the host up to ``now``."""
 
 
 MakeBoard = Callable[[float], Board[Payload]]
-"""Makes the board afresh, powered so many seconds after the start of the simulation."""
+"""Makes a new board that is powered the given number of seconds after the simulation started."""
 
 
 class Station(Protocol):
-    """One port with what is on it."""
+    """One port and the boards on it."""
 
     @property
     def sent(self) -> int:
@@ -63,11 +65,11 @@ class Station(Protocol):
 
     @property
     def losses(self) -> dict[str, int]:
-        """What was lost at the port and at the boards."""
+        """What was lost at the port and at the boards, by reason."""
 
     @property
     def finished(self) -> bool:
-        """Whether there will be nothing to do any more."""
+        """Whether nothing is left to do."""
 
     def fileno(self) -> int:
         """Descriptor to wait on; −1 for none."""
@@ -79,11 +81,11 @@ class Station(Protocol):
         """Close the port."""
 
     def service(self, now: Instant) -> None:
-        """Pass everything on that is due."""
+        """Pass on everything that is due."""
 
 
 class SerialStation:
-    """A board on a pseudo-terminal. ``unplugged``: windows of time without power and port."""
+    """Board on a pseudo-terminal. ``unplugged``: when it has neither power nor port."""
 
     def __init__(
         self, port: PtyPort, make_board: MakeBoard[bytes], unplugged: Sequence[Window] = ()
@@ -98,16 +100,16 @@ class SerialStation:
 
     @property
     def losses(self) -> dict[str, int]:
-        """Of port and board."""
+        """What was lost at the port and at the board, by reason."""
         return self.port.losses | _only_losses(self.board.counters)
 
     @property
     def finished(self) -> bool:
-        """Never: a board runs until it is stopped."""
+        """False: a board runs until it is stopped."""
         return False
 
     def fileno(self) -> int:
-        """Of the port."""
+        """Descriptor of the port; −1 while closed."""
         return self.port.fileno()
 
     def open(self) -> None:
@@ -155,7 +157,7 @@ class CanStation:
 
     @property
     def losses(self) -> dict[str, int]:
-        """Of the port and all boards together."""
+        """What was lost at the port and at all boards together, by reason."""
         total = dict(self.port.losses)
         for board in self.boards:
             for reason, count in _only_losses(board.counters).items():
@@ -164,11 +166,11 @@ class CanStation:
 
     @property
     def finished(self) -> bool:
-        """Never."""
+        """False: boards run until they are stopped."""
         return False
 
     def fileno(self) -> int:
-        """Of the port."""
+        """Descriptor of the port; −1 for none."""
         return self.port.fileno()
 
     def open(self) -> None:
@@ -180,7 +182,7 @@ class CanStation:
         self.port.close()
 
     def service(self, now: Instant) -> None:
-        """Pass frames on; boards hear the host, not one another."""
+        """Pass frames on. Boards receive what the host sends, not what other boards send."""
         frames = self.port.receive()
         for board in self.boards if frames else ():
             board.receive(frames, now)
@@ -193,8 +195,8 @@ class CanStation:
 
 
 class ReplayStation:
-    """A recording on a pseudo-terminal. Nothing of it is lost: it begins when somebody reads, and
-    waits while nobody does."""
+    """Recording on a pseudo-terminal. Nothing of it is lost: it begins when a host reads, and
+    waits while no host does."""
 
     def __init__(self, port: PtyPort, board: ReplayBoard) -> None:
         self.port = port
@@ -212,7 +214,7 @@ class ReplayStation:
 
     @property
     def losses(self) -> dict[str, int]:
-        """Of the port."""
+        """What was lost at the port, by reason."""
         return self.port.losses
 
     @property
@@ -224,7 +226,7 @@ class ReplayStation:
         return waited > (DRAIN_TIME if self.port.unread else SETTLE_TIME)
 
     def fileno(self) -> int:
-        """Of the port."""
+        """Descriptor of the port; −1 while closed."""
         return self.port.fileno()
 
     def open(self) -> None:
@@ -236,9 +238,9 @@ class ReplayStation:
         self.port.close()
 
     def service(self, now: Instant) -> None:
-        """Send the frames that are due; begin once the bait has been read."""
+        """Send the frames that are due; begin once the probe bytes have been read."""
         self._now = now
-        self.port.receive()  # whatever a host asks: such boards do not listen
+        self.port.receive()  # dropped: such boards do not listen
         self.port.flush()
         if not self.port.ready:
             self._full = self._full or now
@@ -270,7 +272,7 @@ class Runner:
         self.stations = tuple(stations)
 
     def open(self) -> None:
-        """Open every port, or none: raises what the first that fails raises."""
+        """Open every port, or none: raises the error of the first that fails."""
         opened: list[Station] = []
         try:
             for station in self.stations:
@@ -282,7 +284,7 @@ class Runner:
             raise
 
     def close(self) -> None:
-        """Close every port; links are taken away."""
+        """Close every port and remove its link."""
         for station in self.stations:
             station.close()
 
@@ -312,7 +314,7 @@ class Runner:
                 status = after(now, STATUS_PERIOD)
             tick = after(tick, TICK)
             if tick < now:
-                tick = now  # late: what was missed is made up by the boards, not by extra ticks
+                tick = now  # late: the boards catch up by themselves, without extra ticks
             self._wait(seconds_between(monotonic_now(), tick))
 
     def _wait(self, seconds: float) -> None:
@@ -321,7 +323,7 @@ class Runner:
 
 
 class _Feeder(Generic[Payload]):
-    """Lets a board wait while its port is full, ``longest`` s at most."""
+    """Lets a board wait while its port is full, for at most ``longest`` s."""
 
     def __init__(self, longest: float) -> None:
         self._longest = longest
@@ -337,7 +339,7 @@ class _Feeder(Generic[Payload]):
 
 
 LOSS_COUNTERS = ("overruns", "lost", "silenced", "damaged", "rx_errors")
-"""Counters of a board that stand for something lost, on purpose or not."""
+"""Counters of a board that count losses, injected or not."""
 
 
 def _only_losses(counters: dict[str, int]) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""What people see while a simulation runs: a live line on a terminal, and a sum at the end."""
+"""Progress shown while a simulation runs: a live line on a terminal, and totals at the end."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class StatusLine(LiveLines):
-    """Shows how the ports of ``planned`` do, on a terminal alone."""
+    """Shows rates and losses of the ports of ``planned``, only if the output is a terminal."""
 
     def __init__(self, planned: Sequence[Planned], console: Console | None = None) -> None:
         super().__init__(console or Console(stderr=True))
@@ -26,7 +26,7 @@ class StatusLine(LiveLines):
         self._text = ""
 
     def show_at(self, elapsed_s: float) -> None:
-        """Show rates since the last call, and losses so far, ``elapsed_s`` after the start."""
+        """Show rates since the last call and losses so far, ``elapsed_s`` after the start."""
         before, counts = self._last
         now = [plan.station.sent for plan in self._planned]
         self._last = elapsed_s, now
@@ -44,17 +44,17 @@ class StatusLine(LiveLines):
         self.show()
 
     def table(self) -> Table:
-        """One row."""
+        """Table of one row, the line."""
         table = Table.grid()
         table.add_row(Text(self._text, no_wrap=True, overflow="ellipsis"))
         return table
 
     def lines(self) -> tuple[str, ...]:
-        """Nothing: what was announced and the sum are enough for a file."""
+        """No lines: what was announced and the totals are enough for a file."""
         return ()
 
     def sum_up(self) -> None:
-        """Say on standard error what each port sent and lost."""
+        """Print to standard error what each port sent and lost."""
         for plan in self._planned:
             losses = {k: v for k, v in plan.station.losses.items() if v}
             lost = ", ".join(f"{name} {count}" for name, count in sorted(losses.items()))

@@ -1,1 +1,1 @@
-"""The simulated arm and its cupboard."""
+"""Simulated arm, and the simulated cupboard it reaches into."""

@@ -1,4 +1,4 @@
-"""A simulated arm: a real arm's driver, as its user sees it, on top of a `World`.
+"""Simulated arm: the interface of a real arm's driver on top of a `World`.
 
 Pure: time is passed in, and whoever owns the threads calls `SimulatedArm.advance`.
 """
@@ -29,33 +29,34 @@ from tactile_core.types import (
 STEP_NS: Final = round(PHYSICS_STEP * NS_PER_S)
 
 MAX_EXPIRY: Final = 0.075
-"""s a command may hold. Braking takes up to 20 ms, so that the arm rests within 100 ms of it."""
+"""Longest time, s, that a command holds. Braking takes up to 20 ms, so the arm rests within 100 ms
+of its last command."""
 
 DEFAULT_EXPIRY: Final = 0.05
-"""s; five cycles of a controller at 100 Hz."""
+"""Seconds that a command holds by default: five cycles of a controller at 100 Hz."""
 
 MAX_PENDING: Final = 64
-"""Commands under way to the joints: 100 a second at a latency of half a second."""
+"""Most commands on their way to the joints: 100 a second at a latency of half a second."""
 
 MAX_UNREAD: Final = 400
-"""States not yet fetched: one second at the highest rate; older ones are of no use to anyone."""
+"""Most states not yet fetched: one second at the highest rate. Older ones are of no use."""
 
 FAST: Final = 5.0
-"""How many times too fast an arm moves that has the fault of this name."""
+"""Factor by which an arm with the fault ``FAST`` moves too fast."""
 
 FACTORY_LIMITS: Final = ArmLimits(v_max=0.5, omega_max=1.0, f_max=100.0, m_max=20.0)
-"""What an arm allows that nobody has set up: ten times too much for a cupboard (v_max and ω_max
-are the defaults of Flexiv's RDK; force and moment are ours)."""
+"""Limits of an arm that nobody has set up: ten times too much for a cupboard (v_max and ω_max are
+the defaults of Flexiv's RDK; force and moment are ours)."""
 
 
 class ArmFault(StrEnum):
     """What may go wrong with an arm.
 
     ``SILENT``: no state is sent. ``FROZEN``: states with fresh stamps and old values. ``STALE``:
-    the same state over and over, stamps and all. ``BIASED``: a constant wrench is added.
-    ``REFUSES_LIMITS``: keeps and confirms its own limits. ``BACKWARDS``, ``SIDEWAYS``: mounted the
-    wrong way round, it moves so. ``FAST``: moves `FAST` times as fast as it is told. ``FAULT``: the
-    drives have failed and brake. ``ESTOP``: the button is pressed.
+    the same state over and over, stamps included. ``BIASED``: a constant wrench is added.
+    ``REFUSES_LIMITS``: keeps and confirms its own limits. ``BACKWARDS``, ``SIDEWAYS``: moves so
+    because it is mounted the wrong way round. ``FAST``: moves `FAST` times as fast as commanded.
+    ``FAULT``: the drives have failed and brake. ``ESTOP``: the button is pressed.
     """
 
     SILENT = "silent"
@@ -72,11 +73,12 @@ class ArmFault(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ArmSettings:
-    """How good the arm and its connection are.
+    """Rate, latency and noise of the arm and its connection.
 
-    ``state_rate`` Hz, a whole number of physics steps apart. ``command_latency``: s from receipt
+    ``state_rate``: Hz, a whole number of physics steps apart. ``command_latency``: s from receipt
     to effect; ``state_latency``: s from capture to receipt. Noise: standard deviations of pose (m,
-    rad), twist (m/s, rad/s) and wrench (N, N·m). ``bias``: N, N, N·m in ``ee``, of `BIASED`.
+    rad), twist (m/s, rad/s) and wrench (N, N·m). ``bias``: N, N, N·m in the frame ``ee``, added by
+    the fault `BIASED`.
     """
 
     state_rate: float = 100.0
@@ -91,7 +93,7 @@ class ArmSettings:
     bias: tuple[float, float, float] = (3.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Refuse rates and figures that no arm has."""
+        """Check rates and figures; ValueError."""
         period = NS_PER_S / self.state_rate if self.state_rate > 0 else math.nan
         if not (self.state_rate >= 100 and abs(period / STEP_NS - round(period / STEP_NS)) < 1e-9):
             raise ValueError(
@@ -117,7 +119,7 @@ class ArmSettings:
 
 @record
 class _Command:
-    """A twist, the instant it takes effect and the instant it dies; ``echo`` names it."""
+    """Twist, the instant it takes effect and the instant it expires; ``echo`` identifies it."""
 
     twist: Twist
     effective: Instant
@@ -128,8 +130,8 @@ class _Command:
 class SimulatedArm:
     """Planar velocity-controlled arm whose wrist pivot carries the finger of ``world``.
 
-    It runs on the physics grid from ``start`` on. It begins with `FACTORY_LIMITS`; ask for others
-    by `request_limits`. ``rng`` is drawn from only where ``settings`` has noise. ``counters``:
+    It runs on the physics grid from ``start`` on, and begins with `FACTORY_LIMITS`; others are set
+    with `request_limits`. ``rng`` is drawn from only if ``settings`` has noise. ``counters``:
     commands by what became of them, and states that nobody fetched.
     """
 
@@ -179,7 +181,7 @@ class SimulatedArm:
 
     @property
     def world(self) -> World:
-        """What the arm moves in."""
+        """World in which the arm moves."""
         return self._world
 
     @property
@@ -194,7 +196,7 @@ class SimulatedArm:
 
     @property
     def mode(self) -> str:
-        """One of the modes of `ArmState`."""
+        """Mode, one of those of `ArmState`."""
         if self._latched is not None:
             return self._latched
         if self._active is not None and self._active.twist != ZERO:
@@ -202,7 +204,7 @@ class SimulatedArm:
         return "stopped" if self._stopped_itself else "ready"
 
     def request_limits(self, limits: ArmLimits) -> ArmLimits:
-        """Ask for ``limits``; returns those now in force, which may be others."""
+        """Request ``limits``. Returns those now in force, which may differ."""
         if ArmFault.REFUSES_LIMITS not in self._faults:
             rated = FACTORY_LIMITS
             self._limits = ArmLimits(
@@ -221,13 +223,13 @@ class SimulatedArm:
         expiry: float = DEFAULT_EXPIRY,
         echo: Echo | None = None,
     ) -> bool:
-        """Move at ``twist`` until ``expiry`` s from ``now``, or the next command.
+        """Move at ``twist`` until ``expiry`` s from ``now``, or until the next command.
 
-        ``echo``: what states say of it once it is in force.
-
-        False where it is refused and counted, and the arm stops: not finite, an expiry that is not
-        finite or not above 0, or an arm that is not enabled. Longer expiries are cut to
+        ``echo``: what states report of the command once it is in force. Longer expiries are cut to
         `MAX_EXPIRY`, speeds to the limits.
+
+        Returns False, counts the command and stops the arm where it refuses: a twist that is not
+        finite, an expiry that is not finite or not above 0, or an arm that is not enabled.
         """
         if not (math.isfinite(twist.vx) and math.isfinite(twist.vy) and math.isfinite(twist.omega)):
             return self._refuse("not_finite")
@@ -268,20 +270,20 @@ class SimulatedArm:
         return received
 
     def inject(self, fault: ArmFault) -> None:
-        """Let ``fault`` befall the arm until `clear`."""
+        """Start ``fault``; it lasts until `clear`."""
         self._faults |= {fault}
         if fault in (ArmFault.FAULT, ArmFault.ESTOP):
-            # An e-stop outranks a fault; whichever came first, the button is what must be seen.
+            # An e-stop outranks a fault: whichever came first, users must see the button.
             self._latched = "estop" if ArmFault.ESTOP in self._faults else "fault"
             self._active = None
             self._pending.clear()
 
     def clear(self, fault: ArmFault) -> None:
-        """Take the cause of ``fault`` away. After a fault or e-stop it stays off until `enable`."""
+        """End the cause of ``fault``. After a fault or e-stop the arm stays off until `enable`."""
         self._faults -= {fault}
 
     def enable(self) -> bool:
-        """An operator's wish to go on; False while the cause of a stop is still there."""
+        """Let the arm go on, as an operator asks. False while the cause of a stop remains."""
         if self._faults & {ArmFault.FAULT, ArmFault.ESTOP}:
             return False
         self._latched = None
@@ -289,7 +291,7 @@ class SimulatedArm:
         return True
 
     def _refuse(self, reason: str) -> bool:
-        """Count a command that is not obeyed, and stop: its sender is out of order."""
+        """Count a command that is refused, and stop: its sender is faulty."""
         self.counters[reason] += 1
         self._active = None
         self._pending.clear()
@@ -297,7 +299,7 @@ class SimulatedArm:
         return False
 
     def _within_limits(self, twist: Twist) -> Twist:
-        """``twist`` slowed down to the limits, its direction kept."""
+        """``twist`` slowed down to the limits, in the same direction."""
         limits = self._limits
         speed = math.hypot(twist.vx, twist.vy)
         scale = min(1.0, limits.v_max / speed) if speed > 0 else 1.0
@@ -308,7 +310,7 @@ class SimulatedArm:
         return Twist(twist.vx * scale, twist.vy * scale, omega)
 
     def _misunderstood(self, twist: Twist) -> Twist:
-        """What an arm that is mounted or scaled wrongly makes of ``twist``."""
+        """Twist that an arm with faults of mounting or scale makes of ``twist``."""
         if ArmFault.BACKWARDS in self._faults:
             twist = Twist(-twist.vx, -twist.vy, -twist.omega)
         if ArmFault.SIDEWAYS in self._faults:
@@ -318,19 +320,19 @@ class SimulatedArm:
         return twist
 
     def _take_commands(self, at: Instant) -> None:
-        """Let commands take effect, and die, that are due at ``at``."""
+        """Start and expire the commands that are due at ``at``."""
         while self._pending and self._pending[0].effective <= at:
             self._active = self._pending.popleft()
             self._echo = self._active.echo
             self._stopped_itself = False
         if self._active is not None and self._active.expires < at + STEP_NS:
-            # A step is whole: stopping before the one in which it dies never holds it too long.
+            # Steps are whole: stopping before the step in which it expires never holds too long.
             self._stopped_itself = True
             self._active = None
             self.counters["expired"] += 1
 
     def _next_change(self, at: Instant, end: Instant) -> Instant:
-        """Grid instant up to ``end`` until which the command in force at ``at`` stays so."""
+        """Last grid instant up to ``end`` until which the command in force at ``at`` stays."""
         if self._pending:
             wait = -((at - self._pending[0].effective) // STEP_NS)
             end = min(end, Instant(at + max(1, wait) * STEP_NS))
@@ -340,7 +342,7 @@ class SimulatedArm:
         return end
 
     def _emit(self, at: Instant) -> None:
-        """Put the state of ``at`` on its way, as the faults leave it."""
+        """Queue the state of ``at`` for sending, as the faults leave it."""
         if ArmFault.SILENT in self._faults:
             return
         received = after(at, self._settings.state_latency)
@@ -357,7 +359,7 @@ class SimulatedArm:
         self._unread.append(state)
 
     def _measure(self, finger: FingerState, captured: Instant, received: Instant) -> ArmState:
-        """The finger's state through the arm's sensors."""
+        """State of the finger as the arm's sensors measure it."""
         twist = finger.twist
         fx, fy, mz = finger.fx, finger.fy, finger.mz
         x, y, heading = finger.x, finger.y, finger.heading

@@ -1,9 +1,9 @@
-"""The cupboard in real time: world and arm, moved on to whatever instant it is. Pure.
+"""Cupboard in real time: the world and the arm, advanced to whatever instant it is. Pure.
 
-The world keeps to the host's clock. When the process was held up, the steps it missed are made up
-for at once, in order, so nothing ever jumps; a controller sees old states with their true, old
-stamps, then new ones. Beyond `MAX_CATCH_UP` the world is suspended for what is left, which is
-longer than any command holds: the arm has come to rest before, so nothing moves meanwhile.
+The world keeps to the host's clock. If the process was held up, the missed steps are made up for at
+once, in order, so nothing ever jumps: a controller sees old states with their true, old stamps,
+then new ones. Beyond `MAX_CATCH_UP` the world is suspended for the rest. That is longer than any
+command holds: the arm has come to rest before, so nothing moves meanwhile.
 """
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ from tactile_core.geometry import TIP_X
 from tactile_core.types import NS_PER_S, ArmLimits, ArmState, Echo, Instant, Twist, seconds_between
 
 COMMAND_EXPIRY: Final = 0.045
-"""s a command holds from its receipt at most, however much of its own expiry is left. With its
-braking, the period of states and the way over the bus, whoever watches the arm sees it at rest
-within 100 ms of the last command; with 50 ms the longest of twenty times was 101."""
+"""Longest time, s, that a command holds from its receipt, however much of its own expiry is left.
+With its braking, the period of states and the way over the bus, an observer sees the arm at rest
+within 100 ms of the last command; with 50 ms the longest of twenty times was 101 ms."""
 
 MAX_CATCH_UP: Final = 0.25
-"""s that are made up for at most: 3 ms of work, and three times what a command may hold."""
+"""Longest time, s, that is made up for: 3 ms of work, and three times what a command may hold."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScheduledFault:
-    """A fault of the arm, in a window of s since the start."""
+    """Fault of the arm, in a window of s since the start."""
 
     kind: ArmFault
     window: Window
 
 
-class NotNow(Exception):  # noqa: N818 - a request that the state of things forbids
-    """The arm's state forbids what was asked; the message says why and what to do."""
+class NotNow(Exception):  # noqa: N818 - a request that the present state forbids
+    """The arm's state forbids what was asked. The message says why and what to do."""
 
 
 class Cupboard:
-    """World and arm from `begin` on. ``counters``: of the arm, and of lateness.
+    """World and arm from `begin` on. ``counters``: those of the arm, and of lateness.
 
-    ``late_steps``: physics steps that were made a step or more after their time. ``suspended_ms``:
-    time in which the world stood still because the process did.
+    ``late_steps``: physics steps made at least a step after their time. ``suspended_ms``: time in
+    which the world stood still because the process did.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Cupboard:
 
     @property
     def world(self) -> World:
-        """The world of the present trial."""
+        """World of the present trial."""
         return self._world
 
     @property
@@ -84,36 +84,36 @@ class Cupboard:
 
     @property
     def counters(self) -> dict[str, int]:
-        """Of all trials together."""
+        """Counters of all trials together."""
         own = self._late | {"suspended_ms": self._suspended // 1_000_000}
         counts = {} if self._arm is None else self._arm.counters
         return {k: v + self._counted.get(k, 0) for k, v in counts.items()} | own
 
     @property
     def distance(self) -> float:
-        """m from the tip to the scene's goal."""
+        """Distance from the tip to the scene's goal, m."""
         finger, (gx, gy) = self._world.finger(), self._world.scene.goal
         x = finger.x + TIP_X * math.cos(finger.heading)
         y = finger.y + TIP_X * math.sin(finger.heading)
         return math.hypot(gx - x, gy - y)
 
     def contacts(self) -> list[Contact]:
-        """What the skin feels now."""
+        """Contacts on the skin now."""
         world = self._world
         return on_skin(world.contacts(), world.scene)
 
     def heading(self) -> float:
-        """Heading of the finger in rad."""
+        """Heading of the finger, rad, counter-clockwise from above."""
         return self._world.finger().heading
 
     def begin(self, now: Instant) -> None:
-        """Let time run from ``now`` on."""
+        """Start time at ``now``."""
         self._start = now
         self._arm = SimulatedArm(self._world, self._settings, now, self._rng)
         self._apply_faults(0.0)
 
     def advance(self, now: Instant) -> list[ArmState]:
-        """Move on to ``now``; the states that were received meanwhile, in order."""
+        """Advance to ``now``. Returns the states received meanwhile, in order."""
         self._apply_faults(seconds_between(self._start, now))
         arm = self.arm
         behind = now - self._suspended - arm.now
@@ -134,10 +134,10 @@ class Cupboard:
         left: float = COMMAND_EXPIRY,
         echo: Echo | None = None,
     ) -> bool:
-        """Obey ``twist`` for ``left`` s more; False when refused.
+        """Obey ``twist`` for ``left`` s more; False if refused. Call it after `advance` to ``now``.
 
-        It came at most ``waited`` s before ``now``, and holds no longer than if it had come that
-        early. Call it after `advance` to ``now``.
+        The command arrived at most ``waited`` s before ``now``, and holds no longer than if it had
+        arrived that early.
         """
         expiry = min(left, COMMAND_EXPIRY - waited)
         if expiry <= 0:
@@ -146,17 +146,17 @@ class Cupboard:
         return self.arm.command(twist, Instant(now - self._suspended), expiry, echo)
 
     def request_limits(self, limits: ArmLimits) -> ArmLimits:
-        """Ask the arm for ``limits``; returns those in force."""
+        """Request ``limits`` of the arm. Returns those in force."""
         return self.arm.request_limits(limits)
 
     def clear(self) -> str:
-        """Enable the arm after a stop; returns its mode. `NotNow` while the cause is there."""
+        """Enable the arm after a stop. Returns its mode; `NotNow` while the cause remains."""
         if not self.arm.enable():
             raise NotNow(f"the cause of {self.arm.mode!r} is still there: wait until it is gone")
         return self.arm.mode
 
     def reset(self, world: World) -> None:
-        """Go on with ``world``, the arm where that has it; limits, faults and stops remain.
+        """Go on with ``world``, the arm at its start; limits, faults and stops remain.
 
         `NotNow` while the arm moves.
         """
@@ -167,7 +167,7 @@ class Cupboard:
             self._counted[name] = self._counted.get(name, 0) + count
         new = SimulatedArm(world, self._settings, old.now, self._rng)
         new.request_limits(old.limits)
-        if old.mode in (ArmFault.FAULT, ArmFault.ESTOP):  # latched, whether or not the cause lasts
+        if old.mode in (ArmFault.FAULT, ArmFault.ESTOP):  # latched even if the cause has gone
             cause = ArmFault(old.mode)
             new.inject(cause)
             new.clear(cause)
@@ -177,7 +177,7 @@ class Cupboard:
         self.resets += 1
 
     def _moved_on(self, simulated: Instant) -> list[ArmState]:
-        """States up to an instant of the simulation, stamped with the host's."""
+        """States up to an instant of the simulation, restamped with the host's time."""
         states = self.arm.advance(simulated)
         if not self._suspended:
             return states
@@ -188,7 +188,7 @@ class Cupboard:
         ]
 
     def _apply_faults(self, seconds: float) -> None:
-        """Let faults begin and end that are due."""
+        """Begin and end the faults that are due."""
         if not self._faults:
             return
         active = frozenset(f for f in self._faults if f.window.covers(seconds))

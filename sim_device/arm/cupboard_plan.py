@@ -1,4 +1,4 @@
-"""From what `simdevice cupboard` is asked for to an arm in a world and boards on its finger."""
+"""Plan ``simdevice cupboard``: an arm in a world, and boards on its finger."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tactile_core.bus.topics import NAME
 
 @dataclass(frozen=True, slots=True)
 class CupboardRequest:
-    """What `simdevice cupboard` was asked for; units as in its help."""
+    """What the user of `simdevice cupboard` asked for; units as in its help."""
 
     scene: str
     seed: int
@@ -34,7 +34,7 @@ class CupboardRequest:
 
 
 def scene_of(request: CupboardRequest) -> Scene:
-    """The scene asked for; SceneError or ValueError where it cannot be had."""
+    """Scene asked for. SceneError or ValueError if it cannot be loaded or made."""
     try:
         return load_scene(request.scene, request.seed)
     except RuntimeError as error:
@@ -42,16 +42,16 @@ def scene_of(request: CupboardRequest) -> Scene:
 
 
 def _another(request: CupboardRequest, seed: int) -> Scene:
-    """Scene ``seed`` of those asked for; SceneError or ValueError where there is none."""
+    """The same kind of scene with ``seed``. SceneError or ValueError if there is none."""
     if request.scene.endswith(".json"):
         raise SceneError(f"{request.scene} is one scene: leave the seed out to begin it again")
     return scene_of(replace(request, seed=seed))
 
 
 def plan_cupboard(request: CupboardRequest) -> list[Planned]:
-    """Arm and boards, all made and nothing open.
+    """Arm and boards, all made and none open.
 
-    ValueError (SceneError is one) for what does not fit together, `EngineMissing`, WorldError.
+    ValueError (SceneError is one) if options do not fit together; `EngineMissing`, WorldError.
     """
     for name in (request.arm, request.world):
         if not NAME.fullmatch(name):
@@ -68,7 +68,7 @@ def plan_cupboard(request: CupboardRequest) -> list[Planned]:
         cupboard, request.arm, request.world, request.bus, partial(_another, request), make_world
     )
     boards: list[Planned] = []
-    if request.boards.ptys or request.boards.slcans:  # an arm without touch is an arm, too
+    if request.boards.ptys or request.boards.slcans:  # without boards the arm runs on its own
         boards = plan_boards(
             replace(request.boards, touched=cupboard.contacts, heading=cupboard.heading)
         )
@@ -85,6 +85,6 @@ def plan_cupboard(request: CupboardRequest) -> list[Planned]:
 
 
 def goal_text(scene: Scene) -> str:
-    """Goal as `reachd --target` takes it, to the tenth of a millimetre."""
+    """Goal as `reachd --target` takes it, to a tenth of a millimetre."""
     x, y = scene.goal
     return f"{x:.4f},{y:.4f}"

@@ -1,4 +1,4 @@
-"""The simulated arm and its cupboard on the bus, as a real arm's driver would be there."""
+"""Simulated arm and cupboard on the bus, with the interface of a real arm's driver."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tactile_core.types import ArmLimits, Echo, Instant, WallClock, after, secon
 
 
 PRESS: Final = 0.2
-"""s that a button is pressed, and drives report a fault, when no time is given."""
+"""Seconds that the button is pressed, or the drives report a fault, when no time is given."""
 
 MOMENTARY = (ArmFault.ESTOP, ArmFault.FAULT)
 """Faults that latch, so that a moment of them is enough."""
@@ -43,10 +43,11 @@ NOISES: Final = {
     "force": ("force_noise", "N"),
     "moment": ("moment_noise", "N·m"),
 }
-"""What may be noisy: field of `ArmSettings`, and unit."""
+"""Noise by name: field of `ArmSettings`, and unit."""
 
 MAX_LATENCY: Final = 0.04
-"""s each way; commands die 0.05 s after their receipt, so later ones would never take effect."""
+"""Longest latency each way, s. Commands expire 0.05 s after their receipt, so a longer one would
+leave them without effect."""
 
 _FAULT = re.compile(r"(?P<kind>[a-z_]+)(?:@(?P<at>\d+(?:\.\d*)?)s(?:\+(?P<for>\d+(?:\.\d*)?)s)?)?")
 
@@ -71,7 +72,7 @@ def _fault(text: str) -> ScheduledFault:
 
 
 def parse_noise(text: str) -> dict[str, Any]:
-    """Fields of `ArmSettings` from such as ``force=0.1,position=1e-4``; ValueError."""
+    """Fields of `ArmSettings` from text such as ``force=0.1,position=1e-4``; ValueError."""
     fields: dict[str, Any] = {}
     units = ", ".join(f"{name} ({unit})" for name, (_, unit) in NOISES.items())
     allowed = f"allowed: NAME=STD, parted by commas; NAME one of {units}"
@@ -88,7 +89,7 @@ def parse_noise(text: str) -> dict[str, Any]:
 
 
 def arm_settings(rate: float, latency: float, noise: str) -> ArmSettings:
-    """Arm with ``latency`` s each way and noise as `parse_noise` takes it; ValueError."""
+    """Settings for ``latency`` s each way and noise as `parse_noise` takes it; ValueError."""
     if not 0 <= latency <= MAX_LATENCY:
         raise ValueError(
             f"arm latency {latency:g} s given; allowed: 0 to {MAX_LATENCY:g} s, as commands die "
@@ -105,13 +106,13 @@ MARKER_PERIOD: Final = 1 / WORLD.rate
 
 
 class ResetRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``seed``: of the next scene, None for the same scene again."""
+    """``seed``: seed of the next scene; None for the same scene again."""
 
     seed: int | None = None
 
 
 def describe_scene(scene: Scene) -> dict[str, object]:
-    """What machines are told of a scene; m and rad in ``cupboard``."""
+    """Scene as services report it; m and rad in the frame ``cupboard``."""
     return {
         "scene": scene.source,
         "parameters": scene.parameters,
@@ -124,17 +125,17 @@ def describe_scene(scene: Scene) -> dict[str, object]:
 
 @dataclass(frozen=True, slots=True)
 class _World:
-    """What the cupboard itself has on the bus."""
+    """What the cupboard itself publishes and serves on the bus."""
 
     markers: Publisher
     services: list[Service]
 
 
 class ArmServer:
-    """A `sim_device.runner.Station`: `service` it every millisecond. BusError from `open`.
+    """`sim_device.runner.Station`: call `service` every millisecond. BusError from `open`.
 
-    ``load``: scene for another seed, SceneError when there is none. ``make_world``: builds it.
-    Services run on zenoh's threads and share the cupboard by a lock.
+    ``load``: scene for another seed, SceneError if there is none. ``make_world``: builds its world.
+    Services run on zenoh's threads; a lock guards the cupboard.
     """
 
     def __init__(
@@ -173,18 +174,18 @@ class ArmServer:
 
     @property
     def finished(self) -> bool:
-        """Never."""
+        """False: the arm runs until it is stopped."""
         return False
 
     @property
     def losses(self) -> dict[str, int]:
-        """Commands not obeyed, by reason, and what came late."""
+        """Commands not obeyed, by reason, and late steps and commands."""
         arm = self.cupboard.counters
         kept = {k: v for k, v in arm.items() if k not in ("accepted", "clamped", "expired")}
         return {**self.port.refused, **kept}
 
     def note(self) -> str:
-        """How the arm is and how far from the goal, for a status line."""
+        """Mode and distance to the goal, for a status line."""
         text = f"{self.cupboard.arm.mode}  {self.cupboard.distance * 100:.1f} cm to goal"
         refused = sum(self.port.refused.values())
         late = self.cupboard.counters["late_steps"] * round(PHYSICS_STEP * 1000)
@@ -192,7 +193,7 @@ class ArmServer:
         return text + (f"  late {late} ms" if late else "")
 
     def fileno(self) -> int:
-        """There is nothing to wait on: commands are fetched every tick."""
+        """−1: there is nothing to wait on, commands are fetched every tick."""
         return -1
 
     def open(self) -> None:
@@ -200,11 +201,11 @@ class ArmServer:
         self.port.open()
 
     def close(self) -> None:
-        """Leave the bus; an arm that was moving has its power cut with the process."""
+        """Leave the bus. An arm that was moving loses power with the process."""
         self.port.close()
 
     def service(self, now: Instant) -> None:
-        """Move the world on, obey the newest command, publish what is due."""
+        """Advance the world, obey the newest command, publish what is due."""
         world = self._on_bus
         if world is None:
             world = self._on_bus = self._begin(now)
@@ -212,7 +213,7 @@ class ArmServer:
             states = self.cupboard.advance(now)
             order = self.port.desk.newest(now)
             if order is not None:
-                # It came since the last look, nobody knows when: taken as having come right then.
+                # It arrived at an unknown moment since the last poll: assume the earliest.
                 waited = seconds_between(self._polled, now)
                 left = seconds_between(now, order.expires)
                 echo = Echo(order.commander, order.sequence, order.decided)
@@ -228,7 +229,7 @@ class ArmServer:
             world.markers.put(self._codec.encode(WORLD, markers), wall_ns)
 
     def _begin(self, now: Instant) -> _World:
-        """Let time run, and be there for others."""
+        """Start time and declare the topics and services."""
         self._polled = self._next_markers = now
         self.cupboard.begin(now)
         self.port.begin()

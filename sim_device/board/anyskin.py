@@ -1,4 +1,4 @@
-"""A simulated AnySkin, ReSkin or eFlesh board: floats without frame, clock or commands."""
+"""Simulated AnySkin, ReSkin or eFlesh board: sends floats; has no frame, clock or commands."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from sim_device.skin.sampler import Contacts, Sampler, SkinOwner
 from sim_device.skin.skin import SkinModel
 from tactile_core.types import Instant, after, seconds_between
 
-# How simulated AnySkin boards write their samples: as people's sketches do, or by a layout.
+# How simulated AnySkin boards write their samples: as published sketches do, or by a layout.
 
 
 Writer = Callable[[FloatSamples, int], bytes]
-"""Bytes of one frame; the number counts frames."""
+"""Makes the bytes of one frame from samples and the frame's number."""
 
 BANNER = (
     b"I2C scan complete.\r\nFound MLX candidates: 0xC 0xD 0xE 0xF 0x10 \r\n"
     b"Init MLX[0] @0xC status=0\r\nStreaming order: 0xC 0xD 0xE 0xF 0x10 \r\n"
 )
-"""What firmware prints before its frames, and (`REMARK`) now and then between them."""
+"""What firmware prints before its frames; `REMARK` is printed now and then between them."""
 
 REMARK = b"loop time 8123 us, errors 0\r\n"
 REMARK_EVERY = 50
 
 
 def writer_of(name: str, chips: int) -> Writer:
-    """Writer by the name of a sketch or by a layout; ValueError names what there is."""
+    """Writer by the name of a sketch or by a layout; ValueError lists the names."""
     if name in SKETCHES:
         return SKETCHES[name]
     if ":" not in name:
@@ -49,7 +49,7 @@ def writer_of(name: str, chips: int) -> Writer:
 
 
 def _rows(samples: FloatSamples) -> list[tuple[float, float, float, float]]:
-    """(t, x, y, z) of each chip."""
+    """(t, x, y, z) of each chip, °C and µT."""
     values = np.column_stack([samples.temperature_c, samples.field_ut]).tolist()
     return [(t, x, y, z) for t, x, y, z in values]
 
@@ -60,7 +60,7 @@ def _anyskin(samples: FloatSamples, number: int) -> bytes:
 
 
 def _anyskin_text(samples: FloatSamples, number: int) -> bytes:
-    """Nothing stands between the last number of a chip and the first of the next."""
+    """As that sketch does: no separator between the last number of a chip and the next chip."""
     del number
     return b"".join(b"%.2f\t%.2f\t%.2f\t%.2f" % row for row in _rows(samples)) + b"\r\n"
 
@@ -102,7 +102,7 @@ def _labels_text(samples: FloatSamples, number: int) -> bytes:
 
 
 def _adafruit_text(samples: FloatSamples, number: int) -> bytes:
-    """A line for each axis, of the first chip alone."""
+    """A line for each axis; only the first chip."""
     del number
     _, x, y, z = _rows(samples)[0]
     return b"X: %.4f uT\r\nY: %.4f uT\r\nZ: %.4f uT\r\n" % (x, y, z)
@@ -117,17 +117,17 @@ SKETCHES: dict[str, Writer] = {
     "labels-text": _labels_text,
     "adafruit-text": _adafruit_text,
 }
-"""``anyskin`` is the usual one; the others follow what public firmware prints."""
+"""Output formats: ``anyskin`` is the usual one; the others follow what public firmware prints."""
 
 
 LOOP_RATE = 115.0
-"""Hz at which the loop of such firmware reads and sends; it does not ask for fresh data."""
+"""Hz at which the loop of such firmware reads and sends, whether or not there is new data."""
 
 CONVERSION_RATE = 100.0
 """Hz at which the chips convert on their own: about one frame in seven is sent twice."""
 
 MAX_BACKLOG = 32
-"""Frames made at once after a pause: what the USB buffer of such a controller holds; more are
+"""Most frames made at once after a pause: what the USB buffer of such a controller holds. More are
 lost."""
 
 _DEAD_RAW = (0.0, 65535.0)
@@ -135,7 +135,7 @@ _DEAD_RAW = (0.0, 65535.0)
 
 
 class AnySkinBoard(SkinOwner):
-    """Streams from its first `tick`, hears nothing, and says nothing of failed chip reads."""
+    """Streams from its first `tick`, takes no commands, and does not report failed chip reads."""
 
     def __init__(
         self,
@@ -148,7 +148,7 @@ class AnySkinBoard(SkinOwner):
         write: Writer | None = None,
         banner: bool = False,
     ) -> None:
-        """``write``: how it writes its samples; ``banner``: it prints remarks as well.
+        """``write``: how it writes its samples; ``banner``: whether it also prints remarks.
 
         ValueError beyond 20 magnetometers, for rates not above 0, for faults of other boards."""
         if skin.geometry.taxels > MAX_MAGNETOMETERS:
@@ -183,7 +183,7 @@ class AnySkinBoard(SkinOwner):
         }
 
     def receive(self, data: bytes, now: Instant) -> None:
-        """Nothing: such firmware does not read its port."""
+        """Ignore the data: such firmware does not read its port."""
 
     def tick(self, now: Instant) -> bytes:
         """Bytes for the host up to ``now``."""
@@ -206,7 +206,7 @@ class AnySkinBoard(SkinOwner):
         return b"".join(self._wire.pass_on(frames, seconds_between(start, now)))
 
     def _frame(self, start: Instant, seconds: float) -> bytes:
-        """What the loop of a board powered at ``start`` sends ``seconds`` later."""
+        """Frame that a board powered at ``start`` sends ``seconds`` s later."""
         converted = int(seconds / self._conversion) + 1
         if self._reading is None or converted > self._conversions:
             self._conversions = converted

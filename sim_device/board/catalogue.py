@@ -1,4 +1,4 @@
-"""The boards that can be simulated by name, the same board for the same seed every time."""
+"""Boards that can be simulated, by name. The same seed always gives the same board."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tactile_core.geometry import (
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """How to make a skin of one kind."""
+    """Geometry and parameters from which a skin is made."""
 
     geometry: Callable[[], SkinGeometry]
     parameters: Callable[[], SkinParameters]
@@ -52,7 +52,8 @@ def build_skin(model: str, seed: int, arrays: tuple[int, ...] | None = None) -> 
 
 
 def controller(model: str, arrays: tuple[int, ...]) -> SkinGeometry:
-    """AnySkin boards of one controller, on different sides of the finger where all have five."""
+    """Geometry of AnySkin boards on one controller. Boards of five sit on different sides of the
+    finger."""
     if model != "anyskin":
         raise ValueError(f"the arrays of a {model} are what they are; they are for anyskin boards")
     if set(arrays) == {ANYSKIN_CHIPS} and len(arrays) <= len(MOUNTS):
@@ -62,7 +63,7 @@ def controller(model: str, arrays: tuple[int, ...]) -> SkinGeometry:
 
 
 def identity(model: str, seed: int) -> Identity:
-    """Who that board says it is; the unique id follows from model and seed."""
+    """Identity that the board reports; the unique id follows from model and seed."""
     digest = hashlib.sha256(f"{model}/{seed}".encode()).digest()
     return Identity(digest[:8], model)
 
@@ -71,6 +72,6 @@ def identity(model: str, seed: int) -> Identity:
 def factory_calibration(
     model: str, seed: int, arrays: tuple[int, ...] | None = None
 ) -> BoardCalibration:
-    """Calibration that belongs to that very board, as its maker would supply it."""
+    """Calibration of exactly that board, as its maker would supply it."""
     skin = build_skin(model, seed, arrays)
     return nominal_calibration(skin, identity(model, seed).unique_id.hex())

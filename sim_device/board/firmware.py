@@ -1,4 +1,4 @@
-"""The program on a board's microcontroller: commands in, messages out, no medium."""
+"""Program on a board's microcontroller: commands in, messages out, whatever the medium."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from sim_device.skin.skin import SkinModel
 from tactile_core.geometry import ArrayGeometry
 from tactile_core.types import Instant, after, seconds_between
 
-# The oscillator of a board: ticks that are never quite what the descriptor says.
+# The oscillator of a board: its ticks never quite match what the descriptor says.
 
 
 TICK_MASK = 0xFFFF_FFFF
@@ -59,10 +59,10 @@ TICK_MASK = 0xFFFF_FFFF
 
 @dataclass(frozen=True, slots=True)
 class ClockParameters:
-    """Figures of a board's oscillator."""
+    """Properties of a board's oscillator."""
 
     tick_hz: int = 1_000_000
-    """Nominal; what the descriptor says."""
+    """Nominal frequency, Hz: what the descriptor says."""
     error: float = 30e-6
     """Relative error at 25 °C; a crystal has up to ±50 ppm, an RC oscillator 1 %."""
     error_per_k: float = -0.5e-6
@@ -81,7 +81,7 @@ class BoardClock:
         self._hz = parameters.tick_hz * (1 + parameters.error)
 
     def warm(self, now: Instant, temperature_c: float) -> None:
-        """From ``now`` on run at the frequency of ``temperature_c``."""
+        """Run at the frequency of ``temperature_c`` from ``now`` on."""
         p = self.parameters
         self._ticks = self.ticks(now)
         self._instant = now
@@ -106,14 +106,14 @@ class BoardClock:
 ALL_ARRAYS = 255
 
 MIN_RATE_MHZ = 100
-"""mHz; slower than a sample in ten seconds is no stream."""
+"""Lowest rate, mHz: less than a sample in ten seconds is not a stream."""
 
 
 class Registers:
     """Present settings of the chips behind ``skin``; `restore` brings back those of a boot."""
 
     def __init__(self, skin: SkinModel, rate: float) -> None:
-        """``rate``: Hz after a boot; ValueError when the chips do not manage it."""
+        """``rate``: Hz after a boot; ValueError if the chips cannot reach it."""
         self._skin = skin
         top = _max_rate_mhz([skin.parameters.chip.setting])
         if not MIN_RATE_MHZ <= rate * 1000 <= top:
@@ -122,7 +122,7 @@ class Registers:
         self.restore()
 
     def restore(self) -> None:
-        """Settings as after a boot."""
+        """Set everything as after a boot."""
         skin = self._skin
         self.rate_mhz = self._boot_rate_mhz
         self._settings = [skin.parameters.chip.setting] * len(skin.geometry.arrays)
@@ -130,23 +130,24 @@ class Registers:
 
     @property
     def max_rate_mhz(self) -> int:
-        """mHz that the slowest array manages."""
+        """Highest rate of the slowest array, mHz."""
         return _max_rate_mhz(self._settings)
 
     @property
     def conversion_time(self) -> float:
-        """s of one conversion of the slowest array."""
+        """Time of one conversion of the slowest array, s."""
         return max(s.conversion_time for s in self._settings)
 
     def set_rate(self, rate_mhz: int) -> AckResult:
-        """Refused outside `MIN_RATE_MHZ` to `max_rate_mhz`."""
+        """Set the rate, mHz; refused outside `MIN_RATE_MHZ` to `max_rate_mhz`."""
         if not MIN_RATE_MHZ <= rate_mhz <= self.max_rate_mhz:
             return AckResult.BAD_ARGUMENT
         self.rate_mhz = rate_mhz
         return AckResult.OK
 
     def set_gain(self, command: SetGain) -> AckResult:
-        """Refused for codes that the chip lacks and for filters too slow for the present rate."""
+        """Set gain and filter; refused for codes that the chip lacks and for filters too slow for
+        the present rate."""
         slices = self._skin.geometry.slices
         if command.array == ALL_ARRAYS:
             chosen = range(len(slices))
@@ -210,29 +211,29 @@ DEFAULT_RATE = 100.0
 """Hz after a boot."""
 
 BOOT_TIME = 0.15
-"""s from reset to the first word: clocks, then the chips' own start-up (assumed)."""
+"""Seconds from reset to the first message: clocks, then the chips' own start-up (assumed)."""
 
 REBOOT_DELAY = 0.02
-"""s between the answer to `Reboot` and the reset, so that the answer gets out."""
+"""Seconds between the answer to `Reboot` and the reset, so that the answer gets out."""
 
 STATUS_PERIOD = 1.0
-"""s between `Status` messages, sent from boot on whether streaming or not."""
+"""Seconds between `Status` messages, sent from boot on whether streaming or not."""
 
 MAX_QUEUED_CYCLES = 8
-"""Cycles of samples that wait to be sent: 80 ms at 100 Hz and about 5 KiB for 80 taxels, what a
-small microcontroller can spare. The oldest are dropped and counted as overruns."""
+"""Most cycles of samples that wait to be sent: 80 ms at 100 Hz and about 5 KiB for 80 taxels, what
+a small microcontroller can spare. The oldest are dropped and counted as overruns."""
 
 MAX_QUEUED_REPLIES = 32
-"""Replies, status and log lines that wait; more than a host may have outstanding."""
+"""Most replies, status and log lines that wait; more than a host may have outstanding."""
 
 LOG_INFO = 20
 
 HOST_BIT = 0x80
-"""Set in the type of everything that a host sends; other unknown types are of newer boards."""
+"""Bit set in the type of everything that a host sends. Other unknown types are newer boards'."""
 
 
 class ResetCause(IntEnum):
-    """``reset_cause`` of a `Status`."""
+    """Values of ``reset_cause`` in a `Status`."""
 
     POWER_ON = 0
     COMMAND = 1
@@ -242,7 +243,7 @@ class ResetCause(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who a board says it is. ``unique_id``: 8 bytes."""
+    """Identity that a board reports. ``unique_id``: 8 bytes."""
 
     unique_id: bytes
     model: str
@@ -251,7 +252,7 @@ class Identity:
 
 @dataclass(slots=True)
 class _Run:
-    """Everything that a reset forgets."""
+    """All state that a reset clears."""
 
     clock: BoardClock
     cause: ResetCause
@@ -270,8 +271,8 @@ class _Run:
 class Controller:
     """Boots at the first instant it is given and streams nothing until `Start`.
 
-    A host that falls silent changes nothing: the board goes on streaming, for it cannot tell a
-    busy host from a dead one, and whoever comes back must not find it stopped.
+    If the host falls silent, the board goes on streaming: it cannot tell a busy host from a dead
+    one, and a host that comes back must not find it stopped.
     """
 
     def __init__(
@@ -305,14 +306,14 @@ class Controller:
         if now < run.ready:
             return
         if len(run.replies) == MAX_QUEUED_REPLIES:
-            # No room for an answer: not obeyed either, so that the host sends it again.
+            # No room for an answer: the command is not obeyed either, so the host repeats it.
             self.count_rejected(1)
             return
         match message:
             case Identify():
                 self._reply(self.descriptor())
             case ClockPoll(token):
-                # The second stamp is put on when the reply leaves.
+                # The second stamp is set when the reply leaves.
                 self._reply(ClockReply(token, run.clock.wire(now), 0))
             case Start(request):
                 if not run.streaming:
@@ -334,7 +335,7 @@ class Controller:
                 run.reboot_at = after(now, REBOOT_DELAY)
                 self._answer(message, request, AckResult.OK)
             case _:
-                # What only boards send, from another board on the bus or echoed by the line.
+                # Only boards send these: another board on the bus, or an echo of the line.
                 self.count_rejected(1)
 
     def refuse(self, command: int, request: int, now: Instant) -> None:
@@ -345,7 +346,7 @@ class Controller:
             self._reply(Ack(command, request, AckResult.UNKNOWN_COMMAND))
 
     def count_rejected(self, frames: int) -> None:
-        """Note input that its decoder refused."""
+        """Count input that the decoder refused."""
         self._note("rx_errors", frames)
 
     # Outputs
@@ -376,7 +377,7 @@ class Controller:
         self._now = now
 
     def take(self, now: Instant) -> list[Message]:
-        """Next messages to send, replies before samples; empty when there is nothing to send."""
+        """Next messages to send, replies before samples; empty if there is nothing to send."""
         run = self._run
         if now < run.ready:
             return []
@@ -388,7 +389,7 @@ class Controller:
         return list(run.cycles.popleft()) if run.cycles else []
 
     def descriptor(self) -> Descriptor:
-        """What the board says of itself with its present settings."""
+        """Descriptor of the board with its present settings."""
         return Descriptor(
             PROTOCOL_MAJOR,
             PROTOCOL_MINOR,
@@ -402,7 +403,7 @@ class Controller:
 
     @property
     def counters(self) -> dict[str, int]:
-        """What the board did since power-on, resets included."""
+        """Counts by name since power-on, across resets."""
         names = ("cycles", "overruns", "chip_errors", "rx_errors", "replies_dropped", "reset")
         return {**{name: self._total[name] for name in names}, **self.sampler.fault_counters}
 
@@ -416,7 +417,7 @@ class Controller:
         return _Run(clock, cause, now, ready, after(ready, STATUS_PERIOD))
 
     def _boot(self, now: Instant, cause: ResetCause) -> _Run:
-        """Start again with nothing remembered but the skin, which does not know of resets."""
+        """Start again with nothing kept but the skin, which a reset does not touch."""
         self.registers.restore()
         run = self._fresh(now, cause)
         text = f"{self.identity.model} {self.identity.firmware} up, reset: {cause.name.lower()}"
@@ -493,7 +494,7 @@ class Controller:
         )
 
     def _restart_conversion(self, result: AckResult, now: Instant) -> None:
-        """After a change of settings: what was measured with the old ones is given up."""
+        """After a change of settings, drop what was measured with the old ones."""
         if result is not AckResult.OK:
             return
         run = self._run
@@ -515,7 +516,8 @@ class Controller:
         self._reply(Ack(message_type(command), request, result))
 
 
-# Simulated boards on a serial line and on a CAN bus: what the host sends in, `tick` out.
+# Simulated boards on a serial line and on a CAN bus: `receive` takes what the host sends, `tick`
+# gives what the board sends.
 #
 # Boards own no clock, port or thread. Whoever drives one calls `receive` with what arrived and
 # `tick` at least every few milliseconds, with instants that never go back. Not calling `tick` is
@@ -523,11 +525,11 @@ class Controller:
 
 
 BURST_SECONDS = 0.05
-"""s worth of a limited line that may go out at once after it was idle."""
+"""Seconds' worth of a limited line that may go out at once after it was idle."""
 
 
 class BoardOptions(TypedDict, total=False):
-    """What may be said of any board when it is made; all may be left out."""
+    """Options of any board when it is made; all may be left out."""
 
     environment: Environment
     contacts: Contacts
@@ -574,7 +576,7 @@ class SimulatedBoard(SkinOwner, ABC):
 
     @property
     def descriptor(self) -> Descriptor:
-        """What the board says of itself now."""
+        """Descriptor of the board with its present settings."""
         return self.controller.descriptor()
 
     @property
@@ -593,7 +595,7 @@ class SimulatedBoard(SkinOwner, ABC):
         for command, request in decoder.take_unknown():
             self.controller.refuse(command, request, now)
         counters = decoder.counters
-        # An idle line, and what others say on the bus, is no frame of the host's.
+        # An idle line, and what others send on the bus, are not frames from the host.
         passed = (
             counters[ACCEPTED] + counters.get(Reject.EMPTY, 0) + counters.get(Reject.FOREIGN, 0)
         )
@@ -629,7 +631,7 @@ class SerialBoard(SimulatedBoard):
 
     @property
     def counters(self) -> dict[str, int]:
-        """As of every board; frames are counted whole."""
+        """As for every board; frames are counted whole."""
         return self._counters(self._wire.counters)
 
     def receive(self, data: bytes, now: Instant) -> None:
@@ -674,11 +676,11 @@ class CanBoard(SimulatedBoard):
 
     @property
     def counters(self) -> dict[str, int]:
-        """As of every board; CAN frames are counted, not transfers."""
+        """As for every board; CAN frames are counted, not transfers."""
         return self._counters(self._wire.counters)
 
     def receive(self, frames: Iterable[CanFrame], now: Instant) -> None:
-        """Take frames from the bus; those for and of other boards are passed over."""
+        """Take frames from the bus; those to and from other boards are ignored."""
         mine = [f for f in frames if f.error or f.identifier & 0x7F in (self.node, BROADCAST)]
         received = self._decoder.feed(mine)
         self.controller.advance(now)

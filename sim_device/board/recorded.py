@@ -1,4 +1,4 @@
-"""Recorded fields of a real board, sent again as the AnySkin frames that it once sent."""
+"""Send the recorded fields of a real board again, as AnySkin frames."""
 
 from __future__ import annotations
 
@@ -23,49 +23,49 @@ from sim_device.skin.damage import BrokenTaxels
 from tactile_core.types import Instant, after, seconds_between
 
 TEMPERATURE_C = 25.0
-"""°C put into every frame: the recordings hold none."""
+"""°C put into every frame: recordings hold no temperature."""
 
 BAIT = b"\r\n"
-"""Sent before the start; once it has gone, somebody reads. A real board's first bytes are the end
-of a frame as well, for a port is opened in the midst of one."""
+"""Probe bytes sent before the start: once they are gone, a host reads. A real host, too, opens a
+port in the middle of a frame, so the first bytes it gets are the end of one."""
 
 BURST = 12
-"""Frames sent at once at high speed: of the longest, they just fit into a terminal."""
+"""Most frames sent at once at high speed: the longest just fit into a terminal."""
 
 MAX_ROWS = 10_000_000
-"""A day at 100 Hz. A longer file is surely none of ours, and would not fit in memory."""
+"""A day at 100 Hz. A longer file is surely not a recording, and would not fit in memory."""
 
 FIXED_FORM = "time in s, then x, y, z in µT for each of 1 to 20 magnetometers"
 
 
 class RecordingError(ValueError):
-    """A file that is no recording: file, line, what was given, what is allowed."""
+    """Not a recording; the message gives file, line, what was found and what is allowed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """``seconds``: (n,) from the first row. ``field_ut``: (n, m, 3) float32 µT in chip axes."""
+    """``seconds``: (n,) s from the first row. ``field_ut``: (n, m, 3) float32 µT in chip axes."""
 
     seconds: NDArray[np.float64]
     field_ut: NDArray[np.float32]
 
     @property
     def magnetometers(self) -> int:
-        """Magnetometers of the recorded board."""
+        """Number of magnetometers of the recorded board."""
         return int(self.field_ut.shape[1])
 
     @property
     def period(self) -> float:
-        """Median time between rows in s, those with the same time left out; 0.1 for one row."""
+        """Median time between rows, s, without rows of equal time; 0.1 for one row."""
         steps = np.diff(self.seconds)
         steps = steps[steps > 0]
         return float(np.median(steps)) if len(steps) else 0.1
 
 
 def load(path: str | Path) -> Recording:
-    """Read a CSV file, plain or ``.gz`` (`FIXED_FORM`; a line of names at the top is skipped).
+    """Read a CSV file, plain or ``.gz``, in the form `FIXED_FORM`; a heading is skipped.
 
-    RecordingError for anything else; OSError when the file cannot be read.
+    RecordingError for anything else; OSError if the file cannot be read.
     """
     path = Path(path)
     rows: list[list[float]] = []
@@ -108,14 +108,14 @@ def load(path: str | Path) -> Recording:
 
 def _open_text(path: Path) -> io.TextIOWrapper:
     with path.open("rb") as file:
-        packed = file.read(2) == b"\x1f\x8b"  # gzip, whatever the file is called
+        packed = file.read(2) == b"\x1f\x8b"  # gzip, whatever the file's name
     if packed:
         return io.TextIOWrapper(gzip.open(path, "rb"), encoding="utf-8", newline="")
     return path.open("r", encoding="utf-8", newline="")
 
 
 def _is_heading(cells: list[str]) -> bool:
-    """Whether no cell at all is a number: then they are names."""
+    """Whether none of the cells is a number: then they are names of columns."""
     for cell in cells:
         try:
             float(cell)
@@ -149,11 +149,11 @@ def _number(cell: str, column: int, where: str) -> float:
 
 
 class ReplayBoard:
-    """A board that sends a recording. It sends `BAIT` until `start`, and takes no commands.
+    """Board that sends a recording. It sends `BAIT` until `start`, and takes no commands.
 
-    ``speed``: times real time. ``loop``: begin again after the last row, one period later.
-    ``plan``: what goes wrong with the chips, all of one array ``skin``, and on the wire, by the
-    time of the recording. ValueError for faults of other boards.
+    ``speed``: times real time. ``loop``: begin again one period after the last row. ``plan``:
+    faults of the chips, which form one array ``skin``, and of the wire, in the recording's time.
+    ValueError for faults of other boards.
     """
 
     def __init__(
@@ -189,12 +189,12 @@ class ReplayBoard:
 
     @property
     def started(self) -> bool:
-        """Whether the first frame is due or gone."""
+        """Whether `start` has been called."""
         return self._start is not None
 
     @property
     def finished(self) -> bool:
-        """Whether the last frame has gone and none will come."""
+        """Whether the last frame has been sent and no more will follow."""
         return self._row >= len(self) and not self._loop
 
     def start(self, now: Instant) -> None:
@@ -207,7 +207,7 @@ class ReplayBoard:
             self._start = after(self._start, seconds)
 
     def receive(self, data: bytes, now: Instant) -> None:
-        """Ignored: such boards take no commands."""
+        """Ignore the data: such boards take no commands."""
 
     def tick(self, now: Instant) -> bytes:
         """Frames due by ``now``, at most `BURST`; the others come with the next call."""
@@ -240,9 +240,9 @@ class ReplayBoard:
     def _spoilt(
         self, field: NDArray[np.float32], seconds: float
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Field and temperatures as broken chips give them.
+        """Field, µT, and temperatures, °C, as broken chips give them.
 
-        All are made from counts, so that what is sent twice is the same to the bit.
+        Both are made from counts, so that repeated values are the same bit for bit.
         """
         counts = np.clip(np.rint(field / self._lsb), -COUNT_MAX - 1, COUNT_MAX).astype(np.int16)
         reading = Reading(counts, self._status, self._temperature.astype(np.float64))
@@ -264,13 +264,13 @@ _SCALES_UT = tuple(
         (0.300, 0.484), (0.250, 0.403), (0.200, 0.323), (0.150, 0.242),
     )
 )  # fmt: skip
-"""µT a count of x and y, and of z, of an MLX90393 at each resolution and gain (datasheet)."""
+"""µT per count of x and y, and of z, of an MLX90393 at each resolution and gain (datasheet)."""
 _LOOKED_AT = 64
-"""Rows from which the scale of a recording is told."""
+"""Rows from which the scale of a recording is found."""
 
 
 def _scale(field_ut: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(3,) µT a count that all of (n, m, 3) are multiples of; the finest where there is none."""
+    """(3,) µT per count of which all of (n, m, 3) are multiples; the finest if none fits."""
     rows = field_ut[:_LOOKED_AT].astype(np.float64)
     for xy, z in _SCALES_UT:
         scale = np.array([xy, xy, z])

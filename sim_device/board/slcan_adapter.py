@@ -1,7 +1,7 @@
-"""A USB-CAN adapter that speaks slcan, as pure state: host bytes in, frames and answers out.
+"""USB-CAN adapter that speaks slcan, as pure state: host bytes in, frames and answers out.
 
-Commands and answers as in the LAWICEL CAN232/CANUSB manual, FD frames as the CANable 2.0 firmware
-adds them, state and error lines (``sb128256``, ``e1a``) as the Linux slcan driver reads them.
+Commands and answers follow the LAWICEL CAN232/CANUSB manual, FD frames the CANable 2.0 firmware,
+and state and error lines (``sb128256``, ``e1a``) are those that the Linux slcan driver reads.
 """
 
 from __future__ import annotations
@@ -32,26 +32,26 @@ VERSION = b"V1013"
 SERIAL = b"NA123"
 
 SJA1000_CLOCK = 8_000_000
-"""Hz behind the prescaler that the two registers of command ``s`` divide."""
+"""Hz behind the prescaler; the two registers of command ``s`` divide it."""
 
 TIMESTAMP_WRAP_MS = 60_000
 
 MAX_HELD = 1000
-"""Late answers that wait; a host that sends commands faster gets the others at once."""
+"""Most late answers that wait; further answers are given at once."""
 
 MAX_OUTPUT = 65_536
-"""Bytes kept for a host that does not read: half a second of a full bus."""
+"""Most bytes kept for a host that does not read: half a second of a full bus."""
 
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """What differs from one adapter's firmware to the next.
+    """What differs between the firmware of adapters.
 
-    ``answers``: whether it answers commands. ``end``: of every line. ``late_s``: s until an answer.
-    ``letter``: of frames with 29-bit identifiers. ``lower``: hex digits in lower case. ``stamps``:
-    time stamps on although nobody asked. ``number``: whether it knows the command ``N``.
-    ``reports``: ``#`` for answers, ``E`` and ``L`` lines once a second. ``flags``: added to the
-    answer to ``F``.
+    ``answers``: whether it answers commands. ``end``: end of every line. ``late_s``: s until an
+    answer. ``letter``: letter of frames with 29-bit identifiers. ``lower``: hex digits in lower
+    case. ``stamps``: time stamps on without being asked. ``number``: whether it knows the command
+    ``N``. ``reports``: ``#`` for answers, ``E`` and ``L`` lines once a second. ``flags``: added to
+    the answer to ``F``.
     """
 
     answers: bool = True
@@ -78,10 +78,10 @@ DIALECTS = {
     "overrun": Dialect(flags=0x08),
     "buserror": Dialect(flags=0x80),
 }
-"""Adapters by name: the LAWICEL manual's, and what is sold."""
+"""Adapters by name: the one in the LAWICEL manual, and what is sold."""
 
 REPORT_EVERY = 1.0
-"""s between ``E`` and ``L`` lines of firmware that reports by itself."""
+"""Seconds between the ``E`` and ``L`` lines of firmware that reports by itself."""
 
 _RATE_OF = {command: rate for rate, command in BITRATES.items()}
 _DATA_RATE_OF = {command: rate for rate, command in DATA_BITRATES.items()}
@@ -103,8 +103,8 @@ _STATE_FLAGS = {
 class SlcanAdapter:
     """One adapter. ``fd``: it takes FD frames. ``tells_state``: it sends ``s`` lines by itself.
 
-    ``bitrate`` and ``data_bitrate`` in bit/s as the host set them. Nothing a host sends raises.
-    ``dialect``: a name from `DIALECTS`; ValueError for another.
+    ``dialect``: a name from `DIALECTS`; ValueError for another. ``bitrate`` and ``data_bitrate``
+    are in bit/s, as the host set them. Nothing that a host sends raises.
     """
 
     def __init__(self, fd: bool = True, tells_state: bool = True, dialect: str = "lawicel") -> None:
@@ -129,16 +129,16 @@ class SlcanAdapter:
 
     @property
     def state(self) -> BusState:
-        """Fault confinement of the adapter's controller."""
+        """Error state of the adapter's CAN controller."""
         return self._state
 
     @property
     def losses(self) -> dict[str, int]:
-        """Frames and answers that went nowhere, by reason."""
+        """Frames and answers that were dropped, by reason."""
         return dict(self._counts)
 
     def feed(self, data: bytes) -> list[CanFrame]:
-        """Carry out the host's bytes, any chunking; frames that go onto the bus, in order."""
+        """Carry out the host's bytes, in any chunking. Returns frames for the bus, in order."""
         frames: list[CanFrame] = []
         for piece in re.split(rb"(\r)", data):
             if piece != CR:
@@ -157,7 +157,7 @@ class SlcanAdapter:
         return frames
 
     def deliver(self, frames: tuple[CanFrame, ...], now: Instant) -> None:
-        """Frames from the bus, for the host; lost while the channel is closed or in bus-off."""
+        """Pass frames from the bus to the host; lost while the channel is closed or in bus-off."""
         if not self.is_open or self._state is BusState.BUS_OFF:
             self._counts["rx_channel_closed" if not self.is_open else "rx_bus_off"] += len(frames)
             return
@@ -173,15 +173,15 @@ class SlcanAdapter:
     def set_bus_off(self, fault: bool) -> None:
         """Begin or end a fault that keeps the controller in bus-off.
 
-        As with a real one, bus-off outlasts the fault until the host closes the channel and opens
-        it again.
+        As with a real one, bus-off outlasts the fault until the host closes and reopens the
+        channel.
         """
         self._fault = fault
         if fault and self.is_open:
             self._enter(BusState.BUS_OFF)
 
     def set_state(self, state: BusState) -> None:
-        """Enter error-warning, error-passive or active, as error counters would have it."""
+        """Enter error-warning, error-passive or active, as error counters would cause."""
         if self.is_open and self._state is not BusState.BUS_OFF:
             self._enter(state)
 
@@ -197,7 +197,7 @@ class SlcanAdapter:
         return taken
 
     def pass_time(self, now: Instant) -> None:
-        """Give the answers that are due, and report by itself where the firmware does."""
+        """Give the answers that are due; send reports if the firmware does so by itself."""
         late = after(now, self.dialect.late_s)
         self._held = deque((late if due is None else due, answer) for due, answer in self._held)
         while self._held and (self._held[0][0] or now) <= now:
@@ -210,7 +210,7 @@ class SlcanAdapter:
             self._put(b"E%d0000000\r" % state + b"L34\r")
 
     def _answer(self, data: bytes) -> None:
-        """Answer to a command, as the dialect has it."""
+        """Answer a command in the way of the dialect."""
         dialect = self.dialect
         if not data or not dialect.answers:
             return
@@ -236,7 +236,7 @@ class SlcanAdapter:
                 self._put(_STATE_LINES[state] + CR)
 
     def _carry_out(self, line: bytes, frames: list[CanFrame]) -> bytes:
-        """Answer to one command."""
+        """Carry out one command and return the answer."""
         letter = line[:1]
         if not line:
             return CR

@@ -1,4 +1,4 @@
-"""The line from a board to its host with the faults of a plan: serial bytes and CAN frames."""
+"""Line from a board to its host, with the faults of a plan: serial bytes and CAN frames."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from tactile_core.types import NS_PER_S, Instant
 
 
 MAX_QUEUED = 512
-"""Frames that wait for the bus: some five samples of a whole finger. What comes on top is dropped,
-as a board's transmit queue does it."""
+"""Most frames that wait for the bus: about five samples of a whole finger. More are dropped, as a
+board's transmit queue does."""
 
 
 def frame_seconds(frame: CanFrame, bitrate: int, data_bitrate: int) -> float:
-    """Longest time of a frame on the wire in s, stuff bits and interframe space included.
+    """Longest time of a frame on the wire, s, with stuff bits and interframe space; rates in bit/s.
 
     Classic, 29-bit: 54 + 8n stuffable bits and 13 more (Davis et al., Real-Time Systems 35, 2007,
     eq. 1). FD: 36 + 9 stuff + 13 bits at ``bitrate``; the rest, with fixed stuff bits in the CRC,
@@ -47,10 +47,7 @@ def frame_seconds(frame: CanFrame, bitrate: int, data_bitrate: int) -> float:
 
 
 class TimedBus:
-    """Frames wait here for their turn: lowest identifier first, then first come.
-
-    ``load``: share of time the bus was busy since it was last asked for.
-    """
+    """Queue of frames for a bus: lowest identifier first, then first come."""
 
     def __init__(self) -> None:
         self._heap: list[tuple[int, int, CanFrame]] = []
@@ -92,7 +89,7 @@ class TimedBus:
         return len(self._heap)
 
     def load(self, now: Instant) -> float:
-        """Share of time since the last call that the bus was busy, 0 to 1."""
+        """Share of the time since the last call that the bus was busy, 0 to 1."""
         span = now - self._since
         busy, self._busy_ns, self._since = self._busy_ns, 0, now
         return min(1.0, busy / span) if span > 0 else 0.0
@@ -101,14 +98,14 @@ class TimedBus:
 Unit = TypeVar("Unit", bytes, CanFrame)
 
 MAX_DELAYED = 4096
-"""Frames held up by delays at once, about 0.5 s of a full CAN bus; the oldest are lost."""
+"""Most frames held up by delays at once, about 0.5 s of a full CAN bus; the oldest are lost."""
 
 
 class _Wire(ABC, Generic[Unit]):
     """Frames in, frames out, changed by the faults of ``plan``.
 
-    ``counters``: every fault by name, and of the frames ``sent`` = ``intact`` + ``damaged`` +
-    ``lost`` + ``silenced`` + ``held`` - ``duplicated``; ``held`` are those that wait inside.
+    ``counters``: every fault by name. For the frames, ``sent`` = ``intact`` + ``damaged`` +
+    ``lost`` + ``silenced`` + ``held`` - ``duplicated``, where ``held`` are those still inside.
     """
 
     def __init__(self, plan: FaultPlan) -> None:
@@ -126,7 +123,7 @@ class _Wire(ABC, Generic[Unit]):
         return {**{name: self._count[name] for name in COUNTS}, "held": held}
 
     def pass_on(self, frames: Iterable[Unit], seconds: float) -> list[Unit]:
-        """What reaches the host at ``seconds`` after power-on when ``frames`` are sent."""
+        """Frames that reach the host ``seconds`` s after power-on when ``frames`` are sent."""
         for frame in frames:
             self._count["sent"] += 1
             self._send(frame, seconds)
@@ -150,8 +147,8 @@ class _Wire(ABC, Generic[Unit]):
             self._waiting = None
             if why == "splice":
                 count["spliced"] += 1
-                # Two frames went in and one comes out; the other counts as damaged here. The one
-                # may still be whole: frames that begin alike, cut where they are alike.
+                # Two frames go in and one comes out; one counts as damaged here. The other may
+                # still arrive whole, where both begin alike and are cut within that part.
                 count["damaged"] += 1
                 self._queue(self._splice(first, frame), seconds, (first, frame))
             else:
@@ -176,7 +173,7 @@ class _Wire(ABC, Generic[Unit]):
         if self._chance(self._plan.delay):
             self._count["delayed"] += 1
             due += self._plan.delay_s
-        # A held-up frame holds up those behind it: a line keeps the order.
+        # A frame that is held up also holds up those behind it: a line keeps the order.
         self._release = max(self._release, due)
         if len(self._delayed) == MAX_DELAYED:
             self._delayed.popleft()
@@ -204,11 +201,11 @@ class _Wire(ABC, Generic[Unit]):
 
     @abstractmethod
     def _splice(self, first: Unit, second: Unit) -> Unit:
-        """Head of ``first`` run into the tail of ``second``."""
+        """Head of ``first`` joined to the tail of ``second``."""
 
     @abstractmethod
     def _arrives(self, frame: Unit, originals: tuple[Unit, ...]) -> bool:
-        """Whether the host can make out one of the ``originals`` in what comes, ``frame``."""
+        """Whether the host can make out one of the ``originals`` in ``frame``, which arrives."""
 
 
 COUNTS = (
@@ -229,10 +226,10 @@ COUNTS = (
 
 
 class SerialWire(_Wire[bytes]):
-    """Frames that each end in a zero byte (or, for float boards, of fixed size)."""
+    """Frames that each end in a zero byte (for float boards: of fixed size)."""
 
     def __init__(self, plan: FaultPlan, delimited: bool = True) -> None:
-        """``delimited``: frames end in a zero, so one that lost it spoils the next as well."""
+        """``delimited``: frames end in a zero, so a frame that lost it damages the next too."""
         if plan.busoff:
             raise ValueError("busoff is a fault of CAN boards; this board is on a serial line")
         super().__init__(plan)
@@ -266,14 +263,14 @@ class SerialWire(_Wire[bytes]):
         if not self._delimited:
             return frame in originals
         segments = frame.split(b"\0")
-        # The first runs on from what came before without its zero; the last has no zero yet.
+        # The first continues what came before without its zero; the last has no zero yet.
         whole = segments[self._unfinished : -1]
         self._unfinished = bool(segments[-1]) or (self._unfinished and len(segments) == 1)
         return any(original[:-1] in whole for original in originals)
 
 
 class CanWire(_Wire[CanFrame]):
-    """CAN frames. The bus has its own CRC, so flips stand for errors behind it (an adapter)."""
+    """CAN frames. The bus has its own CRC, so bit flips stand for errors behind it (an adapter)."""
 
     def __init__(self, plan: FaultPlan) -> None:
         super().__init__(plan)
@@ -282,7 +279,7 @@ class CanWire(_Wire[CanFrame]):
         self._off = False
 
     def pass_on(self, frames: Iterable[CanFrame], seconds: float) -> list[CanFrame]:
-        """As for any wire; while the board is bus-off only error frames come, one at each end."""
+        """As for any wire. During bus-off nothing passes; an error frame marks each end of it."""
         off = any(w.covers(seconds) for w in self._plan.busoff)
         changed, self._off = off != self._off, off
         if off:
