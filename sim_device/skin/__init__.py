@@ -1,1 +1,1 @@
-"""The simulated skin: contacts to counts of its magnetometers."""
+"""Simulated skin: from contacts to the counts of its magnetometers."""

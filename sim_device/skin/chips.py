@@ -1,4 +1,4 @@
-"""Magnetometers of a skin: from the field at each chip to the counts it hands over."""
+"""Magnetometers of a skin: from the field at each chip to the counts it sends."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from tactile_core.arrays import FloatArray
 COUNT_MAX = 32767
 THERMOMETER_RAW_25 = 46244
 THERMOMETER_LSB_PER_K = 45.2
-"""MLX90393 datasheet: T = 25 °C + (raw - 46244) / 45.2."""
+"""Thermometer of the MLX90393: T = 25 °C + (raw - 46244) / 45.2 (datasheet)."""
 
 
 def temperature_of_raw(raw: FloatArray) -> FloatArray:
-    """°C that the 16-bit thermometer value ``raw`` stands for."""
+    """Temperature, °C, of the 16-bit thermometer value ``raw``."""
     return 25.0 + (raw - THERMOMETER_RAW_25) / THERMOMETER_LSB_PER_K
 
 
@@ -28,8 +28,8 @@ class Reading:
     """One conversion of every chip.
 
     ``counts`` (N, 3) int16 in chip axes, ``status`` (N,) uint8 of `TaxelStatus`,
-    ``temperature_c`` (N,) °C as the chips tell it. ``infinite`` (N,) bool: chips that firmware
-    sends no number of; None: there are none. Only boards that send floats can.
+    ``temperature_c`` (N,) °C as the chips measure it. ``infinite`` (N,) bool: chips for which the
+    firmware sends infinities and NaN, possible only on boards that send floats; None: no such chip.
     """
 
     counts: NDArray[np.int16]
@@ -39,7 +39,7 @@ class Reading:
 
 
 def truncated_normal(rng: np.random.Generator, sigma: float, shape: tuple[int, ...]) -> FloatArray:
-    """Normal draws cut off at two sigma: parts beyond are thrown out at inspection."""
+    """Normal draws cut off at two sigma: parts beyond fail inspection."""
     return np.clip(rng.standard_normal(shape), -2.0, 2.0) * sigma
 
 
@@ -72,7 +72,7 @@ class Magnetometers:
             1.0 - np.eye(3)
         )
         trim = 1.0 + truncated_normal(rng, tolerance.sensitivity, (n, 3))
-        # ee field to what the chip makes of it: turned, trimmed, mixed.
+        # From the field in ee to the chip's output: rotated, trimmed, with cross-axis parts.
         self._view = (response * trim[:, None, :]) @ np.transpose(tilted, (0, 2, 1))
         bound = np.array(
             [p.offset_drift_xy_ut_per_k, p.offset_drift_xy_ut_per_k, p.offset_drift_z_ut_per_k]
@@ -94,17 +94,17 @@ class Magnetometers:
         return view
 
     def configure(self, chips: slice, setting: ChipSetting) -> None:
-        """Write the registers of ``chips``: scale, noise and conversion time follow."""
+        """Set the registers of ``chips``; scale, noise and conversion time follow."""
         p = self.parameters
         self._lsb[chips] = setting.lsb_ut
-        # White noise averages down with the conversions behind a value.
+        # White noise averages down with the number of conversions in a value.
         quieter = math.sqrt(p.setting.averaging / setting.averaging)
         self._noise[chips] = np.array([p.noise_xy_ut, p.noise_xy_ut, p.noise_z_ut]) * quieter
         # The chip converts X, Y, Z one after another: when Z ends, X is two conversions old.
         self._lag[chips] = self._oscillator[chips, None] * setting.axis_time * [2.0, 1.0, 0.0]
 
     def response(self, temperature_c: float) -> FloatArray:
-        """Matrices (N, 3, 3): field in ``ee`` to what each chip makes of it, offsets apart."""
+        """Matrices (N, 3, 3): from the field in ``ee`` to each chip's output, without offsets."""
         warmer = temperature_c - self.parameters.reference_c
         matrices: FloatArray = self._view * (1.0 + self._sensitivity_drift * warmer)[:, :, None]
         return matrices
@@ -120,7 +120,7 @@ class Magnetometers:
     def skew(self, now: FloatArray, before: FloatArray, elapsed: float) -> FloatArray:
         """Field (N, 3) µT that each axis saw when it was converted.
 
-        ``now``: at the end of the conversion of z; ``before``: ``elapsed`` s earlier.
+        ``now``: field at the end of the conversion of z; ``before``: field ``elapsed`` s earlier.
         """
         seen: FloatArray = now + (before - now) * np.minimum(self._lag / elapsed, 1.0)
         return seen

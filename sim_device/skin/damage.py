@@ -1,4 +1,4 @@
-"""Chips that are broken in the ways of a plan: what their readings come to be."""
+"""Faults of a plan that alter readings: broken chips, and changes of the whole skin."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from sim_device.skin.environment import Surroundings
 from sim_device.skin.skin import SkinModel
 
 _NO_ANSWER = -1
-"""Count of a chip that does not answer: an I2C bus left alone reads all ones."""
+"""Count of a chip that does not answer: an idle I2C bus reads all ones."""
 
 _COUNTS = 1 << 16
 JUMP = 24_000
-"""Counts by which a chip jumps, over the end of its range if need be."""
+"""Counts by which a chip jumps, wrapping at the end of its range."""
 WRAP_ROOM = 2000
-"""Counts that a chip has left to the end of its range where it is to wrap under a press."""
+"""Counts that remain to the end of the range of a chip that is to wrap under a press."""
 HOT_C = 99.0
-"""°C that a broken thermometer shows: below what a chip cannot show, above what it can be."""
+"""°C that a broken thermometer shows: a value the chip can send, but too hot to be true."""
 KEPT = 40
-"""Readings among which a board with old frames in its buffers finds the one it sends."""
+"""Readings kept by a board that sends old frames; it sends the oldest."""
 COPY_EVERY = 3
-"""Every so many frames is an old one."""
+"""One frame in so many is an old one."""
 
 
 class BrokenTaxels:
     """Applies the taxel faults of ``plan`` to the readings of a board.
 
-    ``taxels``: how many each array has, by its name. ValueError for faults of taxels that are not
-    there.
+    ``taxels``: number of taxels of each array, by name. ValueError for faults of taxels that do
+    not exist.
     """
 
     def __init__(self, plan: FaultPlan, taxels: Mapping[str, int]) -> None:
@@ -50,13 +50,13 @@ class BrokenTaxels:
 
     @property
     def counters(self) -> dict[str, int]:
-        """Readings spoilt so far, by fault."""
+        """Readings altered so far, by fault."""
         return {kind.value: self._count[kind] for kind in TaxelFaultKind} | {
             "copy": self._count["copy"]
         }
 
     def spoil(self, reading: Reading, seconds: float) -> Reading:
-        """``reading`` as the broken chips give it ``seconds`` after power-on."""
+        """``reading`` as the broken chips give it ``seconds`` s after power-on."""
         self._readings += 1
         active = [f for f in self._faults if f[0].window.covers(seconds)]
         if active:
@@ -122,12 +122,12 @@ class BrokenTaxels:
             case TaxelFaultKind.HOT:
                 temperature[taxel] = HOT_C
             case TaxelFaultKind.LOOSE:
-                pass  # the skin's, not the chip's: see `SkinChanges`
+                pass  # a fault of the skin, not of the chip: see `SkinChanges`
             case TaxelFaultKind.INFINITE:
                 infinite[taxel] = True
 
     def _copied(self, reading: Reading, seconds: float, windows: tuple[Window, ...]) -> Reading:
-        """An old reading now and then while one of ``windows`` lasts."""
+        """``reading``, or now and then an old one while one of ``windows`` lasts."""
         old = self._kept[0] if len(self._kept) == KEPT else None
         self._kept.append(reading)
         due = self._readings % COPY_EVERY == 0 and any(w.covers(seconds) for w in windows)
@@ -138,12 +138,12 @@ class BrokenTaxels:
 
 
 def _wrapped(count: int) -> int:
-    """As 16 bits hold it."""
+    """``count`` wrapped to 16 bits."""
     return (count + _COUNTS // 2) % _COUNTS - _COUNTS // 2
 
 
 def _indices(fault: TaxelFault, taxels: Mapping[str, int]) -> range:
-    """Numbers of the broken taxels among all of the board."""
+    """Indices of the broken taxels among all taxels of the board."""
     first = 0
     which = "*" if fault.taxel == ALL_TAXELS else str(fault.taxel)
     called = f"fault {fault.kind}={fault.array}:{which}"
@@ -159,19 +159,19 @@ def _indices(fault: TaxelFault, taxels: Mapping[str, int]) -> range:
     raise ValueError(f"{called}: there is no array {fault.array!r}; allowed: {names}")
 
 
-# What befalls a whole skin: lifted off, exchanged, a magnet lost, gain changed, a magnet near.
+# Faults of a whole skin: lifted off, exchanged, a magnet lost, gain changed, a magnet near.
 
 
 OTHER_SKIN = 0.2
 """Largest relative difference of another skin's magnets from this one's."""
 LEAP_DIRECTION = np.array([0.6, -0.4, 0.693])
-"""Unit vector in world axes of a field that leaps."""
+"""Direction of a field that leaps: unit vector in world axes."""
 
 
 class SkinChanges:
-    """Applies the changes of ``plan`` to ``skin`` and to what it reads.
+    """Applies the changes of ``plan`` to ``skin`` and to its readings.
 
-    ``taxels``: how many each array has, by its name. ValueError for magnets that are not there.
+    ``taxels``: number of taxels of each array, by name. ValueError for magnets that do not exist.
     """
 
     def __init__(self, plan: FaultPlan, skin: SkinModel, taxels: Mapping[str, int]) -> None:
@@ -195,7 +195,7 @@ class SkinChanges:
         self._scale = np.ones(n)
 
     def surround(self, seconds: float, surroundings: Surroundings) -> Surroundings:
-        """Surroundings at ``seconds`` after power-on; the skin's magnets are what they then are."""
+        """Set the magnets as at ``seconds`` s after power-on and return the surroundings then."""
         plan = self._plan
         scale = np.ones(len(self._scale))
         if any(window.covers(seconds) for window in plan.newskin):
@@ -215,7 +215,7 @@ class SkinChanges:
         return replace(surroundings, world_field_ut=field)
 
     def amplify(self, seconds: float, reading: Reading) -> Reading:
-        """The reading with the gain that its chips have at ``seconds``."""
+        """``reading`` with the gain that its chips have ``seconds`` s after power-on."""
         gain = 1.0
         for factor, window in self._plan.gain:
             gain *= factor if window.covers(seconds) else 1.0

@@ -1,4 +1,4 @@
-"""The rubber between a contact and the magnets: spreading, compliance, creep, hysteresis."""
+"""Rubber between a contact and the magnets: spreading, compliance, creep, hysteresis."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from sim_device.skin.parameters import ElastomerParameters
 from tactile_core.arrays import FloatArray
 
 CALIBRATION_DWELL = 2.0
-"""s that a calibration rig waits at each load: about as long as a contact in use lasts."""
+"""Seconds that a calibration rig waits at each load: about as long as a contact in use lasts."""
 
 _HERTZ_VARIANCE = 0.2
-"""Variance per axis of Hertz's pressure sqrt(1 - r²/a²) over a²."""
+"""Variance per axis of Hertz's pressure sqrt(1 - r²/a²), in units of a²."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """What presses on a skin, in ``ee``: ``position`` (3,) m, ``force`` (3,) N, ``radius`` m.
+    """One contact on a skin, in ``ee``: ``position`` (3,) m, ``force`` (3,) N, ``radius`` m.
 
     The force is what the environment exerts on the skin; the radius is that of the patch.
     """
@@ -31,7 +31,7 @@ class Contact:
 
 
 class Spreader:
-    """Shares contacts out over taxels at ``position`` (N, 3) m in ``ee``."""
+    """Distributes contacts over taxels at ``position`` (N, 3) m in ``ee``."""
 
     def __init__(self, position: FloatArray, parameters: ElastomerParameters) -> None:
         self._position = position
@@ -41,14 +41,14 @@ class Spreader:
     def weights(self, contacts: Sequence[Contact]) -> FloatArray:
         """Share (C, N) of each contact that each taxel bears.
 
-        Rows sum to one within ``full_reach`` of a taxel, to zero beyond ``no_reach``: there the
+        Rows sum to one within ``full_reach`` of a taxel, and to zero beyond ``no_reach``: there the
         rigid body bears the contact and no taxel feels it.
         """
         p = self._parameters
         points = np.array([c.position for c in contacts])
         radius = np.array([c.radius for c in contacts])
         # |p - x|² multiplied out: exact to 1e-9 m here, and several times faster. Rounding can
-        # make a distance of nought slightly negative.
+        # make a distance of zero slightly negative.
         squared = self._norm2 - 2.0 * points @ self._position.T
         squared += (points**2).sum(axis=1)[:, None]
         nearest = np.maximum(squared.min(axis=1), 0.0)
@@ -78,15 +78,15 @@ class Elastomer:
     def __init__(
         self, parameters: ElastomerParameters, stiffness_factor: FloatArray, travel: FloatArray
     ) -> None:
-        """``stiffness_factor`` (N,) of each taxel; ``travel`` (N,) m its magnet can sink."""
+        """``stiffness_factor`` (N,) of each taxel; ``travel`` (N,) m that its magnet can sink."""
         p = self._parameters = parameters
         n = len(stiffness_factor)
         nominal = np.array([p.shear_stiffness, p.shear_stiffness, p.normal_stiffness])
         self._compliance = 1.0 / (nominal * stiffness_factor[:, None])
         self._travel = travel
         loop = np.array([p.hysteresis_shear, p.hysteresis_shear, p.hysteresis_normal])
-        # The play lags by knee · load on the way up and leads by knee · peak on the way down; they
-        # are farthest apart at (1 - 2 knee) · peak, where the loop is to be loop · peak wide.
+        # The play lags by knee · load on the way up and leads by knee · peak on the way down. They
+        # are farthest apart at (1 - 2 knee) · peak, where the loop should be loop · peak wide.
         self._play_weight = loop / (2.0 * p.hysteresis_knee * (1.0 - p.hysteresis_knee))
         self._force = np.zeros((n, 3))
         self._creep = np.zeros((n, 3))
@@ -94,7 +94,7 @@ class Elastomer:
         self._peak = np.zeros((n, 3))
 
     def reset(self) -> None:
-        """Fully recovered rubber."""
+        """Return to fully recovered rubber."""
         for state in (self._force, self._creep, self._play, self._peak):
             state[:] = 0.0
 
@@ -113,10 +113,10 @@ class Elastomer:
         return self._displace(effective)
 
     def settled(self, force: FloatArray) -> FloatArray:
-        """Displacement (..., N, 3) m of recovered rubber some time after ``force`` came on.
+        """Displacement (..., N, 3) m of recovered rubber `CALIBRATION_DWELL` after loading.
 
-        ``force``: (..., N, 3) N, on for `CALIBRATION_DWELL`. What a calibration rig sees, which
-        loads and never unloads before it reads; changes no state.
+        ``force``: (..., N, 3) N. This is what a calibration rig sees, which loads and never unloads
+        before it reads. Changes no state.
         """
         p = self._parameters
         crept = -p.creep * math.expm1(-CALIBRATION_DWELL / p.creep_time)

@@ -1,4 +1,4 @@
-"""What surrounds a skin: the earth's field, its gradient, temperature, and scripted attitude."""
+"""Surroundings of a skin: the earth's field, its gradient, temperature, and scripted attitude."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 from tactile_core.arrays import FloatArray
 
 AttitudeScript = Callable[[float], FloatArray]
-"""Seconds since power-on to the rotation (3, 3) from ``ee`` to world axes."""
+"""From seconds since power-on to the rotation (3, 3) from ``ee`` to world axes."""
 
 TemperatureScript = Callable[[float], float]
-"""Seconds since power-on to the board's temperature in °C."""
+"""From seconds since power-on to the board's temperature, °C."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,26 +23,27 @@ class EnvironmentParameters:
     """Magnetic and thermal surroundings."""
 
     field_ut: float = 50.0
-    """µT; the earth's field is 25–65."""
+    """Magnitude of the field, µT; the earth's field is 25–65."""
     inclination: float = math.radians(60)
-    """rad below the horizontal; 60° is central Europe or the northern United States."""
+    """Angle of the field below the horizontal, rad; 60° is central Europe or the northern United
+    States."""
     heading: float = 0.0
-    """rad from world x to magnetic north, about z."""
+    """Angle from world x to magnetic north, about z, rad."""
     gradient_ut_per_m: float = 30.0
-    """µT/m along world x: steel furniture at arm's length (assumed)."""
+    """Gradient of the field along world x, µT/m: steel furniture at arm's length (assumed)."""
     room_c: float = 23.0
-    """°C."""
+    """Room temperature, °C."""
     self_heating_k: float = 4.0
-    """K that a board warms above the room (assumed)."""
+    """Temperature of a warm board above the room, K (assumed)."""
     self_heating_time: float = 300.0
-    """s, time constant of warming."""
+    """Time constant of warming, s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
-    """The environment at one instant. ``attitude`` (3, 3): ``ee`` to world axes.
+    """Environment at one instant. ``attitude`` (3, 3): ``ee`` to world axes.
 
-    ``world_field_ut`` (3,) µT at the origin of ``ee``, ``gradient`` (3, 3) µT/m, both in world
+    ``world_field_ut`` (3,) µT at the origin of ``ee`` and ``gradient`` (3, 3) µT/m, both in world
     axes; ``temperature_c`` of the board.
     """
 
@@ -68,7 +69,7 @@ def still(_seconds: float) -> FloatArray:
 class Environment:
     """Surroundings over time. ``attitude``: script used while a board is given no attitude.
 
-    ``temperature``: script of the board's °C; left out, it warms up as the parameters say.
+    ``temperature``: script of the board's temperature, °C; None: it warms as the parameters say.
     """
 
     def __init__(
@@ -116,7 +117,7 @@ _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 def check_rotation(text: str) -> str:
-    """``text`` if `parse_rotation` takes it; ValueError."""
+    """Return ``text`` if `parse_rotation` accepts it; ValueError."""
     parse_rotation(text)
     return text
 
@@ -124,7 +125,7 @@ def check_rotation(text: str) -> str:
 def parse_rotation(text: str) -> AttitudeScript:
     """Steady turn such as ``90deg/10s``, ``0.2rad/s``, ``360deg/20s@y`` or ``90deg/s@1,0,1``.
 
-    The axis is in world axes, z when left out. ValueError says what is allowed.
+    The axis is in world axes, by default z. ValueError says what is allowed.
     """
     allowed = (
         "allowed: ANGLEdeg/SECONDSs or ANGLErad/SECONDSs, then @x, @y, @z or @X,Y,Z for the axis "

@@ -1,4 +1,4 @@
-"""A scripted indenter: presses on the skin over time, from a TOML script (see docs/press.toml)."""
+"""Scripted indenter: presses on the skin over time, from a TOML script (see docs/press.toml)."""
 
 from __future__ import annotations
 
@@ -26,18 +26,19 @@ from tactile_core.config import (
 from tactile_core.geometry import ArrayGeometry, SkinGeometry, finger
 
 MAX_NORMAL_N = 100.0
-"""N; the elastomer is crushed well before."""
+"""Largest normal force, N; the elastomer is crushed well before."""
 
 MAX_SECONDS = 1e6
-"""s, eleven days: the longest time a script may name."""
+"""Longest time that a script may contain, s: eleven days."""
 
 MAX_REPEATS = 1_000_000
 
 MAX_OFF_SKIN_MM = 12.0
-"""mm from the nearest taxel up to which the skin bears a contact whole (`full_reach`)."""
+"""Distance from the nearest taxel, mm, up to which the skin bears all of a contact
+(`full_reach`)."""
 
 MAX_PAST_EDGE_MM = 7.0
-"""mm past the outermost taxels along each axis: so that a corner is within the same reach."""
+"""Distance past the outermost taxels along each axis, mm: keeps a corner within that reach."""
 
 
 Place = Annotated[Millimetres, Meta(ge=-1000, le=1000)]
@@ -47,10 +48,10 @@ Time = Annotated[Seconds, Meta(ge=0, le=MAX_SECONDS)]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Press:
-    """A force that rises over ``ramp`` s, stays ``hold`` s, falls over ``ramp`` s.
+    """Force that rises over ``ramp`` s, stays ``hold`` s, and falls over ``ramp`` s.
 
-    ``contact`` carries the full force; times in s; it begins at ``start`` and comes ``repeat``
-    times, one every ``every`` s.
+    ``contact`` carries the full force. Times in s; the press begins at ``start`` and comes
+    ``repeat`` times, one every ``every`` s.
     """
 
     contact: Contact
@@ -62,7 +63,7 @@ class Press:
 
     @property
     def end(self) -> float:
-        """When the last repetition is over, s."""
+        """End of the last repetition, s."""
         return self.start + (self.repeat - 1) * self.every + 2 * self.ramp + self.hold
 
     def level(self, seconds: float) -> float:
@@ -80,7 +81,7 @@ class Press:
 
 
 class Indenter:
-    """Presses that go on at the same time; may stand as the ``contacts`` of a board."""
+    """Presses that may overlap in time; usable as the ``contacts`` of a board."""
 
     def __init__(self, presses: Sequence[Press], loop: float | None = None) -> None:
         """``loop``: s after which the script starts again; None: it is played once."""
@@ -89,11 +90,11 @@ class Indenter:
 
     @property
     def duration(self) -> float:
-        """When the script is over (or starts again), s."""
+        """Time until the script ends or starts again, s."""
         return self.loop or max((p.end for p in self.presses), default=0.0)
 
     def contacts(self, seconds: float) -> list[Contact]:
-        """Contacts ``seconds`` after power-on."""
+        """Contacts ``seconds`` s after power-on."""
         if self.loop is not None:
             seconds %= self.loop
         out = []
@@ -160,7 +161,7 @@ class ScriptFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 def load_script(path: str | Path, geometry: SkinGeometry | None = None) -> Indenter:
-    """Indenter of the script at ``path`` for a skin (the finger when left out); `ConfigError`."""
+    """Indenter of the script at ``path`` for a skin (default: the finger); `ConfigError`."""
     document = Document.read(path)
     file = document.convert(ScriptFile)
     geometry = geometry or finger()
@@ -189,7 +190,7 @@ def _press(document: Document, number: int, table: PressTable, geometry: SkinGeo
 def _place(
     document: Document, at: KeyPath, table: PressTable, geometry: SkinGeometry
 ) -> tuple[FloatArray, FloatArray]:
-    """Position (3,) m in ``ee`` and the axes (3, 3) of the skin there."""
+    """Position (3,) m in ``ee``, and the axes (3, 3) of the skin there."""
     if table.position_mm is not None:
         for key in ("array", "u_mm", "v_mm"):
             if getattr(table, key) is not None:
@@ -228,7 +229,7 @@ def _place(
 def on_surface(array: ArrayGeometry, u: float, v: float) -> tuple[FloatArray, FloatArray]:
     """Point (3,) m in ``ee`` at surface coordinates ``u``, ``v`` m, and the axes (3, 3) there.
 
-    The skin is taken as flat round its nearest taxel.
+    The skin is taken as flat around its nearest taxel.
     """
     step = np.array([u, v]) - array.surface
     nearest = int((step**2).sum(axis=1).argmin())

@@ -1,4 +1,4 @@
-"""Field of point dipoles at the chips of a skin, own magnets and neighbours."""
+"""Field of point dipoles at the chips of a skin, from their own magnets and their neighbours'."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tactile_core.arrays import FloatArray
 Index = NDArray[np.intp]
 
 MU0_OVER_4PI = 1e-7
-"""T·m/A."""
+"""Magnetic constant over 4π, T·m/A."""
 
 UT_PER_T = 1e6
 
@@ -30,7 +30,7 @@ def dipole_field_ut(offset: FloatArray, moment: FloatArray) -> FloatArray:
 class MagnetArray:
     """Magnets over chips: ``chips`` (N, 3) m, ``rest`` (N, 3) m and ``moment`` (N, 3) A·m² in ee.
 
-    Each chip sees the magnets within ``radius`` m of it at rest; the others are left out.
+    Each chip sees the magnets within ``radius`` m of it at rest; others are ignored.
     """
 
     def __init__(
@@ -44,13 +44,13 @@ class MagnetArray:
         self._chip, self._magnet = chip, _ = pairs[:, 0], pairs[:, 1]
         # Every chip has at least its own magnet, so each has a run of pairs, in order.
         self._starts = np.searchsorted(chip, np.arange(len(chips)))
-        # Components apart: numpy is several times faster on long rows than on triples.
+        # One row per component: numpy is several times faster on long rows than on triples.
         self._offset = np.ascontiguousarray((chips[chip] - rest[self._magnet]).T)
         self._whole = np.ascontiguousarray(moment[self._magnet].T)
         self._moment = self._whole
 
     def scale(self, factor: FloatArray) -> None:
-        """Let every moment be ``factor`` (N,) of what it was made as; 0: the magnet is gone."""
+        """Set every moment to ``factor`` (N,) times its original value; 0: the magnet is gone."""
         self._moment = self._whole * factor[self._magnet]
 
     @property
@@ -59,7 +59,7 @@ class MagnetArray:
         return self._chip, self._magnet
 
     def shares_ut(self, displacement: FloatArray) -> FloatArray:
-        """Field (..., P, 3) µT in ee at the chip of each pair from its magnet alone.
+        """Field (..., P, 3) µT in ee at the chip of each pair, from the pair's magnet alone.
 
         ``displacement``: (..., N, 3) m in ee.
         """
@@ -67,9 +67,9 @@ class MagnetArray:
         return dipole_field_ut(offset, self._moment.T)
 
     def field_ut(self, displacement: FloatArray, strength: float = 1.0) -> FloatArray:
-        """Field (N, 3) µT in ee at the chips, the magnets moved by ``displacement`` (N, 3) m in ee.
+        """Field (N, 3) µT in ee at the chips with the magnets moved by ``displacement``.
 
-        ``strength``: factor on every moment.
+        ``displacement``: (N, 3) m in ee. ``strength``: factor on every moment.
         """
         offset = self._offset - displacement.take(self._magnet, axis=0).T
         x, y, z = offset

@@ -1,7 +1,7 @@
-"""Every figure of the simulated skin as a named parameter with its source.
+"""Parameters of the simulated skin, each with its source.
 
-"table" means the table of magnetometer facts the project works from: the MLX90393 datasheet and
-measurements on real AnySkin and eFlesh boards.
+"table" means the table of magnetometer facts that the project works from: the MLX90393 datasheet
+and measurements on real AnySkin and eFlesh boards.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ _LSB_Z_UT = (1.210, 0.968, 0.726, 0.605, 0.484, 0.403, 0.323, 0.242)
 """µT per LSB at RES 0 and HALLCONF 0xC for GAIN_SEL 0 to 7 (MLX90393 datasheet, table 17)."""
 
 _AXIS_UNIT = 0.064e-3
-"""s, the datasheet's unit of an axis conversion: (2 + 2^DIG_FILT) · 2^OSR of these."""
+"""Unit of an axis conversion in the datasheet, s: it takes (2 + 2^DIG_FILT) · 2^OSR of these."""
 
 _CYCLE_OVERHEAD = 0.688e-3
-"""s of a T+X+Y+Z cycle that no axis takes: 1.84 ms at OSR 0, DIG_FILT 2 less 3 × 0.384 ms."""
+"""Part of a T+X+Y+Z cycle that no axis uses, s: 1.84 ms at OSR 0, DIG_FILT 2 less 3 × 0.384 ms."""
 
 _OSCILLATOR_MARGIN = 1.10
 """Slowest oscillator, ±5 % trim and ±5 % thermal: why 1.84 ms allow 493 Hz and not 543."""
@@ -24,7 +24,7 @@ _OSCILLATOR_MARGIN = 1.10
 
 @dataclass(frozen=True, slots=True)
 class ChipSetting:
-    """Registers of an MLX90393. ValueError for codes the chip does not have.
+    """Registers of an MLX90393. ValueError for codes that the chip does not have.
 
     Gain 4 is the finest at which 10 mT of rest field and a press of 20 N stay below the wrap of
     z (15.9 mT).
@@ -36,7 +36,7 @@ class ChipSetting:
     filter: int = 3
 
     def __post_init__(self) -> None:
-        """Refuse codes out of range."""
+        """Check that codes are in range; ValueError."""
         for name, value, top in (
             ("gain", self.gain, 7),
             ("resolution", self.resolution, 3),
@@ -55,7 +55,7 @@ class ChipSetting:
 
     @property
     def averaging(self) -> int:
-        """Elementary conversions behind one value: (2 + 2^DIG_FILT) · 2^OSR."""
+        """Elementary conversions in one value: (2 + 2^DIG_FILT) · 2^OSR."""
         return (2 + (1 << self.filter)) << self.oversampling
 
     @property
@@ -70,22 +70,22 @@ class ChipSetting:
 
     @property
     def max_rate(self) -> float:
-        """Cycles per second that even the slowest oscillator manages: 493 Hz at DIG_FILT 2."""
+        """Cycles per second that even the slowest oscillator reaches: 493 Hz at DIG_FILT 2."""
         return 1 / (self.conversion_time * _OSCILLATOR_MARGIN)
 
 
 @dataclass(frozen=True, slots=True)
 class MagnetParameters:
-    """One point dipole per taxel, above its chip, moment along the outward normal."""
+    """One point dipole per taxel, above its chip, with its moment along the outward normal."""
 
     moment: float = 3.25e-3
-    """A·m²: disc of 2 × 1 mm, Br 1.3 T (table)."""
+    """Dipole moment, A·m²: disc of 2 × 1 mm, Br 1.3 T (table)."""
     gap: float = 4e-3
-    """m from chip to magnet at rest: 10.2 mT, as the eFlesh recordings show (table)."""
+    """Distance from chip to magnet at rest, m: 10.2 mT, as the eFlesh recordings show (table)."""
     minimum_gap: float = 1.5e-3
-    """m; the elastomer is crushed and yields no further."""
+    """Smallest distance, m; the elastomer is crushed and yields no further."""
     neighbour_radius: float = 25e-3
-    """m; magnets farther from a chip than this change its field by less than 0.1 %."""
+    """Radius in m beyond which a magnet changes a chip's field by less than 0.1 %."""
     drift_per_k: float = -0.0012
     """Reversible loss of remanence of sintered NdFeB, -0.12 %/K (makers' datasheets)."""
 
@@ -100,30 +100,32 @@ class ElastomerParameters:
     """
 
     normal_stiffness: float = 50e3
-    """N/m per taxel. 1 MPa rubber, 16 mm square and 3–5 mm thick, has 50–85 kN/m."""
+    """Stiffness per taxel, N/m. 1 MPa rubber, 16 mm square and 3–5 mm thick, has 50–85 kN/m."""
     shear_stiffness: float = 25e3
-    """N/m per taxel."""
+    """Stiffness per taxel, N/m."""
     spread: float = 5e-3
-    """m, standard deviation of the pressure under a point force: about the thickness."""
+    """Standard deviation of the pressure under a point force, m: about the thickness."""
     full_reach: float = 12e-3
-    """m from the nearest taxel up to which the skin bears a contact: covers half a grid cell."""
+    """Distance from the nearest taxel, m, up to which the skin bears all of a contact: covers half
+    a grid cell."""
     no_reach: float = 20e-3
-    """m from the nearest taxel at which the rigid body bears it all; linear between the two."""
+    """Distance from the nearest taxel, m, from which the rigid body bears it all; linear between
+    the two."""
     creep: float = 0.04
     """Slow part of the displacement over the prompt one: 89–178 µT in 3.9 mT are 2–5 % (table)."""
     creep_time: float = 8.0
-    """s, time constant of creep (not published; the recordings' rest settles in about 10 s)."""
+    """Time constant of creep, s (not published; the recordings' rest settles in about 10 s)."""
     hysteresis_normal: float = 0.03
     """Width of the press-release loop over its peak; 1–6 % (table)."""
     hysteresis_shear: float = 0.08
-    """The same for shear; up to 16 % (table)."""
+    """Width of the loop for shear; up to 16 % (table)."""
     hysteresis_knee: float = 0.25
     """Half-width of the play over the peak: the loop is at full width after twice this."""
     hysteresis_time: float = 5.0
-    """s, time constant with which the rubber forgets its peak load."""
+    """Time constant with which the rubber forgets its peak load, s."""
 
     def __post_init__(self) -> None:
-        """Refuse rubber that does not yield, and a play as wide as its peak."""
+        """Check that the rubber yields and the play is narrower than its peak; ValueError."""
         if not (self.normal_stiffness > 0 and self.shear_stiffness > 0 and self.spread > 0):
             raise ValueError("stiffnesses and spread must be above 0")
         if not 0 < self.hysteresis_knee < 0.5:
@@ -138,50 +140,50 @@ class ChipParameters:
 
     setting: ChipSetting = field(default_factory=ChipSetting)
     noise_xy_ut: float = 3.7
-    """µT standard deviation per sample of x and y at the default filter; 3–4.4 (table)."""
+    """Standard deviation per sample of x and y, µT, at the default filter; 3–4.4 (table)."""
     noise_z_ut: float = 5.8
-    """µT, the same of z; 5–6.7 (table)."""
+    """Standard deviation per sample of z, µT; 5–6.7 (table)."""
     offset_drift_xy_ut_per_k: float = 2.5
-    """µT/K bound of thermal offset drift: ±150 µT over 60 K (table)."""
+    """Bound of thermal offset drift, µT/K: ±150 µT over 60 K (table)."""
     offset_drift_z_ut_per_k: float = 4.0
-    """µT/K: ±242 µT over 60 K (table)."""
+    """Bound of thermal offset drift, µT/K: ±242 µT over 60 K (table)."""
     sensitivity_drift_per_k: float = 0.0005
-    """Bound, per K: ±3 % over 60 K (table)."""
+    """Bound of relative drift per K: ±3 % over 60 K (table)."""
     cross_axis: float = 0.01
     """Bound of each off-diagonal sensitivity (table)."""
     saturation_ut: float = 50e3
-    """µT on one axis at which the Hall plates saturate (table)."""
+    """Field on one axis at which the Hall plates saturate, µT (table)."""
     oscillator_trim: float = 0.05
     """Bound of the relative error of a chip's oscillator (table)."""
     thermometer_error_k: float = 1.0
-    """K standard deviation of a chip's thermometer offset (assumed)."""
+    """Standard deviation of a chip's thermometer offset, K (assumed)."""
     reference_c: float = 25.0
-    """°C at which drifts are zero; the thermometer's own reference (table)."""
+    """Temperature at which drifts are zero, °C; the thermometer's own reference (table)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ToleranceParameters:
-    """Standard deviations of how a skin is made, cut off at twice (assumed, hand-assembled)."""
+    """Standard deviations of manufacture, cut off at twice that (assumed, hand-assembled)."""
 
     gap: float = 0.03e-3
-    """m."""
+    """Distance from chip to magnet, m."""
     lateral: float = 0.05e-3
-    """m, magnet beside its chip's axis, per axis."""
+    """Offset of the magnet from its chip's axis, per axis, m."""
     moment: float = 0.02
-    """Relative."""
+    """Dipole moment, relative."""
     magnet_tilt: float = 0.02
-    """rad, per axis."""
+    """Tilt of the magnet, per axis, rad."""
     chip_tilt: float = 0.01
-    """rad, per axis, the yaw included."""
+    """Tilt of the chip, per axis, yaw included, rad."""
     sensitivity: float = 0.01
-    """Relative, per axis."""
+    """Sensitivity, relative, per axis."""
     stiffness: float = 0.05
-    """Relative, per taxel."""
+    """Stiffness, relative, per taxel."""
 
 
 @dataclass(frozen=True, slots=True)
 class SkinParameters:
-    """All of a skin. `ideal` is the textbook skin: every imperfection off, crosstalk left."""
+    """All parameters of a skin. `ideal` gives one without imperfections, only crosstalk."""
 
     magnet: MagnetParameters = field(default_factory=MagnetParameters)
     elastomer: ElastomerParameters = field(default_factory=ElastomerParameters)
@@ -211,9 +213,9 @@ class SkinParameters:
 
 
 def anyskin_parameters() -> SkinParameters:
-    """An AnySkin-like board: 5 mm gap (5.2 mT), softer, chips at the library's gain of 6.
+    """Parameters of an AnySkin-like board: 5 mm gap (5.2 mT), softer, at the library's gain of 6.
 
-    115 µT/N as on eFlesh (table); the wrap at 6.55 / 10.6 mT is beyond a press of 20 N.
+    115 µT/N as on eFlesh (table). z wraps at 6.55 / 10.6 mT, beyond a press of 20 N.
     """
     return SkinParameters(
         magnet=MagnetParameters(gap=5e-3),

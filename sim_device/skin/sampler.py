@@ -1,4 +1,4 @@
-"""The sensing half of a board: its skin in its surroundings, with the taxels that a plan breaks."""
+"""Sensing part of a board: its skin in its surroundings, with the faults of a plan."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Sampler:
     """Reads a skin in its surroundings.
 
     ``contacts`` and ``attitude`` may be set at any time, as values or as functions of the seconds
-    since power-on; no attitude means the environment's script.
+    since power-on. Without an attitude, the environment's script applies.
     """
 
     def __init__(
@@ -30,7 +30,7 @@ class Sampler:
         contacts: Contacts = (),
         plan: FaultPlan | None = None,
     ) -> None:
-        """ValueError when ``plan`` breaks taxels that ``skin`` does not have."""
+        """ValueError if ``plan`` breaks taxels that ``skin`` does not have."""
         self.skin = skin
         self.environment = environment
         self.contacts: Contacts = contacts
@@ -42,11 +42,11 @@ class Sampler:
 
     @property
     def fault_counters(self) -> dict[str, int]:
-        """Readings of single taxels spoilt so far, by fault."""
+        """Readings of single taxels altered so far, by fault."""
         return self._broken.counters
 
     def read(self, now: Instant, seconds: float) -> Reading:
-        """Conversion that ends at ``now``, ``seconds`` after power-on."""
+        """Conversion that ends at ``now``, ``seconds`` s after power-on."""
         contacts = self.contacts(seconds) if callable(self.contacts) else self.contacts
         attitude = self.attitude(seconds) if callable(self.attitude) else self.attitude
         surroundings = self.environment.at(seconds, attitude)
@@ -57,14 +57,14 @@ class Sampler:
 
 
 class SkinOwner:
-    """A board as seen by whoever moves it and presses on it."""
+    """Board as seen by whoever moves it and presses on it."""
 
     def __init__(self, sampler: Sampler) -> None:
         self._sampler = sampler
 
     @property
     def skin(self) -> SkinModel:
-        """The field model, with the true forces of the last sample."""
+        """Field model, with the true forces of the last sample."""
         return self._sampler.skin
 
     @property

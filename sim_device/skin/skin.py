@@ -1,4 +1,4 @@
-"""A simulated skin: contacts in the end-effector's frame to counts of its magnetometers."""
+"""Simulated skin: from contacts in the end-effector's frame to counts of its magnetometers."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ __all__ = ["Contact", "SkinModel", "nominal_calibration"]
 class SkinModel:
     """Skin of one board; N taxels, one array after another.
 
-    ``rng`` draws first the tolerances of this skin, then the noise of its samples. Pieces are
-    public so that each effect can be looked at alone: ``spreader``, ``elastomer``, ``magnets``,
+    ``rng`` draws first the tolerances of this skin, then the noise of its samples. Its parts are
+    public, so that each effect can be studied alone: ``spreader``, ``elastomer``, ``magnets``,
     ``chips``.
     """
 
@@ -77,9 +77,10 @@ class SkinModel:
     def sample(
         self, now: Instant, contacts: Sequence[Contact], surroundings: Surroundings
     ) -> Reading:
-        """Reading of every chip for a conversion that ends at ``now``, the contacts as they are.
+        """Reading of every chip for a conversion that ends at ``now`` with these contacts.
 
-        Between samples force and field are taken to change evenly. ValueError if time goes back.
+        Force and field are assumed to change linearly between samples. ValueError if time goes
+        back.
         """
         last = self._last
         elapsed = 0.0 if last is None else seconds_between(last[0], now)
@@ -101,9 +102,9 @@ class SkinModel:
         return self.chips.sense(field, surroundings.temperature_c)
 
     def settled_field_ut(self, force: FloatArray, temperature_c: float) -> FloatArray:
-        """Noiseless field (N, 3) µT in taxel axes some time under ``force`` (N, 3) N, no ambient.
+        """Noiseless field (N, 3) µT some time under ``force`` (N, 3) N, without ambient field.
 
-        In the axes that a host gets by undoing the designed yaw of each chip; see
+        Both in taxel axes: a host gets there by undoing the designed yaw of each chip. See
         `Elastomer.settled`. Changes no state.
         """
         displacement = self.elastomer.settled(force)
@@ -111,30 +112,31 @@ class SkinModel:
         return _turn(self.yaw, in_chip)
 
     def reset(self) -> None:
-        """Recovered rubber and no memory of earlier samples; the tolerances stay."""
+        """Recover the rubber and forget earlier samples; the tolerances stay."""
         self.elastomer.reset()
         self._last = None
         self._true_force = np.zeros_like(self._true_force)
 
 
 CALIBRATION_NORMAL_N = (0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
-"""N, normal loads of the calibration of each taxel."""
+"""Normal loads with which each taxel is calibrated, N."""
 
 CALIBRATION_SHEAR = (0.0, 0.3, -0.3)
 """Shear over normal load in each direction, one at a time: below usual friction."""
 
 _DRIFT_STEP_K = 5.0
-"""K above and below the reference at which the drift of the rest field is measured."""
+"""Temperature steps from the reference, K, at which the drift of the rest field is measured."""
 
 
 def nominal_calibration(
     model: SkinModel, serial: str, created: str = "1970-01-01T00:00:00Z"
 ) -> BoardCalibration:
-    """What a calibration rig finds for this very skin, its tolerances included (``nominal`` false).
+    """Calibration that a rig finds for exactly this skin, tolerances included.
 
-    Each taxel in turn is pressed with 0.5–5 N and sheared; the matrix of an array is the least
-    squares fit of force over field, each load weighted by one over its size, so that the dipole's
-    curvature is shared out evenly in relative terms. ``created``: ISO 8601.
+    Each taxel in turn is pressed with 0.5–5 N and sheared. The matrix of an array is the least
+    squares fit of force over field, each load weighted by one over its size, so that the relative
+    error from the dipole's curvature is spread evenly. ``created``: ISO 8601. The result has
+    ``nominal`` False.
     """
     reference = model.parameters.chip.reference_c
     n = model.geometry.taxels
@@ -166,10 +168,10 @@ def nominal_calibration(
 
 
 def _presses(model: SkinModel, temperature_c: float) -> tuple[FloatArray, FloatArray]:
-    """Loads (L, 3) N of the calibration and what each pair of chip and magnet makes of them.
+    """Loads (L, 3) N of the calibration, and the field that each pair of chip and magnet gives.
 
     The field (L, P, 3) µT is the change in taxel axes when the magnet's own taxel bears the load
-    alone: whatever else a chip sees stays as it is at rest.
+    alone: everything else that a chip sees stays as it is at rest.
     """
     sheared = [(s, 0.0) for s in CALIBRATION_SHEAR] + [(0.0, s) for s in CALIBRATION_SHEAR[1:]]
     loads = np.array(
@@ -186,7 +188,7 @@ def _presses(model: SkinModel, temperature_c: float) -> tuple[FloatArray, FloatA
 
 
 def _fit(model: SkinModel, taxels: slice, loads: FloatArray, field: FloatArray) -> FloatArray:
-    """Matrix (3n, 3n) N/µT of one array, from what `_presses` found."""
+    """Matrix (3n, 3n) N/µT of one array, from the results of `_presses`."""
     weight = 1.0 / np.linalg.norm(loads, axis=1)
     n = taxels.stop - taxels.start
     forces = np.zeros((n, len(loads), n, 3))
@@ -196,7 +198,7 @@ def _fit(model: SkinModel, taxels: slice, loads: FloatArray, field: FloatArray) 
     own = (chip >= 0) & (chip < n) & (magnet >= 0) & (magnet < n)
     fields[magnet[own], :, chip[own]] = np.moveaxis(field[:, own], 1, 0) * weight[:, None]
     rows = n * len(loads)
-    # Half as many operations as by singular values, and the presses leave no doubt of the rank.
+    # QR takes half as many operations as singular values, and the presses ensure full rank.
     q, r = np.linalg.qr(fields.reshape(rows, 3 * n))
     matrix = np.linalg.solve(r, q.T @ forces.reshape(rows, 3 * n))
     return np.ascontiguousarray(matrix.T)

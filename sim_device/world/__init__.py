@@ -1,1 +1,1 @@
-"""The cupboard without hardware: scenes, planar physics and the simulated arm."""
+"""Simulated cupboard: scenes and planar physics."""

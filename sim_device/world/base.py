@@ -1,4 +1,4 @@
-"""The seam between physics and everything that touches it."""
+"""Interface between the physics engines and their users."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from tactile_core.arrays import FloatArray
 from tactile_core.types import Twist, record
 
 PHYSICS_STEP = 0.005
-"""s; 10 ms explodes in MuJoCo, 5 ms is as clean as 2.5 and twice as fast."""
+"""Time of one physics step, s. MuJoCo diverges at 10 ms; 5 ms is as accurate as 2.5 and twice as
+fast."""
 
 WALL = -1
 """Body id of back and side walls among contacts."""
 
 MERGE_RADIUS = 0.003
-"""m; touches of one body closer than this are one contact. Engines report the upper and lower
-corner of an edge apart, and corners wander by v_max × a control period = 0.5 mm."""
+"""Touches of one body closer than this, m, are one contact. Engines report the upper and lower
+corner of an edge separately, and corners move by v_max × a control period = 0.5 mm."""
 
 
 class WorldError(RuntimeError):
-    """The physics diverged or overflowed: this trial is worth nothing."""
+    """The physics diverged or overflowed: this trial is invalid."""
 
 
 Touch = tuple[int, float, float, float, float, float, float]
-"""One of an engine's points: body; place x, y m, outward normal x, y, force x, y N, in ``ee``."""
+"""Contact point of an engine: body; place x, y m, outward normal x, y, force x, y N, in ``ee``."""
 
 
 @record
@@ -51,12 +52,12 @@ class FingerContact:
 
     @property
     def normal_force(self) -> float:
-        """N, positive when pressed."""
+        """Normal force, N, positive when pressed."""
         return -(self.force_x * self.normal_x + self.force_y * self.normal_y)
 
     @property
     def shear_force(self) -> float:
-        """N, friction along the surface; positive 90° counter-clockwise of the outward normal."""
+        """Friction along the surface, N, positive 90° counter-clockwise of the outward normal."""
         return self.force_y * self.normal_x - self.force_x * self.normal_y
 
 
@@ -77,11 +78,11 @@ class FingerState:
 
 
 class World(Protocol):
-    """A cupboard with a finger in it, in one plane. Deterministic: same calls, same bits."""
+    """Cupboard with a finger in it, in one plane. Deterministic: same calls, same bits."""
 
     @property
     def scene(self) -> Scene:
-        """What it was built from."""
+        """Scene it was built from."""
         ...
 
     @property
@@ -91,14 +92,14 @@ class World(Protocol):
 
     @property
     def time(self) -> float:
-        """Simulated s since it was built."""
+        """Simulated time since it was built, s."""
         ...
 
     def step(self, dt: float, twist: Twist) -> None:
-        """Advance ``dt`` s, the pivot's motors asking for ``twist``.
+        """Advance ``dt`` s while the pivot's motors aim at ``twist``.
 
-        ``dt`` is a multiple of `PHYSICS_STEP`, else ValueError, as where ``twist`` is not finite;
-        WorldError where the engine gives up.
+        ValueError if ``dt`` is not a multiple of `PHYSICS_STEP` or ``twist`` is not finite;
+        WorldError if the engine fails.
         """
         ...
 
@@ -111,7 +112,7 @@ class World(Protocol):
         ...
 
     def finger(self) -> FingerState:
-        """Where the finger is, how it moves and what pushes it."""
+        """Pose, twist and wrench of the finger."""
         ...
 
     def poses(self) -> FloatArray:
@@ -128,17 +129,17 @@ class World(Protocol):
         ...
 
     def kinetic_energy(self) -> float:
-        """J, of finger and objects in the plane."""
+        """Kinetic energy of finger and objects in the plane, J."""
         ...
 
     @property
     def motor_work(self) -> float:
-        """J that the motors have put in since it was built, braking counted negative."""
+        """Work of the motors since it was built, J; braking counts negative."""
         ...
 
 
 def substeps(dt: float) -> int:
-    """Physics steps in ``dt`` s; ValueError when it holds no whole number of them."""
+    """Number of physics steps in ``dt`` s; ValueError if it is not a whole number."""
     count = round(dt / PHYSICS_STEP)
     if count < 1 or abs(count * PHYSICS_STEP - dt) > 1e-9:
         raise ValueError(f"a step of {dt} s is no multiple of {PHYSICS_STEP} s")
@@ -149,7 +150,7 @@ def merge_touches(touches: Sequence[Touch], count: int) -> tuple[FingerContact, 
     """Contacts from the touches of ``count`` physics steps.
 
     Touches of one body within `MERGE_RADIUS` of each other become one: forces summed and divided
-    by ``count``, place and normal weighted by normal force. Touches that do not press are left out.
+    by ``count``, place and normal weighted by normal force. Touches that do not press are dropped.
     """
     if not touches:
         return ()

@@ -1,4 +1,4 @@
-"""Engines of physics by name."""
+"""Physics engines by name."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 Engine = Literal["mujoco", "pymunk", "pybullet"]
 
 ENGINES: Final[tuple[Engine, ...]] = get_args(Engine)
-"""The first is the one that published figures come from."""
+"""Names of the engines; published figures come from the first."""
 
 _CLASSES: Final[dict[str, str]] = {
     "mujoco": "MujocoWorld",
@@ -23,19 +23,19 @@ _CLASSES: Final[dict[str, str]] = {
     "pybullet": "PybulletWorld",
 }
 EngineMissing = MissingExtraError
-"""The engine asked for is not installed; the message says how to get it."""
+"""The requested engine is not installed; the message says how to install it."""
 
 
 class WorldMaker(Protocol):
-    """How to build a world; ``parameters``: None for those that the scene names."""
+    """Builds a world. ``parameters``: None for those that the scene names."""
 
     def __call__(self, scene: Scene, parameters: WorldParameters | None = None) -> World:
-        """Build ``scene``; WorldError where the engine gives up."""
+        """World of ``scene``; WorldError if the engine fails."""
         ...
 
 
 def world_maker(engine: str) -> WorldMaker:
-    """How to build a world in ``engine``; `EngineMissing`, or ValueError: there is none such."""
+    """Builder of worlds in ``engine``; `EngineMissing`, or ValueError for an unknown name."""
     if engine not in _CLASSES:
         raise ValueError(f"unknown engine {engine!r}; available: {', '.join(ENGINES)}")
     require(engine, extra=EXTRAS[engine], what=f"engine {engine!r}")
@@ -44,5 +44,5 @@ def world_maker(engine: str) -> WorldMaker:
 
 
 def make_world(engine: str, scene: Scene, parameters: WorldParameters | None = None) -> World:
-    """Build ``scene`` in ``engine``, see `world_maker`."""
+    """World of ``scene`` in ``engine``; see `world_maker`."""
     return world_maker(engine)(scene, parameters)

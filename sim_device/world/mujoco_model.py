@@ -1,11 +1,11 @@
-"""A scene as a planar MuJoCo model.
+"""Scene as a planar MuJoCo model.
 
-Figures and their reasons come from trials of several engines: elliptic cones because pyramidal
-ones make jams slip, ``impratio`` 10 because at 1 objects creep at half their friction, 5 ms
-because 10 explodes. Each object slides in x, y, z and turns about z. A disc is a sphere, because
-only its outline in the plane matters and spheres are the cheapest; its box neighbours are tall.
-Weight rests on one massless support sphere whose torsional friction makes sliding and turning
-share one ellipsoidal limit surface, as a spread-out footprint does.
+The settings come from trials of several engines: elliptic cones because jams slip with pyramidal
+ones, ``impratio`` 10 because at 1 objects creep at half their friction, steps of 5 ms because it
+diverges at 10. Each object slides in x, y, z and turns about z. A disc is a sphere, because only
+its outline in the plane matters and spheres are the cheapest; the boxes beside it are tall.
+Weight rests on one massless support sphere. Its torsional friction gives sliding and turning one
+common ellipsoidal limit surface, as a wide footprint has.
 """
 
 from __future__ import annotations
@@ -23,20 +23,21 @@ from sim_device.world.scenes import Scene, SceneObject, Shape
 from tactile_core.geometry import FINGER_HEIGHT
 
 GRAVITY: Final = 9.81
-"""m/s²."""
+"""Acceleration of gravity, m/s²."""
 
 PLANE_HEIGHT: Final = 0.06
-"""m, of the plane in which all bodies are centred: half the height of a box."""
+"""Height of the plane in which all bodies are centred, m: half the height of a box."""
 
 SUPPORT_RADIUS: Final = 0.005
-"""m, of the sphere an object rests on."""
+"""Radius of the sphere that an object rests on, m."""
 
 DROP: Final = 1.0
-"""m, from the shelf to the floor in front of it, where what fell lies still and costs nothing."""
+"""Height of the shelf above the floor in front of it, m. What fell lies still there and costs
+nothing."""
 
 MOTOR_TIME: Final = 0.005
-"""s, time constant of the velocity motors: gains of 600 N·s/m and 10 N·m·s/rad on the finger of
-`authors_sim`. Shorter is stiffer than a physics step can follow."""
+"""Time constant of the velocity motors, s: gains of 600 N·s/m and 10 N·m·s/rad on the finger of
+`authors_sim`. A shorter one is stiffer than a physics step can follow."""
 
 CONTACT_SOLREF: Final = (0.01, 1.0)
 CONTACT_SOLIMP: Final = (0.95, 0.99, 0.0005, 0.5, 2.0)
@@ -51,7 +52,8 @@ BACK_WALL: Final = "back"
 
 
 def mean_lever(item: SceneObject) -> float:
-    """Mean distance in m of a footprint's points from its centre: torsional friction over sliding.
+    """Mean distance of a footprint's points from its centre, m: ratio of torsional to sliding
+    friction.
 
     Two thirds of the radius for a disc; for a rectangle the integral in closed form (0.383 of the
     side for a square).
@@ -65,14 +67,14 @@ def mean_lever(item: SceneObject) -> float:
 
 
 def yaw_inertia(item: SceneObject) -> float:
-    """Moment of inertia about the vertical through the centre, kg·m², of a homogeneous object."""
+    """Moment of inertia of a homogeneous object about the vertical through its centre, kg·m²."""
     if item.shape is Shape.DISC:
         return item.mass * item.radius**2 / 2
     return item.mass * (item.size_x**2 + item.size_y**2) / 12
 
 
 def base_spec(gravity: float = GRAVITY) -> mujoco.MjSpec:
-    """Empty model with the solver's settings. ``gravity`` in m/s², downwards."""
+    """Empty model with the solver's settings. ``gravity``: m/s², downwards."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     option = spec.option
@@ -151,11 +153,11 @@ def add_wall(
     *,
     moves: bool = False,
 ) -> None:
-    """Vertical plane through ``point`` facing the angle ``normal`` (rad in ``cupboard``).
+    """Add a vertical plane through ``point`` that faces the angle ``normal`` (rad in ``cupboard``).
 
-    ``moves``: it is a mocap body, at a price, so that it can be moved between steps.
+    ``moves``: makes it a mocap body, which costs time, so that it can be moved between steps.
     """
-    # Turn a plane's z axis to the horizontal, then about the vertical.
+    # Turn the plane's z axis to the horizontal, then about the vertical.
     c, s = math.cos(normal / 2), math.sin(normal / 2)
     h = math.sqrt(0.5)
     place = [*point, 0.0]
@@ -178,7 +180,7 @@ def add_wall(
 def add_ground(
     spec: mujoco.MjSpec, name: str, x: tuple[float, float], half_width: float, top: float
 ) -> None:
-    """Horizontal slab that objects rest on, from x[0] to x[1]; its upper face is at ``top``."""
+    """Add a horizontal slab for objects to rest on, from x[0] to x[1], upper face at ``top``; m."""
     half = (x[1] - x[0]) / 2
     spec.worldbody.add_geom(
         name=name,
@@ -192,7 +194,7 @@ def add_ground(
 
 def cupboard_model(scene: Scene, parameters: WorldParameters) -> mujoco.MjModel:
     """Model of ``scene``: objects ``object_<i>``, walls, shelf, ground, finger and its motors."""
-    # Heavier objects under a weaker pull: the same weight and friction, more inertia.
+    # Heavier objects under weaker gravity: the same weight and friction, more inertia.
     heavier = parameters.inertia_scale
     spec = base_spec(GRAVITY / heavier)
     friction = parameters.friction
@@ -217,7 +219,7 @@ def cupboard_model(scene: Scene, parameters: WorldParameters) -> mujoco.MjModel:
         )
     _add_finger(spec, scene, parameters)
     for name in walls:
-        # Friction of two surfaces is the greater of both, which is right but for this pair.
+        # MuJoCo uses the greater friction of two surfaces, which is right except for this pair.
         spec.add_pair(
             name=f"finger_{name}",
             geomname1=name,
@@ -231,9 +233,9 @@ def cupboard_model(scene: Scene, parameters: WorldParameters) -> mujoco.MjModel:
 
 
 def _add_finger(spec: mujoco.MjSpec, scene: Scene, parameters: WorldParameters) -> None:
-    """The finger: its outline extruded, three joints at the pivot, a velocity motor on each.
+    """Add the finger: its outline extruded, three joints at the pivot, a velocity motor on each.
 
-    It is built unturned, as a body's joints turn with it; set the start's heading as an angle.
+    It is built with heading 0, as a body's joints turn with it; set the start heading as an angle.
     """
     start = scene.start
     outline = np.asarray(parameters.outline)

@@ -1,4 +1,4 @@
-"""The cupboard in MuJoCo: the engine that every published figure comes from."""
+"""Cupboard in MuJoCo: the engine from which every published figure comes."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from tactile_core.arrays import FloatArray
 from tactile_core.types import Twist
 
 _FALLEN = -0.02
-"""m below the shelf at which an object counts as fallen; contacts give way by less than 1 mm."""
+"""Height below the shelf at which an object counts as fallen, m; contacts sink less than 1 mm."""
 
-# Otherwise MuJoCo prints, and writes MUJOCO_LOG.TXT wherever the process happens to stand.
+# Otherwise MuJoCo prints, and writes MUJOCO_LOG.TXT to the working directory.
 mujoco.set_mju_user_warning(logging.getLogger(__name__).debug)
 
 
@@ -67,7 +67,7 @@ class MujocoWorld:
         self._finger_push = data.qfrc_constraint[-3:]
         self._objects_qpos = data.qpos[: 4 * n].reshape(n, 4)
         self._objects_qvel = data.qvel[: 4 * n].reshape(n, 4)
-        # Counts by kind; none is harmless here, see mjtWarning.
+        # Counts by kind of warning; every kind is serious, see mjtWarning.
         self._warnings = data.warning.number
         self._start = scene.start
         self._steps = 0
@@ -80,7 +80,7 @@ class MujocoWorld:
 
     @property
     def scene(self) -> Scene:
-        """What it was built from."""
+        """Scene it was built from."""
         return self._scene
 
     @property
@@ -90,17 +90,17 @@ class MujocoWorld:
 
     @property
     def time(self) -> float:
-        """Simulated s since it was built."""
+        """Simulated time since it was built, s."""
         return self._steps * PHYSICS_STEP
 
     @property
     def model(self) -> Any:
-        """The ``mujoco.MjModel``, for viewers."""
+        """``mujoco.MjModel``, for viewers."""
         return self._model
 
     @property
     def data(self) -> Any:
-        """The ``mujoco.MjData``, for viewers."""
+        """``mujoco.MjData``, for viewers."""
         return self._data
 
     def step(self, dt: float, twist: Twist) -> None:
@@ -117,7 +117,7 @@ class MujocoWorld:
         fx, fy, mz = self._finger_push.tolist()
         for _ in range(count):
             pose = self._finger_qpos.tolist()
-            # A motor that answers to speed alone gives way under load: make up for the last one.
+            # A motor that answers to speed alone yields under load: compensate the last load.
             self._ctrl[:] = (
                 twist.vx - fx * MOTOR_TIME / mass,
                 twist.vy - fy * MOTOR_TIME / mass,
@@ -126,7 +126,7 @@ class MujocoWorld:
             mujoco.mj_step(model, data)
             u1, v1, w1 = self._finger_qvel.tolist()
             fx, fy, mz = self._finger_push.tolist()
-            # By momentum, what contacts did not give the finger, its motors did.
+            # By momentum balance, the motors gave the finger what contacts did not.
             work += (
                 (mass * (u1 - u0) - PHYSICS_STEP * fx) * (u0 + u1)
                 + (mass * (v1 - v0) - PHYSICS_STEP * fy) * (v0 + v1)
@@ -147,7 +147,7 @@ class MujocoWorld:
             )
 
     def _gather(self, pose: list[float]) -> None:
-        """Keep what touched the finger in the physics step just made; ``pose`` is from before it.
+        """Keep what touched the finger in the last physics step; ``pose`` is from before it.
 
         Loops, because a finger touches few things: arrays cost more to make than they save.
         """
@@ -205,7 +205,7 @@ class MujocoWorld:
         return self._contacts
 
     def finger(self) -> FingerState:
-        """Where the finger is, how it moves and what pushes it."""
+        """Pose, twist and wrench of the finger."""
         if self._state is None:
             x, y, heading = self._finger_qpos.tolist()
             fx, fy, mz = self._wrench
@@ -236,12 +236,12 @@ class MujocoWorld:
         return int(np.count_nonzero(~self.on_shelf()))
 
     def kinetic_energy(self) -> float:
-        """J, of finger and objects in the plane."""
+        """Kinetic energy of finger and objects in the plane, J."""
         doubled = float((self._mass * self._objects_qvel[:, [0, 1, 3]] ** 2).sum())
         doubled += float((np.array(self._finger_mass) * self._finger_qvel**2).sum())
         return doubled / 2
 
     @property
     def motor_work(self) -> float:
-        """J that the motors have put in since it was built."""
+        """Work of the motors since it was built, J; braking counts negative."""
         return self._work

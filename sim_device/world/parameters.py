@@ -1,10 +1,10 @@
-"""The two named sets of physical figures, and why each figure is what it is.
+"""The two named sets of physical parameters, with the reason for each value.
 
 Sources: "paper" is Tables I and II and the text of *Tactile-Informed Action Primitives Mitigate
 Jamming in Dense Clutter*; "simulator" is its authors' published PyBullet program, lengths divided
-by ten. Forces are not divided: their lengths grew tenfold with gravity and mass as they are, so
-that weight, friction and motor force kept their newtons, while moments had ten times the lever.
-Where neither says, the figure is ours, and the reason stands beside it.
+by ten. Forces are not divided: their lengths are ten times as great with gravity and mass as they
+are, so that weight, friction and motor force keep their newtons, while moments have ten times the
+lever. Where neither source gives a value it is ours, with the reason beside it.
 
 | figure | hardware | authors_sim | disagreement and decision |
 |---|---|---|---|
@@ -13,14 +13,14 @@ Where neither says, the figure is ours, and the reason stands beside it.
 | F_max | 15 N, paper | 10 N per world axis, simulator | per world axis in both: the paper's |
 | | | | bound on Fx and on Fy is that too |
 | M_max | 4.5 N·m, paper | 1.5 N·m, simulator | 15 at a tenfold lever is 1.5 |
-| time limit | 40 s, ours | 20 s, simulator | paper silent; at 20 s its own burrow cannot |
-| | | | arrive (v_max × 20 s × 0.385 < the way) |
+| time limit | 40 s, ours | 20 s, simulator | paper silent; within 20 s its own burrow |
+| | | | cannot arrive (v_max × 20 s × 0.385 < the way) |
 | success | 7.5 mm, paper | 1 mm, simulator | the outcomes give both |
 | cupboard | 0.38 × 0.53 m, paper | 0.375 × 0.55 m, simulator | each its own |
 | friction | as simulator | simulator | paper silent |
 | inertia | × 1 | × 10 | lengths ten times as great with forces and times |
-| | | | as they are: what moves there carries ten |
-| | | | times the momentum that its mass has here |
+| | | | as they are: what moves there has ten times the |
+| | | | momentum that its mass has here |
 | finger | 4 kg, 0.45 kg·m², ours | 3 kg, 0.05 kg·m², ours | its 1.0 × 10 would not be at rest |
 | | | | 0.1 s after the last command; its |
 | | | | 0.237 ÷ 10 would chatter at 5 ms |
@@ -36,12 +36,12 @@ from tactile_core.geometry import FINGER_OUTLINE
 from tactile_core.types import ARM_LIMITS, ArmLimits
 
 FINGER_WIDTH: Final = max(y for _, y in FINGER_OUTLINE) - min(y for _, y in FINGER_OUTLINE)
-"""m, of the finger as built."""
+"""Width of the finger as built, m."""
 
 
 @dataclass(frozen=True, slots=True)
 class Friction:
-    """Coulomb coefficients of each pair of materials."""
+    """Coulomb friction coefficient of each pair of materials."""
 
     objects: float
     object_shelf: float
@@ -50,22 +50,22 @@ class Friction:
     finger_wall: float
 
     def __post_init__(self) -> None:
-        """Refuse what the engines cannot represent."""
+        """Check that engines can represent these; ValueError."""
         if not 0 < self.objects <= min(self.object_wall, self.finger_object):
-            # Engines mix by the greater of two surfaces; object on object is the floor of that.
+            # Engines use the greater of two surfaces, so object on object is the lower limit.
             raise ValueError("object–object friction must be positive and the least of all")
 
 
 @dataclass(frozen=True, slots=True)
 class WorldParameters:
-    """Physical figures of one named set; SI.
+    """Physical parameters of one named set; SI.
 
-    ``limits``: what the arm is asked to keep. ``finger_mass`` kg, ``finger_inertia`` kg·m² about
-    the pivot: a velocity-controlled arm's apparent inertia, high enough that one physics step of
-    full force changes the speed by less than half its limit. ``goal_radius`` m, ``time_limit`` s.
-    ``inertia_scale``: by how much objects are harder to accelerate than their weight says; friction
-    goes by weight. ``lip``: m, how far the shelf reaches out in front of the front edge.
-    ``finger_width``: m, to which the finger's outline is stretched across.
+    ``limits``: limits asked of the arm. ``finger_mass`` kg, ``finger_inertia`` kg·m² about the
+    pivot: a velocity-controlled arm's apparent inertia, high enough that one physics step of full
+    force changes the speed by less than half its limit. ``goal_radius`` m, ``time_limit`` s.
+    ``inertia_scale``: factor from an object's mass by weight to its inertia; friction goes by
+    weight. ``lip``: m, how far the shelf reaches out in front of the front edge. ``finger_width``:
+    m, to which the finger's outline is stretched across.
     """
 
     name: str
@@ -130,7 +130,7 @@ WORLD_PARAMETERS: Final = MappingProxyType(
 
 
 def world_parameters(name: str) -> WorldParameters:
-    """Set called ``name``; ValueError that lists what exists."""
+    """Set called ``name``; ValueError lists the names."""
     try:
         return WORLD_PARAMETERS[name]
     except KeyError:

@@ -1,8 +1,8 @@
-"""The cupboard in Bullet (pybullet): the engine of the authors' simulator, at its scale and step.
+"""Cupboard in Bullet (pybullet): the engine of the authors' simulator, at its scale and step.
 
-Needs the optional extra ``reference``. It is here to tell what is the engine's doing from what is
-ours, and to measure our cost beside its cost in one run. Objects are free bodies in three
-dimensions, as there; figures that the authors left at Bullet's defaults are left so.
+Needs the optional extra ``reference``. It separates effects of the engine from effects of our
+model, and lets us measure our cost beside its cost in one run. As in the authors' simulator,
+objects are free bodies in three dimensions, and settings they left at Bullet's defaults stay there.
 """
 
 from __future__ import annotations
@@ -31,32 +31,33 @@ from tactile_core.geometry import FINGER_HEIGHT
 from tactile_core.types import Twist
 
 BULLET_STEP = 1 / 240
-"""s, the authors' and Bullet's own."""
+"""Time of one engine step, s: the authors' and Bullet's own."""
 
 UNITS = 10.0
-"""Lengths of theirs to a metre. Bullet's margins are made for bodies of about one unit."""
+"""The authors' length units per metre. Bullet's margins are made for bodies of about one unit."""
 
 CLEARANCE = 0.011
-"""m between shelf and finger."""
+"""Distance between shelf and finger, m."""
 
 _THICK = 0.5
-"""Units, half the thickness of shelf and walls: nothing tunnels."""
+"""Half the thickness of shelf and walls, units: thick enough that nothing tunnels."""
 _TALL = 2.0
-"""Units, half the height of the walls; theirs keep objects in, whatever happens."""
+"""Half the height of the walls, units; the authors' walls keep objects in under all conditions."""
 _FALLEN = -0.5
 """Units below the shelf at which an object counts as fallen."""
 
 
 Motion = list[tuple[float, float, float]]
-"""Of x, y and heading: m or rad, m/s or rad/s, N or N·m of the motor."""
+"""For each of x, y and heading: position (m or rad), speed (m/s or rad/s), motor force (N or
+N·m)."""
 
 
 class PybulletWorld:
-    """`World` on a Bullet model of ``scene``; ImportError where pybullet is not installed.
+    """`World` on a Bullet model of ``scene``; ImportError if pybullet is not installed.
 
     ``parameters``: None for the set that the scene names. Objects that overlap a wall are left to
-    the engine, as the authors leave theirs. A time that is asked for is passed by the number of
-    Bullet's steps nearest below, the rest is made up for in the next call.
+    the engine, as the authors leave theirs. Each call makes the whole number of Bullet steps next
+    below the time asked for; the next call makes up for the rest.
     """
 
     def __init__(self, scene: Scene, parameters: WorldParameters | None = None) -> None:
@@ -67,14 +68,14 @@ class PybulletWorld:
         self._bullet = bullet = pybullet
         self._client = client = bullet.connect(bullet.DIRECT)
         weakref.finalize(self, _disconnect, bullet, client)
-        # Forces and times are what they are in SI, so masses go by lengths; weights stay.
+        # Forces and times are in SI, so masses scale with lengths; weights stay.
         self._mass_units = parameters.inertia_scale / UNITS
         bullet.setGravity(0, 0, -GRAVITY / self._mass_units, physicsClientId=client)
         bullet.setPhysicsEngineParameter(
             fixedTimeStep=BULLET_STEP, deterministicOverlappingPairs=1, physicsClientId=client
         )
         friction = parameters.friction
-        # Bullet multiplies two surfaces: finger on wall comes out of the others.
+        # Bullet multiplies two surfaces: finger on wall follows from the others.
         self._of_object = math.sqrt(friction.objects)
         self._add_cupboard()
         self._objects = [self._add_object(item) for item in scene.objects]
@@ -88,7 +89,7 @@ class PybulletWorld:
         self._state = self._finger_state(self._motion(), [0.0] * 3, 1)
 
     def _body(self, mass: float, shape: int, place: FloatArray, yaw: float, friction: float) -> int:
-        """Body of ``mass`` (0: fixed) at ``place``, units."""
+        """Add a body of ``mass`` (0: fixed) at ``place``, units."""
         bullet, client = self._bullet, self._client
         turn = bullet.getQuaternionFromEuler((0, 0, yaw))
         body: int = bullet.createMultiBody(
@@ -100,7 +101,7 @@ class PybulletWorld:
     def _block(
         self, low: tuple[float, float, float], high: tuple[float, float, float], friction: float
     ) -> None:
-        """Fixed box between two corners, units; ``friction`` of objects on it."""
+        """Add a fixed box between two corners, units; ``friction``: that of objects on it."""
         a, b = np.array(low), np.array(high)
         bullet = self._bullet
         shape = bullet.createCollisionShape(
@@ -109,7 +110,7 @@ class PybulletWorld:
         self._body(0.0, shape, (a + b) / 2, 0.0, friction / self._of_object)
 
     def _add_cupboard(self) -> None:
-        """Shelf with its upper face at 0, and three walls."""
+        """Add the shelf, with its upper face at 0, and three walls."""
         depth, half = self._scene.depth * UNITS, self._scene.width / 2 * UNITS
         lip, far = -self._parameters.lip * UNITS, depth + _THICK
         wide = half + 2 * _THICK
@@ -137,7 +138,7 @@ class PybulletWorld:
         return self._body(item.mass * self._mass_units, shape, place, item.yaw, self._of_object)
 
     def _add_finger(self) -> int:
-        """Two slides and a hinge at the pivot; only the last link has a shape."""
+        """Add the finger: two slides and a hinge at the pivot; only the last link has a shape."""
         bullet, p, start = self._bullet, self._parameters, self._scene.start
         low = CLEARANCE * UNITS
         high = low + FINGER_HEIGHT * UNITS
@@ -152,7 +153,7 @@ class PybulletWorld:
         mass = p.finger_mass / UNITS
         body: int = bullet.createMultiBody(
             basePosition=[start.x * UNITS, start.y * UNITS, middle],
-            # Bullet wants every link to weigh something.
+            # Bullet requires every link to have mass.
             linkMasses=[mass / 1000, mass / 1000, mass],
             linkCollisionShapeIndices=[-1, -1, shape],
             linkVisualShapeIndices=[-1, -1, -1],
@@ -177,7 +178,7 @@ class PybulletWorld:
 
     @property
     def scene(self) -> Scene:
-        """What it was built from."""
+        """Scene it was built from."""
         return self._scene
 
     @property
@@ -187,7 +188,7 @@ class PybulletWorld:
 
     @property
     def time(self) -> float:
-        """Simulated s since it was built: what was asked for."""
+        """Simulated time since it was built, s: the time asked for."""
         return self._asked
 
     def step(self, dt: float, twist: Twist) -> None:
@@ -238,8 +239,10 @@ class PybulletWorld:
         return FingerState(x + start.x, y + start.y, heading, Twist(vx, vy, omega), fx, fy, mz)
 
     def _read(self, touches: list[Touch], wrench: list[float], motion: Motion) -> None:
-        """Add the touches of the step just made; ``motion`` is from before it, as Bullet's places
-        of contact are. ``wrench``: N, N, N·m about the pivot in ``cupboard``, summed.
+        """Add the touches of the last step.
+
+        ``motion`` is from before it, as Bullet's contact places are. ``wrench``: N, N, N·m about
+        the pivot in ``cupboard``, summed.
         """
         (px, _, _), (py, _, _), (heading, _, _) = motion
         px, py = px + self._scene.start.x, py + self._scene.start.y
@@ -257,14 +260,14 @@ class PybulletWorld:
             wrench[2] += x * fy - y * fx
             flat = math.hypot(nx, ny)
             if push <= 0.0 or flat < 0.5:
-                continue  # what bears on the finger from above or below is felt by no taxel
+                continue  # taxels do not feel what presses on the finger from above or below
             nx, ny = nx / flat, ny / flat
             touches.append(
                 (
                     self._body_of.get(other, WALL),
                     c * x + s * y,
                     c * y - s * x,
-                    # Outward of the finger is against what pushes it.
+                    # The finger's outward normal is opposite to the push.
                     -c * nx - s * ny,
                     -c * ny + s * nx,
                     c * fx + s * fy,
@@ -283,7 +286,7 @@ class PybulletWorld:
         return self._contacts
 
     def finger(self) -> FingerState:
-        """Where the finger is, how it moves and what pushes it."""
+        """Pose, twist and wrench of the finger."""
         return self._state
 
     def poses(self) -> FloatArray:
@@ -311,7 +314,7 @@ class PybulletWorld:
         return int(np.count_nonzero(~self.on_shelf()))
 
     def kinetic_energy(self) -> float:
-        """J, of finger and objects in the plane."""
+        """Kinetic energy of finger and objects in the plane, J."""
         p, twist = self._parameters, self._state.twist
         doubled = p.finger_mass * (twist.vx**2 + twist.vy**2) + p.finger_inertia * twist.omega**2
         for item, body in zip(self._scene.objects, self._objects, strict=True):
@@ -324,11 +327,11 @@ class PybulletWorld:
 
     @property
     def motor_work(self) -> float:
-        """J that the motors have put in since it was built."""
+        """Work of the motors since it was built, J; braking counts negative."""
         return self._work
 
 
 def _disconnect(bullet: Any, client: int) -> None:
-    """Give the engine's memory back; it has room for a thousand worlds in a process."""
+    """Free the engine's memory: one process has room for a thousand worlds."""
     if bullet.isConnected(client):
         bullet.disconnect(client)

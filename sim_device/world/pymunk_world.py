@@ -1,4 +1,4 @@
-"""The cupboard in Chipmunk (pymunk): a second opinion, for checking the first.
+"""Cupboard in Chipmunk (pymunk): a second engine, to check the first.
 
 Needs the optional extra ``crosscheck``. It differs from MuJoCo in kind: contacts solved by
 impulses in true two dimensions, friction as the product of two surfaces, shelf friction as a
@@ -30,17 +30,17 @@ from tactile_core.arrays import FloatArray
 from tactile_core.types import Twist
 
 ITERATIONS = 30
-"""Of the impulse solver; fewer let jams give way."""
+"""Iterations of the impulse solver; with fewer, jams give way."""
 
 SLOP = 1e-4
-"""m of overlap that is left alone, so that resting contacts persist."""
+"""Overlap that is left alone, m, so that resting contacts persist."""
 
 
 class PymunkWorld:
-    """`World` on a pymunk model of ``scene``; ImportError where pymunk is not installed.
+    """`World` on a pymunk model of ``scene``; ImportError if pymunk is not installed.
 
-    Same calls give the same motion to within rounding; not to the bit, as pymunk numbers shapes
-    through the life of the process.
+    Same calls give the same motion to within rounding, but not bit for bit, as pymunk numbers
+    shapes over the life of the process.
     """
 
     def __init__(self, scene: Scene, parameters: WorldParameters | None = None) -> None:
@@ -53,10 +53,10 @@ class PymunkWorld:
         self._space = space = pymunk.Space()
         space.iterations = ITERATIONS
         space.collision_slop = SLOP
-        # Half of an overlap is undone in 4 steps, as fast as MuJoCo's 10 ms.
+        # Half of an overlap is removed in 4 steps, as fast as MuJoCo's 10 ms.
         space.collision_bias = 0.5 ** (1 / (4 * PHYSICS_STEP))
         friction = parameters.friction
-        # Products of these give each pair's coefficient; finger on wall comes out as their product.
+        # Products of these give each pair's coefficient; finger on wall follows as their product.
         of_object = math.sqrt(friction.objects)
         of_wall = friction.object_wall / of_object
         self._bodies: dict[Any, int] = {space.static_body: WALL}
@@ -88,7 +88,7 @@ class PymunkWorld:
         self._contacts: tuple[FingerContact, ...] = ()
 
     def _add_object(self, pymunk: Any, item: SceneObject, friction: float, shelf: float) -> Any:
-        """Body of ``item`` with the shelf's friction as bounded joints to the ground."""
+        """Add a body for ``item`` with the shelf's friction as bounded joints to the ground."""
         heavier = self._parameters.inertia_scale
         body = pymunk.Body(heavier * item.mass, heavier * yaw_inertia(item))
         body.position = (item.x, item.y)
@@ -103,7 +103,7 @@ class PymunkWorld:
         slide = pymunk.PivotJoint(ground, body, (0, 0), (0, 0))
         turn = pymunk.GearJoint(ground, body, 0.0, 1.0)
         for joint, bound in ((slide, shelf * weight), (turn, shelf * weight * mean_lever(item))):
-            joint.max_bias = 0.0  # resists motion, pulls nothing back
+            joint.max_bias = 0.0  # resists motion, does not pull back
             joint.max_force = bound
         self._space.add(body, shape, slide, turn)
         self._bodies[body] = len(self._bodies) - 1
@@ -111,7 +111,7 @@ class PymunkWorld:
 
     @property
     def scene(self) -> Scene:
-        """What it was built from."""
+        """Scene it was built from."""
         return self._scene
 
     @property
@@ -121,7 +121,7 @@ class PymunkWorld:
 
     @property
     def time(self) -> float:
-        """Simulated s since it was built."""
+        """Simulated time since it was built, s."""
         return self._steps * PHYSICS_STEP
 
     def step(self, dt: float, twist: Twist) -> None:
@@ -137,7 +137,7 @@ class PymunkWorld:
         wrench = [0.0, 0.0, 0.0]
         push, before = self._push, (*finger.velocity, finger.angular_velocity)
         for _ in range(count):
-            # A motor that answers to speed alone gives way under load: make up for the last one.
+            # A motor that answers to speed alone yields under load: compensate the last load.
             motor = [
                 min(max(m / MOTOR_TIME * (want - speed) - load, -bound), bound)
                 for m, want, speed, load, bound in zip(
@@ -164,7 +164,7 @@ class PymunkWorld:
         self._contacts = merge_touches(touches, count)
 
     def _read(self, touches: list[Touch]) -> None:
-        """Add the touches of one physics step. A pair's force is shared among its points."""
+        """Add the touches of one physics step. A pair's force is divided among its points."""
         finger = self._finger
         c, s = math.cos(finger.angle), math.sin(finger.angle)
         origin = finger.position
@@ -194,7 +194,7 @@ class PymunkWorld:
         finger.each_arbiter(note)
 
     def _drop(self) -> None:
-        """Take off the shelf what has passed its front edge."""
+        """Remove objects that have passed the shelf's front edge."""
         for index, body in enumerate(self._objects):
             if self._shelf[index] and body.position.x < -self._parameters.lip:
                 self._shelf[index] = False
@@ -211,7 +211,7 @@ class PymunkWorld:
         return self._contacts
 
     def finger(self) -> FingerState:
-        """Where the finger is, how it moves and what pushes it."""
+        """Pose, twist and wrench of the finger."""
         body = self._finger
         fx, fy, mz = self._wrench
         return FingerState(
@@ -225,7 +225,7 @@ class PymunkWorld:
         )
 
     def poses(self) -> FloatArray:
-        """(n, 3) x, y m and yaw rad of each object, where it left the shelf if it fell."""
+        """(n, 3) x, y m and yaw rad of each object; for fallen ones, where they left the shelf."""
         rows = [[b.position.x, b.position.y, b.angle] for b in self._objects]
         return np.array(rows).reshape(len(rows), 3)
 
@@ -239,12 +239,12 @@ class PymunkWorld:
         return int(np.count_nonzero(~self._shelf))
 
     def kinetic_energy(self) -> float:
-        """J, of finger and objects on the shelf."""
+        """Kinetic energy of finger and objects on the shelf, J."""
         standing = [b for b, on in zip(self._objects, self._shelf, strict=True) if on]
         # pymunk's own figure lacks the half.
         return float(sum(b.kinetic_energy for b in (*standing, self._finger))) / 2
 
     @property
     def motor_work(self) -> float:
-        """J that the motors have put in since it was built."""
+        """Work of the motors since it was built, J; braking counts negative."""
         return self._work

@@ -1,4 +1,4 @@
-"""Scenes of the authors' simulator as recorded, and what happened in them."""
+"""Scenes recorded in the authors' simulator, and the outcomes of its trials in them."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ RECORDED = "authors_sim_recorded"
 """``Scene.source`` of these scenes."""
 
 AUTHORS_UNIT: Final = 0.1
-"""m to one length unit of the authors' simulator."""
+"""Metres per length unit of the authors' simulator."""
 
 MAX_BYTES = 16 << 20
-"""Decompressed size beyond which a file is none of ours; sixty scenes take 0.4 MB."""
+"""Largest decompressed size; a larger file is not ours. Sixty scenes take 0.4 MB."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """One trial of the reference.
 
-    ``distance``: of tip from goal at the end, over the cupboard's depth. ``success``: within
-    1 mm; ``entered``: ever within 7.5 mm, ``entered_step`` the step of 1/240 s at which.
+    ``distance``: from tip to goal at the end, over the cupboard's depth. ``success``: ended within
+    1 mm. ``entered``: came within 7.5 mm; ``entered_step``: the step of 1/240 s when it did.
     ``duration``: over the time limit. ``normal_force``: median, 90th percentile and maximum over
     the trial of the normal forces summed over the arm, N. ``ejected``: objects past the front.
     """
@@ -50,7 +50,7 @@ class Outcome:
 
 
 def load_recorded(path: Path) -> tuple[Scene, ...]:
-    """Scenes of ``scenes_*.json.gz``, in the file's order; SceneError that says what is wrong."""
+    """Scenes of ``scenes_*.json.gz``, in the file's order; SceneError says what is wrong."""
     try:
         with gzip.open(path, "rb") as stream:
             data = stream.read(MAX_BYTES + 1)
@@ -68,7 +68,7 @@ def load_recorded(path: Path) -> tuple[Scene, ...]:
 
 
 def load_outcomes(path: Path) -> tuple[Outcome, ...]:
-    """Rows of ``outcomes_*.csv``; SceneError that names the line."""
+    """Rows of ``outcomes_*.csv``; SceneError names the line."""
     try:
         with path.open(newline="", encoding="utf-8") as stream:
             reader = csv.DictReader(stream)

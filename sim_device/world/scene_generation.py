@@ -1,4 +1,4 @@
-"""Seeded scene generators: the same seed gives the same scene, to the last bit."""
+"""Seeded scene generators: the same seed gives the same scene, bit for bit."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from sim_device.world.scene_squeeze import Plate, push
 from sim_device.world.scenes import Pose, Scene, SceneObject, Shape
 
 PIVOT_X = -0.2
-"""m, the pivot at the start: the tip stands 42 mm in front of the cupboard (simulator)."""
+"""x of the pivot at the start, m: the tip is 42 mm in front of the cupboard (simulator)."""
 
 LATERAL = 0.15
-"""m, start and goal are uniform within ± this (simulator; the paper only says random)."""
+"""Start and goal are uniform within ± this, m (simulator; the paper only says random)."""
 
 BACK_CLEARANCE = 0.017
-"""m from goal to back wall: less than any object, so one at the goal must be displaced."""
+"""Distance from goal to back wall, m: less than any object, so one at the goal must be moved."""
 
 MAX_DRAWS = 10_000
-"""Draws of a place before a scene is given up; the fullest need some 400."""
+"""Draws of a place after which a scene is given up; the fullest need about 400."""
 
 _SCATTER_X: Final = (-0.2625, 0.6375)
 _SCATTER_Y: Final = 0.45
-"""m, where centres are scattered (simulator)."""
+"""Area where centres are scattered, m (simulator)."""
 
 _DISC_SHARE = 0.43
-"""Share of cylinders drawn. Places are refused to them more often than to boxes, so that 41 % are
-left, as in the recorded scenes; an even draw leaves 48 % and fills 0.41 of the area, not 0.37."""
+"""Share of cylinders drawn. They are refused a place more often than boxes, so that 41 % are left,
+as in the recorded scenes; an even draw leaves 48 % and fills 0.41 of the area, not 0.37."""
 
 _SHORT = 0.0003
-"""m that plates stop short of the cupboard's bounds, as in the recorded scenes."""
+"""Distance that plates stop short of the cupboard's bounds, m, as in the recorded scenes."""
 
 _GIVE = 0.0099
-"""m by which the plates of the first stage give way during the second: in the recorded scenes
-objects lie in heaps at the cupboard's depth and 9.6 mm beyond it."""
+"""Distance by which the plates of the first stage give way during the second, m: in the recorded
+scenes objects lie in heaps at the cupboard's depth and 9.6 mm beyond it."""
 
 _CLEARANCE = 1e-3
-"""m between objects of a grid scene, as a hand leaves."""
+"""Distance between objects of a grid scene, m, as left when placed by hand."""
 
 
 Range = tuple[int, int]
@@ -50,11 +50,11 @@ Range = tuple[int, int]
 
 
 def authors_sim(seed: int, objects: Range = (20, 30)) -> Scene:
-    """Scatter and squeeze as the authors' simulator does, then shelf them where they lie.
+    """Scatter and squeeze objects as the authors' simulator does, then put them on the shelf there.
 
-    Objects over 0.9 × 0.9 m, there 20 to 30, are pushed together by plates, first in x to 1 cm
-    beyond the cupboard's depth at either end, then in y to its width, in the simulator's scale
-    (see `push`); heights and masses are drawn afterwards, as there.
+    The 20 to 30 objects, scattered over 0.9 × 0.9 m, are pushed together by plates, first in x to
+    1 cm beyond the cupboard's depth at either end, then in y to its width, in the simulator's scale
+    (see `push`). Heights and masses are drawn afterwards, as in that simulator.
     """
     parameters = WORLD_PARAMETERS["authors_sim"]
     rng = np.random.default_rng(np.random.SeedSequence([seed, _STREAM["authors_sim"]]))
@@ -94,7 +94,7 @@ def authors_sim(seed: int, objects: Range = (20, 30)) -> Scene:
 
 
 def _scattered_object(rng: np.random.Generator) -> SceneObject:
-    """Cylinder or box anywhere on the scattering ground, unturned."""
+    """Cylinder or box anywhere on the scattering area, not turned."""
     if rng.random() < _DISC_SHARE:
         shape, (size_x, size_y) = Shape.DISC, [2 * rng.uniform(0.03, 0.05)] * 2
     else:
@@ -114,9 +114,9 @@ def _scattered_object(rng: np.random.Generator) -> SceneObject:
 def hardware(seed: int, objects: Range = (15, 22)) -> Scene:
     """Objects on a grid of 5 × 7 cells over 38 × 53 cm, as on the paper's bench.
 
-    Paper: footprints 4.3 to 8.8 cm square, 143 to 570 g, number and cells pseudo-random. Ours,
-    where it is silent: 15 to 22 objects (with these the prototype's rates came close to the
-    paper's), half of them discs, sizes and masses uniform, squared up with the shelf, nudged
+    From the paper: footprints 4.3 to 8.8 cm square, 143 to 570 g, number and cells pseudo-random.
+    Ours, where it is silent: 15 to 22 objects (with these the prototype's rates came close to the
+    paper's), half of them discs, sizes and masses uniform, aligned with the shelf, moved slightly
     within their cells. A cell is 7.6 cm, so neighbours of the largest do not fit and are redrawn.
     """
     parameters = WORLD_PARAMETERS["hardware"]
@@ -149,7 +149,7 @@ def _grid_object(
     depth: float,
     width: float,
 ) -> SceneObject:
-    """An object drawn for one cell: centred with 5 mm of a hand's spread, kept off the walls."""
+    """Object for one cell: centred to within 5 mm, as placed by hand, and kept off the walls."""
     disc = rng.random() < 0.5
     size_x, size_y = rng.uniform(0.043, 0.088, 2)
     if disc:
@@ -171,7 +171,7 @@ def _grid_object(
 
 
 def gap(a: SceneObject, b: SceneObject) -> float:
-    """Distance in m between two objects of yaw 0, negative or 0 where they overlap."""
+    """Distance in m between two objects of yaw 0; 0 or negative if they overlap."""
     dx, dy = abs(a.x - b.x), abs(a.y - b.y)
     discs = sum(o.radius for o in (a, b) if o.shape is Shape.DISC)
     for item in (a, b):
@@ -185,7 +185,7 @@ def gap(a: SceneObject, b: SceneObject) -> float:
 def _scene(
     name: str, seed: int, rng: np.random.Generator, objects: tuple[SceneObject, ...]
 ) -> Scene:
-    """Scene of ``objects`` with a start and a goal drawn."""
+    """Scene of ``objects`` with a random start and goal."""
     parameters = WORLD_PARAMETERS[name]
     return Scene(
         source=name,
@@ -207,21 +207,21 @@ class Generator(Protocol):
     """Makes the scene of a seed."""
 
     def __call__(self, seed: int, objects: Range = ...) -> Scene:
-        """Scene with so many objects."""
+        """Scene of ``seed``; ``objects``: least and greatest number of them."""
         ...
 
 
 GENERATORS: Final[Mapping[str, Generator]] = MappingProxyType(
     {"authors_sim": authors_sim, "hardware": hardware}
 )
-"""By the name a user gives."""
+"""Generators by the name a user gives."""
 
 
 def generate(name: str, seed: int, objects: Range | None = None) -> Scene:
-    """Scene ``seed`` of the generator ``name``; ValueError that lists what exists.
+    """Scene ``seed`` of the generator ``name``; ValueError lists the names.
 
-    ``objects``: how many there shall be, None for the generator's own range. RuntimeError where
-    they do not fit.
+    ``objects``: range of their number, None for the generator's own. RuntimeError if they do not
+    fit.
     """
     if seed < 0:
         raise ValueError(f"seed is {seed}; seeds are 0 or above")

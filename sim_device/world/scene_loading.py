@@ -14,17 +14,17 @@ FILE_PREFIX: Final = "recorded:"
 
 RECORDED_SCENES: Final = "scenes_1_60.json.gz"
 RECORDED_OUTCOMES: Final = "outcomes_1_60.csv"
-"""Names of the sixty scenes recorded in the authors' simulator, and of what happened in them.
+"""Files of the sixty scenes recorded in the authors' simulator, and of the outcomes in them.
 
-They are not part of this repository: nobody has put them under a licence."""
+They are not part of this repository: nobody has published them under a licence."""
 
 FOLDER_VARIABLE: Final = "TACTILE_SCENES_DIR"
-"""Environment variable that names the folder where they are."""
+"""Environment variable that names their folder."""
 
 _BESIDE = Path(__file__).resolve().parents[3] / "shared" / "data" / "authors_scenes"
 
 MAX_SCENE_BYTES: Final = 1 << 20
-"""A scene of 200 objects, the most there may be, takes 50 kB of JSON."""
+"""Largest scene file: a scene of 200 objects, the maximum, takes 50 kB of JSON."""
 
 
 def load_scene(name: str, seed: int) -> Scene:
@@ -32,7 +32,7 @@ def load_scene(name: str, seed: int) -> Scene:
 
     ``name``: a generator, ``authors_sim_recorded`` or ``recorded:FILE.json.gz`` (``seed`` is the
     scene's number there), or ``FILE.json``, which is one scene whatever the seed. SceneError or
-    ValueError that says what there is, RuntimeError where a generator cannot place its objects.
+    ValueError lists what is available; RuntimeError if a generator cannot place its objects.
     """
     if name in GENERATORS:
         return generate(name, seed)
@@ -48,10 +48,10 @@ def load_scene(name: str, seed: int) -> Scene:
 
 
 def find_recorded(name: str) -> Path:
-    """Where ``name``, a file of the recorded scenes, is; SceneError that says where to put it.
+    """Path of ``name``, a file of the recorded scenes; SceneError says where to put it.
 
-    Looked for in the folder that `FOLDER_VARIABLE` names, else in the user's data folder, else
-    beside the checkout.
+    Searched in the folder that `FOLDER_VARIABLE` names; if it is not set, in the user's data
+    folder, then beside the checkout.
     """
     told = os.environ.get(FOLDER_VARIABLE)
     data = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")

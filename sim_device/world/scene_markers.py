@@ -1,4 +1,4 @@
-"""The cupboard as markers, for the bus, a log and a 3D view: one message tells the whole scene."""
+"""Cupboard as markers, for the bus, logs and 3D views: one message holds the whole scene."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def scene_markers(world: World, wall_ns: int) -> Any:
     xs, ys = zip(*world.outline, strict=True)
     size = (max(xs) - min(xs), max(ys) - min(ys), FINGER_HEIGHT)
     middle = SHELF_CLEARANCE + FINGER_HEIGHT / 2
-    # A cube stands on its centre, the finger on its pivot.
+    # A cube's pose is that of its centre, the finger's is that of its pivot.
     ahead = (max(xs) + min(xs)) / 2
     x, y = (
         finger.x + ahead * math.cos(finger.heading),

@@ -1,4 +1,4 @@
-"""Objects on a shelf pushed about by moving plates: how scenes are squeezed and settled."""
+"""Push objects on a shelf with moving plates: used to squeeze and settle scenes."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from sim_device.world.parameters import WorldParameters
 from sim_device.world.scenes import Scene, SceneObject
 
 SETTLE_SPEED = 0.05
-"""m/s at which walls move out of objects: that of the finger, slow enough that nothing slides on
-(v² / 2μg = 0.6 mm)."""
+"""Speed at which walls move out of objects, m/s: that of the finger, slow enough that nothing
+slides on (v² / 2μg = 0.6 mm)."""
 
 REST = 0.1
-"""s of rest after the plates of a stage have stopped: contacts, 1 mm deep at 0.1 m/s, recover with
-a time constant of 10 ms."""
+"""Seconds of rest after the plates of a stage have stopped: contacts, 1 mm deep at 0.1 m/s, recover
+with a time constant of 10 ms."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plate:
-    """Vertical plate facing ``normal`` (rad), its face at ``offset`` m along the axis it moves on.
+    """Vertical plate facing ``normal`` (rad) that moves along x if that is 0 or π, else along y.
 
-    The axis is x where the normal is 0 or π, else y. It moves from ``start`` to ``end`` m, and
-    stands at ``rest`` m (at ``end`` where None) while later stages move.
+    Its face moves from ``start`` to ``end`` m, and stands at ``rest`` m (None: at ``end``) while
+    later stages move.
     """
 
     normal: float
@@ -51,8 +51,8 @@ def push(
 ) -> tuple[SceneObject, ...]:
     """Objects where the plates leave them; plates of one stage move together, then stand.
 
-    ``speed``: m/s. ``gravity``: m/s²; more of it stops what was pushed sooner and alters no
-    balance of forces between objects that are pushed slowly.
+    ``speed``: m/s. ``gravity``: m/s²; higher gravity stops pushed objects sooner and does not
+    change the balance of forces between objects that are pushed slowly.
     """
     spec = base_spec(gravity)
     add_ground(spec, "shelf", (-2.0, 2.0), 2.0, 0.0)
@@ -100,10 +100,10 @@ def push(
 
 
 def settled(scene: Scene, parameters: WorldParameters) -> tuple[SceneObject, ...]:
-    """Objects of ``scene`` after its walls have pushed them out of themselves.
+    """Objects of ``scene`` after its walls have pushed out those that overlap them.
 
-    The authors' scenes overlap the back wall by up to 1 cm; left to an engine, such an object
-    is shot through the cupboard.
+    The authors' scenes overlap the back wall by up to 1 cm; an engine would shoot such an object
+    through the cupboard.
     """
     half = scene.width / 2
     back = max((o.x + o.half_extent[0] for o in scene.objects), default=0.0)

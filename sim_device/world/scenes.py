@@ -1,4 +1,4 @@
-"""What stands in the cupboard, where the finger starts and where it is to go.
+"""Scenes: the objects in the cupboard, where the finger starts and where it is to go.
 
 Frame ``cupboard``: origin at the middle of the front edge, x into the cupboard, y left, angles
 counter-clockwise from x; SI at true scale.
@@ -18,7 +18,8 @@ SCENE_FORMAT = 1
 """Version of the JSON form; a reader refuses any other."""
 
 MAX_OBJECTS = 200
-"""A cupboard of this size holds about 100 of the smallest objects; more is a damaged file."""
+"""Most objects; a cupboard of this size holds about 100 of the smallest. More means a damaged
+file."""
 
 
 class Shape(StrEnum):
@@ -29,18 +30,18 @@ class Shape(StrEnum):
 
 
 class SceneError(ValueError):
-    """A scene that cannot be: which figure, what it was, what is allowed."""
+    """Invalid scene; the message gives the figure, its value and what is allowed."""
 
 
 def _finite(label: str, *values: float) -> None:
-    """Refuse NaN and infinity."""
+    """Check that all are finite; SceneError."""
     for value in values:
         if not math.isfinite(value):
             raise SceneError(f"{label} is {value}, not a finite number")
 
 
 def _positive(label: str, *values: float) -> None:
-    """Refuse all but finite numbers above 0."""
+    """Check that all are finite and above 0; SceneError."""
     _finite(label, *values)
     for value in values:
         if value <= 0:
@@ -49,10 +50,11 @@ def _positive(label: str, *values: float) -> None:
 
 @dataclass(frozen=True, slots=True)
 class SceneObject:
-    """A rigid object on the shelf.
+    """Rigid object on the shelf.
 
-    ``size_x``, ``size_y``: m, full sides of a box along its own axes, or a disc's diameter twice.
-    ``height`` m, ``mass`` kg; ``x``, ``y`` m and ``yaw`` rad of its centre in ``cupboard``.
+    ``size_x``, ``size_y``: m, full sides of a box along its own axes; for a disc, both are its
+    diameter. ``height`` m, ``mass`` kg; ``x``, ``y`` m and ``yaw`` rad of its centre in
+    ``cupboard``.
     """
 
     shape: Shape
@@ -65,7 +67,7 @@ class SceneObject:
     yaw: float
 
     def __post_init__(self) -> None:
-        """Refuse sizes and masses that no object has."""
+        """Check sizes, mass and pose; SceneError."""
         _positive("size of an object", self.size_x, self.size_y, self.height)
         _positive("mass of an object", self.mass)
         _finite("pose of an object", self.x, self.y, self.yaw)
@@ -79,7 +81,7 @@ class SceneObject:
 
     @property
     def area(self) -> float:
-        """Footprint in m²."""
+        """Area of the footprint, m²."""
         if self.shape is Shape.DISC:
             return math.pi * self.radius**2
         return self.size_x * self.size_y
@@ -98,7 +100,7 @@ class SceneObject:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """m, m and rad in ``cupboard``."""
+    """Position x, y, m, and heading, rad, in ``cupboard``."""
 
     x: float
     y: float
@@ -122,7 +124,7 @@ class Scene:
     objects: tuple[SceneObject, ...]
 
     def __post_init__(self) -> None:
-        """Refuse scenes that no world can be built from."""
+        """Check that a world can be built from it; SceneError."""
         world_parameters(self.parameters)
         _positive("depth of the cupboard", self.depth)
         _positive("width of the cupboard", self.width)
@@ -137,12 +139,12 @@ class Scene:
         return sum(o.area for o in self.objects) / (self.depth * self.width)
 
     def to_json(self) -> str:
-        """Text from which `from_json` makes an equal scene, to the last bit."""
+        """Text from which `from_json` makes an equal scene, bit for bit."""
         return json.dumps({"format": SCENE_FORMAT, **asdict(self)}, allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> Scene:
-        """Scene from `to_json`'s text; SceneError that says what is wrong."""
+        """Scene from `to_json`'s text; SceneError says what is wrong."""
         try:
             raw = json.loads(text)
         except json.JSONDecodeError as error:
