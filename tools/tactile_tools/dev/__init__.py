@@ -1,1 +1,1 @@
-"""Commands for those who work on the project; nothing a rig needs."""
+"""Commands for developers of the project; a rig needs none of them."""

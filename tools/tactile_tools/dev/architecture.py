@@ -1,8 +1,8 @@
 """Draw the structure of the code from its imports, for ``docs/architecture.md``.
 
 ``python -m tactile_tools.dev.architecture docs/pictures`` writes ``floors.svg`` (packages, their
-rooms and who imports whom), ``sample.svg`` and ``twist.svg`` (the files on the way of a taxel
-sample and of a twist). A way that the imports do not bear out is refused.
+subpackages and who imports whom), ``sample.svg`` and ``twist.svg`` (the files that a taxel sample
+and a twist pass through). It refuses a file there that does not exist or that nothing imports.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ SAMPLE = (
     ("tactiled.sensing.features", "forces to features"),
     ("tactiled.publisher", "to the bus and the log"),
 )
-"""The way of a taxel sample on a serial port, file by file."""
+"""Files that a taxel sample on a serial port passes through, in order."""
 
 TWIST = (
     ("reachd.strategies.builtin", "wants a twist"),
@@ -55,12 +55,12 @@ TWIST = (
     ("reachd.gate.gate", "final check"),
     ("reachd.arms.bus_arm", "signs and sends to the arm"),
 )
-"""The way of a twist from a strategy to the arm."""
+"""Files that a twist passes through from a strategy to the arm, in order."""
 
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """Modules with their lines, and imports between modules."""
+    """Modules with their number of lines, and imports between modules."""
 
     lines: dict[str, int]
     imports: dict[str, frozenset[str]]
@@ -107,9 +107,9 @@ def room(module: str, structure: Structure) -> tuple[str, str]:
 
 
 def check_way(way: Sequence[tuple[str, str]], structure: Structure) -> None:
-    """Every file of a way exists and is imported, directly or not, by one on the way or its shell.
+    """Check that every file of a way exists and that some module imports it.
 
-    ValueError names the first that is not.
+    ValueError names the first that fails.
     """
     names = [name for name, _ in way]
     for name in names:
@@ -197,7 +197,7 @@ def floors_svg(structure: Structure) -> str:
         if by <= ay:
             raise ValueError(f"{above} imports {below}, which is not below it")
         if by - (ay + ah) > FLOOR_GAP + 1:
-            continue  # arrows over a whole floor would only hide the nearer ones
+            continue  # arrows past a whole floor would only hide the nearer ones
         start = min(max(ax + aw / 2, bx + 20), bx + bw - 20) if aw > bw else ax + aw / 2
         end = min(max(start, bx + 20), bx + bw - 20)
         incoming[below] += 1
@@ -208,7 +208,7 @@ def floors_svg(structure: Structure) -> str:
 
 
 def way_svg(way: Sequence[tuple[str, str]], title: str) -> str:
-    """Files of a way from left to right, row after row."""
+    """Files of a way from left to right, row by row."""
     columns, width, height = 4, 262, 58
     parts = []
     for number, (name, job) in enumerate(way):
@@ -237,7 +237,7 @@ def way_svg(way: Sequence[tuple[str, str]], title: str) -> str:
 
 
 def pictures(structure: Structure) -> dict[str, str]:
-    """File name to SVG of every picture."""
+    """Pictures as SVG, by file name."""
     for way in (SAMPLE, TWIST):
         check_way(way, structure)
     return {

@@ -1,4 +1,4 @@
-"""``tactile bench``: every figure the project promises, measured side by side in one run."""
+"""``tactile bench``: measure every promised figure, side by side in one run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Figures = dict[str, float]
 class Group:
     """Figures measured together by ``function`` of ``module``, which takes ``quick``.
 
-    ``promised``: those of its figures that have an aim. ``asked``: it is measured only when named.
+    ``promised``: those of its figures that have an aim. ``asked``: measured only when named.
     """
 
     name: str
@@ -159,7 +159,7 @@ GROUPS = (
 
 @dataclass(frozen=True, slots=True)
 class Aim:
-    """A bound on a figure: at most or at least ``bound``."""
+    """Bound on a figure: at most or at least ``bound``."""
 
     relation: str  # "≤" or "≥"
     bound: float
@@ -207,7 +207,7 @@ AIMS: Mapping[str, Aim] = {
 
 
 def _group_of(name: str) -> str:
-    """Name of the group that is called ``name`` or has a figure called so."""
+    """Name of the group that has this name or a figure of this name; CommandError."""
     for group in GROUPS:
         if name in (group.name, *group.promised):
             return group.name
@@ -218,7 +218,7 @@ def _group_of(name: str) -> str:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure and print; 0 when every group ran, whether or not its aims were met."""
+    """Measure and print. Returns 0 if every group ran, whether or not its aims were met."""
     console = Console()
     only = None if not options.only else [_group_of(name) for name in options.only]
     chosen = [g for g in GROUPS if (not g.asked if only is None else g.name in only)]
@@ -277,7 +277,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _earlier(path: Path | None) -> dict[str, Any]:
-    """Return the report that is in ``path``, empty where there is none; ValueError."""
+    """Report in ``path``; empty if there is none. ValueError."""
     if path is None or not path.exists():
         return {}
     try:
@@ -295,7 +295,7 @@ def _range_of_loads(loads: Mapping[str, Any]) -> str:
 
 
 def machine() -> dict[str, object]:
-    """Return what a reader needs to judge the figures by: processor, cores, load, Python."""
+    """Processor, cores, load and Python, which a reader needs to judge the figures."""
     model = platform.processor() or platform.machine()
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
@@ -314,7 +314,7 @@ def machine() -> dict[str, object]:
 
 
 def table(figures: Figures) -> Table:
-    """Return figures beside their aims, as a table for a terminal."""
+    """Figures beside their aims, as a table for a terminal."""
     shown = Table(title="tactile bench")
     for heading, justify in (("figure", "left"), ("measured", "right"), ("aim", "right")):
         shown.add_column(heading, justify="right" if justify == "right" else "left")

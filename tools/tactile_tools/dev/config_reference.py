@@ -72,7 +72,7 @@ COLUMNS = ("Key", "Type", "Unit", "Range", "Default", "Meaning")
 
 
 def render() -> str:
-    """The whole page."""
+    """Text of the whole page."""
     parts = [HEAD, "\n".join(f"- [{t}](#{_anchor(t)})" for t, _, _ in FILES) + "\n"]
     seen: dict[Section, str] = {}
     for title, intro, schema in FILES:
@@ -119,7 +119,7 @@ def _row(cells: Sequence[str]) -> str:
 
 
 def _with_sets(header: str, key: Key) -> Key:
-    """``key`` with the defaults of the parameter sets, where it is one of them."""
+    """``key`` with the defaults of the parameter sets, if it is one of theirs."""
     if not header.startswith("[parameters"):
         return key
     sets = [s.safety if header.endswith("safety]") else s for s in SETS.values()]
@@ -128,14 +128,14 @@ def _with_sets(header: str, key: Key) -> Key:
 
 
 def _file_form(value: object) -> str:
-    """A value of a parameter set as a file writes it."""
+    """Value of a parameter set as a file writes it."""
     if isinstance(value, Region):
         return written(value.corners)
     return written(sorted(map(str, value)) if isinstance(value, frozenset) else value)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write the page, or say with 1 that it is out of date."""
+    """Write the page; with ``--check``, return 1 if it is out of date."""
     parser = argparse.ArgumentParser(prog="config_reference", description=__doc__)
     parser.add_argument("page", type=Path, help="docs/configuration.md")
     parser.add_argument("--check", action="store_true", help="write nothing; end with 1 if stale")

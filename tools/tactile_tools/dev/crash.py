@@ -31,18 +31,18 @@ from tactile_core.types import NS_PER_S
 from tactile_tools.dev.crash_writer import TRUTH
 
 ALLOWED_LOSS = 1.0
-"""s of log that a kill may cost (faults.md row 29)."""
+"""Seconds of log that a kill may cost (faults.md row 29)."""
 
 START_SHARE = 0.2
-"""Share of the kills that fall anywhere from the start of the process on, so also before and while
-its first file is opened; the others come after its first message."""
+"""Share of the kills that come anywhere from the start of the process on, also before and while
+its first file is opened. The others come after its first message."""
 
 START_TIME = 1.0
 RUN_TIME = 2.5
-"""s after the start, or after the first message, within which the kill comes."""
+"""Seconds after the start, or after the first message, within which the kill comes."""
 
 PATIENCE = 30.0
-"""s to wait for a writer's first message before giving up on it."""
+"""Seconds to wait for a writer's first message before giving up on it."""
 
 
 @dataclass(slots=True)
@@ -79,7 +79,8 @@ class Result:
 
 
 def _run_processes(options: argparse.Namespace) -> int:
-    """Kill the three processes; 0 when the arm rested each time and every log was read."""
+    """Kill the three processes. Returns 0 if the arm came to rest each time and every log was
+    read."""
     from tactile_tools.dev.process_kills import run_kills, write_json
 
     console = Console(stderr=True)
@@ -111,7 +112,8 @@ def _run_processes(options: argparse.Namespace) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Kill and check; 0 when every file was read and recovered with at most 1 s lost, else 1."""
+    """Kill and check. Returns 0 if every file was read and recovered with at most 1 s lost, else
+    1."""
     if options.processes:
         return _run_processes(options)
     started = time.monotonic()
@@ -151,7 +153,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _kills(count: int, writers: int, seed: int, keep: Path | None) -> Iterator[Kill]:
-    """Kill ``count`` writers, some at a time, in an order that only ``seed`` decides."""
+    """Kill ``count`` writers, several at a time; what each kill does depends only on ``seed``."""
     seeds = np.random.SeedSequence(seed).spawn(count)
     with ThreadPoolExecutor(writers) as pool:
         running: set[Future[Kill]] = set()
@@ -200,7 +202,7 @@ def _await_first(truth: Path, process: subprocess.Popen[bytes]) -> None:
 
 
 def judge(logs: Path, truth: Path) -> Kill:
-    """Read and recover every file in ``logs`` and compare with what was handed over."""
+    """Read and recover every file in ``logs`` and compare with what the writer recorded."""
     kill = Kill()
     kill.written, first_written_ns, last_written_ns = TRUTH.unpack(truth.read_bytes())
     last_read_ns = 0

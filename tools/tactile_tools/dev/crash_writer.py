@@ -1,6 +1,6 @@
-"""A process that does nothing but log, to be killed: ``python -m tactile_tools.dev.crash_writer``.
+"""A process that only logs, to be killed: ``python -m tactile_tools.dev.crash_writer``.
 
-It notes in a shared file what it handed to the recorder, so that whoever kills it knows the truth.
+It notes in a shared file what it gave to the recorder, so that whoever kills it can compare.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from tactile_core.log.recorder import Recorder, RecorderSettings
 from tactile_core.types import WallClock, monotonic_now
 
 TRUTH = struct.Struct("<QQQ")
-"""Messages handed over so far, wall-clock ns of the first and of the last."""
+"""Messages recorded so far, wall-clock ns of the first and of the last."""
 
 NAME = "b0"
 RATE = 100.0
-"""Hz of each of the three streams: a board at its usual rate."""
+"""Rate of each of the three streams, Hz: a board at its usual rate."""
 
 SPLIT_BYTES = 150_000
 """A file lasts about a second, so that many kills fall into the change of files."""
@@ -34,7 +34,7 @@ TAXELS = 80
 
 
 def run(directory: Path, truth: Path, seed: int, seconds: float) -> None:
-    """Log to ``directory`` for ``seconds``, noting what was handed over in the file ``truth``."""
+    """Log to ``directory`` for ``seconds``, noting what was recorded in the file ``truth``."""
     rng = np.random.default_rng(seed)
     with truth.open("r+b") as file:
         shared = mmap.mmap(file.fileno(), TRUTH.size)
@@ -93,13 +93,13 @@ def run(directory: Path, truth: Path, seed: int, seconds: float) -> None:
         hand_over(RAW, MSG.RawChunk(head, now_ns, 0, *none, raw), now_ns)
         cycle += 1
         now = time.monotonic()
-        due = max(due + 1 / RATE, now)  # a board that was not read in time does not hurry
+        due = max(due + 1 / RATE, now)  # do not catch up, as a board that was read late does not
         time.sleep(due - now)
     recorder.close()
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Command line of the process."""
+    """Parse the command line and run."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("directory", type=Path)
     parser.add_argument("truth", type=Path)

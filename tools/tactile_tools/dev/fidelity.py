@@ -1,4 +1,4 @@
-"""``tactile fidelity``: our engine against recorded outcomes of the authors' simulator."""
+"""``tactile fidelity``: compare our engine with recorded outcomes of the authors' simulator."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ REFERENCE_RATES = {
     "hybrid_event": (0.63, 0.52, 0.72),
 }
 REFERENCE_NAMES = {"clock": "hybrid_clock", "event": "hybrid_event"}
-"""What the recorded outcomes call our strategies, where they differ."""
+"""Names of our strategies in the recorded outcomes, where they differ."""
 
 PERTURBATION_M = 1e-4
-"""Standard deviation of a perturbed start across the cupboard: far below what matters to a user."""
+"""Standard deviation of a perturbed start across the cupboard: too small to matter to a user."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One trial: scene, strategy, and how it was perturbed (0: not at all)."""
+    """One trial: scene, strategy, and number of its perturbation (0: none)."""
 
     seed: int
     strategy: str
@@ -59,7 +59,7 @@ class Trial:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run, print and write the comparison; 0 when all of it ran."""
+    """Run, print and write the comparison. Returns 0 if all of it ran, 3 if data are missing."""
     console = Console()
     try:
         file = options.recorded or find_recorded(RECORDED_SCENES)
@@ -107,7 +107,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def outcomes_of(scenes: Path) -> Path:
-    """Outcomes that lie beside a file of scenes: outcomes_1_60.csv of scenes_1_60.json.gz."""
+    """Outcomes beside a file of scenes: outcomes_1_60.csv for scenes_1_60.json.gz."""
     name = scenes.name.removesuffix(".gz").removesuffix(".json")
     return scenes.with_name(name.replace("scenes", "outcomes", 1) + ".csv")
 
@@ -142,7 +142,7 @@ def _trial(task: tuple[Scene, str, int], engine: str, depth: str) -> Trial:
 
 
 def summarise(trials: Sequence[Trial], reference: dict[int, bool]) -> dict[str, float]:
-    """Success rates, agreement with the reference, and agreement of our own repeated runs."""
+    """Success rates, agreement with the reference, and agreement among our own repeated runs."""
     plain = {t.seed: t.success for t in trials if t.perturbed == 0}
     same = [plain[seed] == success for seed, success in reference.items() if seed in plain]
     repeats: dict[int, list[bool]] = {}

@@ -1,7 +1,7 @@
-"""``tactile fuzz``: spoil millions of frames and prove that none is accepted for another.
+"""``tactile fuzz``: corrupt millions of frames and check that none is accepted as another.
 
-``--through pipeline``: instead, frames with right CRCs that say anything at all, through tactiled's
-links and pipeline.
+``--through pipeline``: instead, pass frames with arbitrary content and right CRCs through
+tactiled's links and pipeline.
 """
 
 from __future__ import annotations
@@ -28,27 +28,28 @@ if TYPE_CHECKING:
     from tactile_tools.dev.fuzzers.pipeline import Kind
 
 BLOCK = 20_000
-"""Frames under one seed: the same blocks whatever the number of processes."""
+"""Frames per seed: the blocks are the same for any number of processes."""
 
 CAN_SHARE = 4
-"""One block in so many is CAN transfers."""
+"""One block in so many consists of CAN transfers."""
 
 PIPELINE_BLOCK = 4000
-"""Hostile frames under one seed, between an honest second and an honest board again."""
+"""Hostile frames per seed, between an honest second and an honest board again."""
 
 PIPELINE_KINDS: tuple[Kind, ...] = ("serial", "can", "floats")
-"""Taken in turn."""
+"""Kinds of port, taken in turn."""
 
 Totals = dict[str, Any]
 Progress = Callable[[int], None]
 
 
 def run_fuzz(frames: int, seed: int, progress: Progress | None = None, jobs: int = 1) -> Totals:
-    """Spoil ``frames`` frames and transfers; the totals are the same for any ``jobs``.
+    """Corrupt ``frames`` frames and transfers; the totals are the same for any ``jobs``.
 
-    ``progress`` is told how many frames more are done. ``wrong`` in the result counts messages
-    accepted that were not sent; ``lost`` never exceeds ``lost_allowed``: the frames touched, one
-    more for each that lost its end, and on CAN for each stray frame. ValueError for frames < 1.
+    ``progress`` is called with the number of frames done since the last call. ``wrong`` in the
+    result counts messages accepted that were not sent. ``lost`` never exceeds ``lost_allowed``: the
+    frames corrupted, one more for each that lost its end, and on CAN for each stray frame.
+    ValueError for frames < 1.
     """
     if frames < 1 or jobs < 1 or seed < 0:
         raise ValueError(f"frames {frames}, jobs {jobs}: at least 1 each; seed {seed}: at least 0")
@@ -81,11 +82,11 @@ def run_pipeline(
     first: int = 0,
     seconds: float = math.inf,
 ) -> Totals:
-    """``mutations`` hostile frames with right CRCs through links and pipeline, in blocks.
+    """Pass ``mutations`` hostile frames with right CRCs through links and pipeline, in blocks.
 
-    Each block repeats by its number: ``failures`` names those in which something gave way.
-    ``first``: number to begin at, ``seconds``: begin no block after so many. ``next_block``: where
-    to go on.
+    A block can be repeated by its number; ``failures`` lists the blocks in which something failed.
+    ``first``: number to begin at. ``seconds``: begin no block after this time. ``next_block`` in
+    the result: where to go on.
     """
     if mutations < 1 or jobs < 1 or seed < 0 or first < 0:
         raise ValueError(
@@ -140,17 +141,17 @@ def _pipeline_results(
 
 
 def _pipeline_block(job: tuple[int, int, int]) -> Totals:
-    """Totals of one block; runs in a process of its own."""
+    """Totals of one block; runs in its own process."""
     from tactile_tools.dev.fuzzers.pipeline import PipelineFuzzer
 
     seed, number, mutations = job
     kind = PIPELINE_KINDS[number % len(PIPELINE_KINDS)]
-    logging.disable(logging.CRITICAL)  # each lie is told of, thousands of times
+    logging.disable(logging.CRITICAL)  # every false claim is logged, thousands of times
     fuzzer = PipelineFuzzer(kind, np.random.default_rng([seed, number]))
     failure = ""
     try:
         fuzzer.run(mutations)
-    except Exception as error:  # noqa: BLE001 - what gives way in any manner is what is sought
+    except Exception as error:  # noqa: BLE001 - any exception at all is a finding
         failure = "".join(traceback.format_exception(error)[-4:])
     finally:
         logging.disable(logging.NOTSET)
@@ -177,7 +178,7 @@ def _results(blocks: list[tuple[int, int, int]], jobs: int) -> Iterator[Totals]:
 
 
 def _block(job: tuple[int, int, int]) -> Totals:
-    """Totals of one block; runs in a process of its own."""
+    """Totals of one block; runs in its own process."""
     seed, number, frames = job
     rng = np.random.default_rng([seed, number])
     on_can = number % CAN_SHARE == CAN_SHARE - 1
@@ -210,7 +211,7 @@ def _add(total: Totals, more: Totals) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fuzz; 1 when something was accepted wrongly or gave way."""
+    """Fuzz. Returns 1 if something was accepted wrongly or failed."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
     if options.out is not None and not options.out.parent.is_dir():
@@ -250,7 +251,7 @@ def _fuzz(options: argparse.Namespace, progress: Progress) -> Totals:
 
 
 def _tell_pipeline(result: Totals) -> int:
-    """Say what came of it; the exit status."""
+    """Print the result. Returns the exit status."""
     failures = result["failures"]
     oversized = sum(m["oversized"] for m in result["media"].values())
     print(

@@ -1,7 +1,7 @@
-"""``tactile mutation``: change the safety gate in small ways and see whether its tests notice.
+"""``tactile mutation``: make small changes to the safety gate and see whether its tests notice.
 
 A mutant that no test fails on is a survivor: either a test is missing, or the change makes no
-difference that matters. Works in a checkout only, for it needs the tests.
+difference that matters. It needs the tests, so it works only in a checkout.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ TESTS = (
     "test_gate_random.py",
 )
 RANDOM_INPUTS = "2000"
-"""Inputs of the random test for each mutant: what it finds it finds among the first."""
+"""Inputs of the random test for each mutant: what it finds, it finds among the first."""
 
 SWAPS: dict[type[ast.AST], tuple[type[Any], ...]] = {
     ast.Lt: (ast.LtE, ast.Gt),
@@ -79,7 +79,7 @@ class Mutant:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What became of a mutant: "killed", "survived" or "timeout"."""
+    """Fate of a mutant: "killed", "survived" or "timeout"."""
 
     mutant: Mutant
     fate: str
@@ -116,7 +116,7 @@ def variants(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def mutants(file: str, source: str) -> list[Mutant]:
-    """Every single change of ``source``; annotations and module constants are left alone."""
+    """Every single change of ``source``, except in annotations and module constants."""
     tree = ast.parse(source)
     found = []
     for holder in ast.walk(tree):
@@ -168,7 +168,7 @@ def trial(overlay: str, tests: Sequence[str]) -> None:
 
 
 def judge(package: Path, mutant: Mutant | None, tests: Sequence[str], limit: float) -> str:
-    """Fate of one mutant of ``package``, or of the package as it is where there is none."""
+    """Fate of one mutant of ``package``; None: of the unchanged package."""
     context = multiprocessing.get_context("forkserver")
     with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
         _copy(package, Path(folder) / "reachd")
@@ -239,7 +239,7 @@ def _line(mutant: Mutant) -> str:
 def _report(
     verdicts: list[Verdict], total: int, console: Console, options: argparse.Namespace
 ) -> int:
-    """Sum up, and write what survived; 1 when that is more than was allowed."""
+    """Print totals and write the survivors. Returns 1 if there are more than allowed."""
     survivors = sorted(
         (v.mutant for v in verdicts if v.fate == "survived"), key=lambda m: (m.file, m.line)
     )

@@ -1,7 +1,7 @@
 """``tactile crash --processes``: kill simulator, tactiled and reachd at random while they reach.
 
-After each kill the arm must come to rest, must stay at rest while the killed one comes back, and
-must move again only when an operator arms it; the log that was cut off must read and recover.
+After each kill the arm must come to rest, must stay at rest while the killed process comes back,
+and must move again only when an operator arms it. The log that was cut off must read and recover.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ from tactile_tools.reach.process_rig import LiveReach, WatchError, is_moving
 PROCESSES = ("tactiled", "reachd", "cupboard")
 
 MOVING_FOR_S = 4.0
-"""s of motion within which the kill comes."""
+"""Seconds of motion within which the kill comes."""
 
 REST_S = 0.5
-"""s after the kill within which the arm must rest: 200 ms to the zero twist, 100 for the arm's own
-expiry and braking (rows 13 and 15 of the fault table), and what an observer on a busy machine hears
-late."""
+"""Seconds after the kill within which the arm must rest: 200 ms to the zero twist, 100 for the
+arm's own expiry and braking (rows 13 and 15 of the fault table), and delays of an observer on a
+busy machine."""
 
 WATCH_S = 0.5
-"""s after the killed one is back in which nothing may move."""
+"""Seconds after the killed process is back in which nothing may move."""
 
 TRIES = 3
 """Reaches that may end before the kill comes."""
 
 AT_REST = 1e-3
-"""m/s, rad/s below which the arm is at rest."""
+"""Speed below which the arm is at rest, m/s and rad/s."""
 
 SCENE = ("--scene", "authors_sim")
 
 
 @dataclass(slots=True)
 class OneKill:
-    """``rest_s``: from the kill to rest, None where it did not move or the arm was killed."""
+    """``rest_s``: from the kill to rest; None if it did not move or the arm itself was killed."""
 
     number: int
     process: str
@@ -91,8 +91,8 @@ def run_kills(
 ) -> KillTotals:
     """Kill ``count`` times, from number ``first`` on; begin none after ``seconds``.
 
-    What kill n does is drawn from ``seed`` and n alone, so that a run can be gone on with. ``save``
-    gets the totals after each, as far as they go.
+    What kill n does is drawn from ``seed`` and n alone, so that a run can be continued. ``save``
+    gets the totals so far after each kill.
     """
     started = time.monotonic()
     totals = KillTotals(seed, first, count, next=first)
@@ -115,7 +115,7 @@ def run_kills(
                     save(asdict(totals))
                     progress(1)
         except WatchError as error:
-            # The rig cannot go on: told, counted, and another one is made for the next number.
+            # The rig cannot go on: count and report it, and make another for the next number.
             totals.problems.append(f"kill {totals.next}: {error}")
             totals.next += 1
             totals.kills += 1
@@ -140,7 +140,7 @@ def _sum_up(totals: KillTotals, rests: list[float], backs: list[float], started:
 def _one_rig(
     folder: Path, seed: int, numbers: Iterator[int], end: float, totals: KillTotals
 ) -> Iterator[OneKill]:
-    """Kills on one rig, until ``end`` or there are no more; its folder is emptied as it goes."""
+    """Kills on one rig, until ``end`` or all are done; its folder is emptied as it goes."""
     with LiveReach(folder, (*SCENE, "--seed", "0"), strategy="hybrid_event") as live:
         for number in numbers:
             yield _kill(live, folder, number, seed, totals)
@@ -185,7 +185,7 @@ def _kill(live: LiveReach, folder: Path, number: int, seed: int, totals: KillTot
 
 
 def _rest(live: LiveReach, killed_ns: int, kill: OneKill) -> float:
-    """s from the kill to the first state at rest after the last in motion."""
+    """Seconds from the kill to the first state at rest after the last in motion."""
     states = live.decoded(ARM_STATE)
     moving = [at for at, m in states if is_moving(m.twist, AT_REST)]
     rest = max(0.0, (max(moving, default=killed_ns) - killed_ns) / 1e9)
@@ -204,7 +204,7 @@ def _speaks(live: LiveReach, process: str) -> bool:
 
 
 def _read_log(folder: Path, kill: OneKill, totals: KillTotals) -> None:
-    """Read and recover what the killed process wrote; delete it when that went well."""
+    """Read and recover what the killed process wrote; delete it if that went well."""
     if kill.process == "cupboard":
         return
     written = sorted(folder.glob(f"{kill.process}-*.mcap"), key=lambda p: p.stat().st_mtime)
@@ -225,7 +225,7 @@ def _read_log(folder: Path, kill: OneKill, totals: KillTotals) -> None:
 
 
 def write_json(path: Path, values: dict[str, Any]) -> None:
-    """At once, so that a run that is interrupted leaves what it has."""
+    """Write in one step, so that an interrupted run leaves what it has."""
     new = path.with_name(f".{path.name}.new")
     new.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
     new.replace(path)

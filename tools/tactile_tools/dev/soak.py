@@ -1,4 +1,4 @@
-"""``tactile soak``: boards pulled out and plugged in for an hour; nothing may grow."""
+"""``tactile soak``: unplug and replug boards for an hour; nothing may grow."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ BOARDS = 4
 REPLUG_PERIOD_S = 1.0
 AWAY_S = 0.4
 WARM_UP_S = 30.0
-"""s of imports, first log chunks, the bounded windows of clock and tare filling."""
+"""Seconds for imports, the first log chunks, and the bounded windows of clock and tare to fill."""
 
 SAMPLE_S = 1.0
 KINDS = ("finger", "anyskin")
-"""Boards that say who they are, and boards that only stream."""
+"""Boards that identify themselves, and boards that only stream."""
 
 LOG_BYTES = 256 << 20
 """Bytes of logs kept, so that retention works for an hour as well."""
 
 GROWTH_MB = 20.0
-"""MB of resident memory between the first and the last twentieth that count as growth: what the
-allocator moves about is a few."""
+"""Resident memory gained from the first to the last twentieth, MB, that counts as growth: the
+allocator itself moves it by a few MB."""
 
 GROWTH_DESCRIPTORS = 4.0
 QUIET_S = 10.0
-"""s at the end without a replug and without a reading, for every board to come back in."""
+"""Seconds at the end without a replug and without a reading, for every board to come back in."""
 
 LATE_S = 30.0
-"""s more that a board may take to be back at the end, on a busy machine."""
+"""Extra seconds that a board may take to be back at the end, on a busy machine."""
 
 
 @dataclass(slots=True)
@@ -82,7 +82,7 @@ class Soak:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run it; 0 when nothing grew and every board came back."""
+    """Run the soak. Returns 0 if nothing grew and every board came back."""
     if options.out is not None and not options.out.parent.is_dir():
         print(f"tactile soak: --out {options.out}: there is no folder for it", file=sys.stderr)
         return 2
@@ -150,7 +150,8 @@ def _soak(soak: Soak) -> None:
 
 
 def _simulator(soak: Soak, pty: Path, index: int, seconds: float) -> list[str]:
-    """A board that is away for `AWAY_S` in its turn, until `QUIET_S` before the end."""
+    """Command line of a board that is away for `AWAY_S` in its turn, until `QUIET_S` before the
+    end."""
     kind = KINDS[index % 2]
     words = [command("simdevice"), "boards", "--pty", str(pty), "--seed", str(index + 1)]
     words += ["--kind", kind]
@@ -204,7 +205,7 @@ def _ends(values: list[float], part: int) -> tuple[float, float]:
 
 
 def _ask(soak: Soak, session: zenoh.Session, names: list[str]) -> None:
-    """What tactiled says of its boards; each must be streaming, and must have been replugged."""
+    """Check what tactiled reports of its boards: all must be streaming and have been replugged."""
     for name, status in _statuses(session, names):
         if status is None or status.get("state") != "streaming":
             state = "no answer" if status is None else status.get("state")

@@ -22,7 +22,7 @@ messages in CDR, the same bytes on the bus and in the log. `NAME` is the board, 
 
 
 def page() -> str:
-    """The whole page as Markdown."""
+    """Whole page as Markdown."""
     text = [HEAD]
     for topic in TOPICS:
         stale = "" if topic.stale_after is None else f"{topic.stale_after:g} s"

@@ -1,1 +1,1 @@
-"""What `tactile bench` measures, a module a group."""
+"""Benchmarks of `tactile bench`, one module per group."""

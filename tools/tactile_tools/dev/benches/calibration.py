@@ -1,4 +1,4 @@
-"""Benchmark of fitted models in the daemon: what one costs per board and frame."""
+"""Benchmark of fitted models in the daemon: cost per board and frame."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ PERIOD_S = 0.01
 
 
 def bench_calibration(*, quick: bool = False, seed: int = 0) -> dict[str, float]:
-    """Milliseconds a frame of the largest model of each kind that `calibrate fit` tries.
+    """Milliseconds per frame of the largest model of each kind that `calibrate fit` tries.
 
-    What a model says does not matter to its cost: its numbers are random.
+    The numbers in the models are random: they do not affect the cost.
     """
     frames = 500 if quick else 5000
     rng = np.random.default_rng(seed)
@@ -36,7 +36,7 @@ def bench_calibration(*, quick: bool = False, seed: int = 0) -> dict[str, float]
 
 
 def history_model(taxels: int, rng: np.random.Generator) -> NetModel:
-    """Creep, play operators and their products, as for a recording of force."""
+    """Model with creep, play operators and their products, as for a recording of force."""
     features = FeatureMap(
         tracker=RestTracker(near_ut=400.0, still_ut=80.0, tau_s=2.0),
         projection=rng.normal(size=(3 * taxels, COMPONENTS)) / 1000,
@@ -52,7 +52,8 @@ def history_model(taxels: int, rng: np.random.Generator) -> NetModel:
 
 
 def place_model(rng: np.random.Generator) -> NetModel:
-    """Radial basis functions over the pattern of five magnetometers, as for single touches."""
+    """Model with radial basis functions over the pattern of five magnetometers, as for single
+    touches."""
     features = FeatureMap(tracker=None, projection=np.eye(15) / 1000, direction=True)
     centres = Layer("rbf", rng.normal(size=(CENTRES, features.size)), np.array([0.01]))
     layers = (centres, Layer("linear", rng.normal(size=(CENTRES, 2)), np.zeros(2)))
@@ -74,7 +75,7 @@ def _model(targets: tuple[str, ...], features: FeatureMap, layers: tuple[Layer, 
 
 
 def _time(model: NetModel, frames: int, rng: np.random.Generator) -> FloatArray:
-    """(frames,) ms of each."""
+    """Time of each frame (frames,), ms."""
     field = rng.normal(size=(frames, 3 * model.taxels)) * 1000
     estimator = NetEstimator(model)
     times = np.empty(frames)

@@ -1,4 +1,4 @@
-"""How hard ordinary reaches press, as the wrist feels it."""
+"""Force of ordinary reaches, as the wrist measures it."""
 
 from __future__ import annotations
 
@@ -17,16 +17,15 @@ REACHES = 100
 REACHES_QUICK = 10
 
 AIMED_PEAK = 18.0
-"""N that no reach should exceed, the limit being 15."""
+"""Force that no reach should exceed, N; the limit is 15."""
 
 
 def bench_contact_force(*, quick: bool = False) -> dict[str, float]:
     """Return ``contact_*``: the force of reaches in the grid scenes 0 to 99 of ``hardware``.
 
-    ``peak_n_*``: greatest in-plane force that the arm reports in each reach, whose states are
-    means over 10 ms. ``above_limit_ms_max``: longest time without a break above the gate's limit
-    in any reach. ``success`` and ``held``: parts of the reaches that arrived, and that the gate
-    ended.
+    ``peak_n_*``: greatest in-plane force that the arm reports in each reach; its states are means
+    over 10 ms. ``above_limit_ms_max``: longest unbroken time above the gate's limit in any reach.
+    ``success`` and ``held``: shares of the reaches that arrived, and that the gate ended.
     """
     count = REACHES_QUICK if quick else REACHES
     values = parameters(SET)
@@ -65,5 +64,5 @@ def _longest_run(forces: list[float], limit: float) -> int:
 
 
 def _into(forces: list[float]) -> Callable[[Step], None]:
-    """Notes the in-plane force of each cycle."""
+    """Watcher that appends the in-plane force of each cycle to ``forces``."""
     return lambda step: forces.append(math.hypot(step.arm.fx, step.arm.fy))

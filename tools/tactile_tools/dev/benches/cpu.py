@@ -17,9 +17,9 @@ WARM_UP_S = 6.0  # imports, identification, tare
 
 
 def bench_cpu(*, quick: bool = False) -> dict[str, float]:
-    """Return ``tactiled_cpu_pct_1`` and ``_4``: percent of one processor, by fingers at 100 Hz.
+    """Return ``tactiled_cpu_pct_1`` and ``_4``: percent of one processor for 1 and 4 fingers.
 
-    Real tactileds with their logs, on simulated fingers of four arrays and 64 taxels each.
+    Real tactileds with logs, on simulated fingers of four arrays and 64 taxels each, at 100 Hz.
     """
     seconds = 8.0 if quick else 60.0
     return {f"tactiled_cpu_pct_{n}": _percent(n, seconds) for n in FINGERS}

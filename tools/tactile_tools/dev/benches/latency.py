@@ -1,4 +1,4 @@
-"""From the last byte written to a tty to features in another process, beside the bare hop."""
+"""Latency from the last byte written to a tty to features in another process, beside a minimum."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ with zenoh.open(config) as session, serial.Serial(sys.argv[1]) as port:
     while True:
         publisher.put(port.read(port.in_waiting or 1))
 """
-"""The least that could be done: bytes from the tty, as they come, to zenoh."""
+"""The minimum: bytes from the tty, as they come, to zenoh."""
 
 
 def bench_latency(*, quick: bool = False) -> dict[str, float]:
-    """Return ``wire_to_feature_ms_*`` and ``floor_ms_*``, taken in turn, 5 ms apart, at 100 Hz.
+    """Return ``wire_to_feature_ms_*`` and ``floor_ms_*``, measured in turn, 5 ms apart, at 100 Hz.
 
     ``wire``: from the return of the write of a cycle's last byte to the arrival of its features
     in this process. ``floor``: the same for raw bytes through a pty and a bare zenoh put.
@@ -107,7 +107,7 @@ def _tty() -> Iterator[tuple[int, str]]:
 
 
 class _Run:
-    """Plays the board, sends the bare bytes, and takes the time of what comes back."""
+    """Simulates the board, sends the bare bytes, and times what comes back."""
 
     def __init__(self, board_end: int, floor_end: int, tactiled: str, floor: str) -> None:
         self._board_end, self._floor_end = board_end, floor_end
@@ -120,7 +120,7 @@ class _Run:
         self._bare: list[float] = []
         self._counting = False
         self._session = open_session(BusConfig(listen=(), connect=(tactiled,)))
-        # The bare program asks for no proof of who reads it, so that this reader brings none.
+        # The bare program does not check who reads it, so this reader presents no keys.
         self._bare_session = open_session(BusConfig(listen=(), connect=(floor,), insecure=True))
         self._subscribers = (
             self._session.declare_subscriber(FEATURES.key(NAME), self._on_features),
@@ -170,7 +170,7 @@ class _Run:
                 self._sent[received.message.sequence] = written
 
     def _serve_until(self, due: Instant) -> None:
-        """Give the board what the host says, as soon as it comes, until ``due``."""
+        """Pass what the host sends to the board, as soon as it comes, until ``due``."""
         while (left := (due - monotonic_now()) * 1e-9) > 0:
             if select.select([self._board_end], [], [], left)[0]:
                 self._board.receive(os.read(self._board_end, 4096), monotonic_now())
@@ -180,6 +180,6 @@ class _Run:
         return np.asarray(self._wire), np.asarray(self._bare)
 
     def close(self) -> None:
-        """Leave the bus; without it the process would hang at exit."""
+        """Leave the bus; otherwise the process would hang at exit."""
         self._session.close()
         self._bare_session.close()

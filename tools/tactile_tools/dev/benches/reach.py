@@ -1,4 +1,4 @@
-"""Reaches: how fast they run in lockstep, and how punctual they are in real time."""
+"""Reaches: speed in lockstep, and punctuality in real time."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ SCENES = (0, 1, 19)
 
 OBJECTS = 25
 STRATEGY = "hybrid_event"
-"""The dearest of the strategies: it is in contact most of the time."""
+"""The most expensive of the strategies: it is in contact most of the time."""
 
 
 def bench_reach_speed(*, quick: bool = False) -> dict[str, float]:
-    """Return ``reach_rtf_contacts`` and ``reach_rtf_taxels``: simulated s a CPU-second.
+    """Return ``reach_rtf_contacts`` and ``reach_rtf_taxels``: simulated seconds per CPU-second.
 
     Whole trials of 25 objects: building the world, starting the board, physics, sensing at 25 Hz
     with every byte, strategy, safety gate and arm. Processor time of all threads of this process
-    counts. Depths and scenes are taken in turn; the worst scene is given as well.
+    counts. Depths and scenes alternate; the worst scene is given as well.
     """
     rates: dict[Depth, list[float]] = {"contacts": [], "taxels": []}
     totals: dict[Depth, list[float]] = {"contacts": [0.0, 0.0], "taxels": [0.0, 0.0]}
@@ -50,11 +50,11 @@ def bench_reach_speed(*, quick: bool = False) -> dict[str, float]:
 
 
 def bench_reference(*, quick: bool = False) -> dict[str, float]:
-    """Return ``speedup_vs_reference_engine``: what a simulated second costs in the authors' engine
-    over what it costs in ours, processor time of whole trials of 25 objects, taken in turn.
+    """Return ``speedup_vs_reference_engine``: cost of a simulated second in the authors' engine
+    over its cost in ours, as processor time of whole trials of 25 objects, run alternately.
 
     Bullet makes the authors' 240 steps a second at their scale (`PybulletWorld`); all else is ours
-    in both. EngineMissing where the extra ``reference`` is not installed.
+    in both. EngineMissing if the extra ``reference`` is not installed.
     """
     engines: tuple[Engine, ...] = ("mujoco", "pybullet")
     totals = {engine: [0.0, 0.0] for engine in engines}
@@ -98,8 +98,8 @@ def bench_reach_live(*, quick: bool = False) -> dict[str, float]:
 
     Lateness is that of every control cycle while reaching, as reachd reports it. Wire to twist:
     from the return of the write of a cycle's last byte to the arrival, in this process, of the
-    first command that was decided with these features or newer ones; the wait for the loop's next
-    deadline is in it. ``ordinary``: without the real-time priority that reachd takes where it may.
+    first command decided with these features or newer ones; it includes the wait for the loop's
+    next deadline. ``ordinary``: without the real-time priority that reachd takes where it may.
     """
     seeds = SCENES[:1] if quick else SCENES * 2
     late, wire = _punctuality(seeds, real_time=True)
@@ -142,10 +142,10 @@ def _wire_to_twist(live: LiveReach, states: list[Any]) -> list[float]:
     relay = live.relay
     if relay is None or not states:
         return []
-    # Both stamps of a control cycle are the same, so that they tell which command was its.
+    # State and command of a control cycle have the same stamp, so the stamp identifies the command.
     arrived = {_stamp(m.header): at for at, m in live.decoded(COMMAND)}
     decided = np.array([m.stamped_ns for m in states])
-    # The age is of 32 bits: right to some ns.
+    # The age has 32 bits: exact to a few ns.
     captured = decided - np.array([m.features_age for m in states], float) * NS_PER_S
     found = []
     for _, features in live.decoded(FEATURES):

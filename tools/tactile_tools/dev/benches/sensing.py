@@ -1,4 +1,4 @@
-"""Benchmarks of the sensing core: a cycle's time, consensus beside RANSAC, forces while turning."""
+"""Benchmarks of the sensing core: time of a cycle, consensus and RANSAC, forces while turning."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ LSB_XY_UT, LSB_Z_UT = 0.300, 0.484  # MLX90393 at gain 4
 
 
 def four_by_sixteen() -> SkinGeometry:
-    """Four arrays of 4 × 4 taxels round the finger's outline: both sides, both shoulders."""
+    """Four arrays of 4 × 4 taxels around the finger's outline: both sides, both shoulders."""
     pitch = (0.0165, 0.016)
     return SkinGeometry(
         "bench",
@@ -64,7 +64,7 @@ def bench_pipeline(
     """Milliseconds from the bytes of one cycle to its features, 4 arrays × 16 taxels.
 
     Every tenth cycle begins or ends a press of 2 N that covers a quarter of an array, so that
-    contacts and patches are there half of the time.
+    half of the cycles have contacts and patches.
     """
     cycles = cycles or (1000 if quick else 5000)
     rng = np.random.default_rng(seed)
@@ -125,12 +125,12 @@ def bench_pipeline(
 def bench_consensus(
     *, quick: bool = False, surfaces: int | None = None, repeats: int = 5, seed: int = 0
 ) -> dict[str, float]:
-    """Consensus beside scikit-learn's default RANSAC on the same surfaces, in one run.
+    """Compare consensus with scikit-learn's default RANSAC on the same surfaces, in one run.
 
     ``surfaces`` cycles of four 4 × 4 arrays for each of 0, 25 and 45 % of the taxels in contact:
     planes of 50 µT and ± 100 µT/m, noise of real chips, contacts of 0.5–5 N at 152 µT/N with 30 %
-    shear. Residual: rms over the taxels free of contact about the plane that was found;
-    ``_plane_error``: rms over all taxels of that plane about the true one.
+    shear. Residual: rms of the taxels free of contact about the plane found. ``_plane_error``: rms
+    over all taxels of the plane found about the true one.
     """
     surfaces = surfaces or (4 if quick else 20)
     rng = np.random.default_rng(seed)
@@ -177,8 +177,8 @@ def bench_consensus(
 class _Turn:
     """One turn of the board under steady contacts, cycle by cycle.
 
-    ``forces``: (T, N, 3) N measured. ``truth``: (N, 3) N. ``pressed``, ``unloaded``: (N,) bool.
-    ``still``: (N, 3) N, what the same skin gives in no ambient field, without noise.
+    ``forces``: (T, N, 3) N measured. ``truth``: (N, 3) N. ``pressed``: (N,) bool. ``still``:
+    (N, 3) N, what the same skin gives without ambient field and noise. ``valid``: share of cycles.
     """
 
     forces: FloatArray
@@ -199,13 +199,12 @@ def bench_rotation(
     """False forces while the board turns through 360° in 50 µT, uncompensated and compensated.
 
     0, 25 and 50 % of each array's taxels of the default finger are pressed with 0.5–5 N and 30 %
-    shear, in ``contact_sets`` random choices. Keys, percent p: ``rotation_METHOD_rms_n_p``: rms
-    over the free taxels' force components, noise included; ``rotation_METHOD_systematic_n_p``:
-    the same without the chips' noise; ``rotation_contact_bias_pct_p``: mean size of the
-    error of the pressed taxels' normal force, noise apart, against the same skin in no ambient
-    field, in % of the force;
-    ``rotation_contact_true_bias_pct_p``: against the true force, curvature of the dipole law and
-    all. ``quick`` leaves RANSAC out.
+    shear, in ``contact_sets`` random choices. Keys, for percent p: ``rotation_METHOD_rms_n_p``: rms
+    over the free taxels' force components, with noise; ``rotation_METHOD_systematic_n_p``: the same
+    without the chips' noise; ``rotation_contact_bias_pct_p``: mean size of the error of the pressed
+    taxels' normal force, without noise, against the same skin without ambient field, in % of the
+    force; ``rotation_contact_true_bias_pct_p``: against the true force, which includes the
+    curvature of the dipole law. ``quick`` leaves RANSAC out.
     """
     steps = steps or (90 if quick else 360)
     contact_sets = contact_sets or (1 if quick else 2)
@@ -237,7 +236,7 @@ def bench_rotation(
 
 
 def _relative(turn: _Turn, reference: FloatArray) -> FloatArray:
-    """Relative error of each pressed taxel's normal force at every step, one after another."""
+    """Relative error of each pressed taxel's normal force at every step, in one row."""
     error: FloatArray = (turn.forces[:, turn.pressed, 2] / reference[turn.pressed, 2] - 1).ravel()
     return error
 
@@ -296,7 +295,7 @@ def _turn(
             for cycle in pipeline.feed(block):
                 forces[k] = cycle.force
                 valid += bool(cycle.ambient.valid.all())
-    # the same skin under the same load in no ambient field, by the same calibration
+    # the same skin under the same load without ambient field, by the same calibration
     matrix_in = model.settled_field_ut(truth, 25.0) - model.settled_field_ut(0 * truth, 25.0)
     still = np.concatenate(
         [

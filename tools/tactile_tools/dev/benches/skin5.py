@@ -1,4 +1,4 @@
-"""Benchmark of a board of five magnetometers: what a press reads, and whether its bounds hold."""
+"""Benchmark of a board of five magnetometers: error of a press, and whether its bounds hold."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ FORCES_N = (0.5, 1.0, 2.0, 5.0, 10.0)
 RADII_M = (2e-3, 4e-3, 8e-3)
 PLACES_M = (-0.008, -0.004, 0.0, 0.004, 0.008)
 RAMP_S = 0.15
-"""s in which a press comes on."""
+"""Seconds in which a press reaches its full force."""
 TURN_AXIS = np.array([0.6, 0.48, 0.64])
 TURN_RAD_PER_S = 1.0
 
 
 class Board:
-    """A simulated AnySkin board with its factory calibration, under the sensing pipeline."""
+    """Simulated AnySkin board with its factory calibration, under the sensing pipeline."""
 
     def __init__(self, seed: int, method: Method = "consensus") -> None:
         self._rng = np.random.default_rng([seed, 5])
@@ -37,7 +37,7 @@ class Board:
         room = EnvironmentParameters(self_heating_k=0.0, room_c=25.0)
         self._environment = Environment(room)
         calibration = nominal_calibration(self.skin, "skin5")
-        # the rest field is the tare's: a calibration knows nothing of the earth's field here
+        # the rest field comes from the tare: this calibration does not contain the earth's field
         self._pipeline = BoardPipeline(calibration, PipelineSettings(method=method, auto_tare=True))
         self._cycle = 0
 
@@ -81,16 +81,16 @@ class Board:
 
 
 def bench_skin5(*, quick: bool = False, seed: int = 0) -> dict[str, float]:
-    """Figures of a five-chip board, factory calibration, compensation as it comes.
+    """Figures of a five-chip board with its factory calibration and default compensation.
 
-    ``skin5_force_error``: of presses of 0.5 to 10 N at 25 places with three indenters, the rms over
-    presses of the mean error of the normal force over what is allowed, the larger of 5 % and 0.1 N.
-    ``skin5_force_error_pct``, ``skin5_light_force_error_n``: rms in % from 2 N and in N below.
+    ``skin5_force_error``: for presses of 0.5 to 10 N at 25 places with three indenters, the rms
+    over presses of the mean error of the normal force over the allowed error, the larger of 5 % and
+    0.1 N. ``skin5_force_error_pct``, ``skin5_light_force_error_n``: rms in % from 2 N, in N below.
     ``skin5_press_coverage``: share of their cycles whose bound holds the truth.
     ``skin5_rest_n``: largest force of a still, untouched board. ``skin5_bound_coverage``: share of
     cycles whose bound holds the truth while the board turns at 1 rad/s in 50 µT with 0, 1, 3 and 5
-    chips pressed, the worst of the four; ``skin5_bound_median_n`` the median of the bounds;
-    ``skin5_bound_coverage_K``, ``skin5_bound_median_n_K``, ``skin5_valid_K`` for K chips.
+    chips pressed, the worst of the four; ``skin5_bound_median_n``: the median of the bounds;
+    ``skin5_bound_coverage_K``, ``skin5_bound_median_n_K``, ``skin5_valid_K``: for K chips.
     """
     rng = np.random.default_rng([seed, 55])
     return _presses(rng, quick) | _rest(rng, quick) | _turning(rng, quick)

@@ -1,4 +1,4 @@
-"""How soon a reach stands still when one of its three processes is stopped or killed."""
+"""Time until a reach stands still when one of its three processes is stopped or killed."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ NS_PER_MS = 1e6
 
 
 class SpoiltTrialError(RuntimeError):
-    """Nothing can be said: the arm was not moving, or the signal came too late."""
+    """The trial says nothing: the arm was not moving, or the signal came too late."""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Which process is hit, and how soon what is seen ends; from which of its words."""
+    """Process that is signalled, and how the time until its effect is measured."""
 
     figure: str
     process: str
@@ -41,10 +41,10 @@ class Case:
 def bench_stop(*, quick: bool = False) -> dict[str, float]:
     """Return ``stop_ms_max_*``: the longest of 20 SIGSTOPs and 20 SIGKILLs of each process.
 
-    ``features``, ``arm_state``: from the capture of the last that came to the arrival of the zero
-    twist after which no other came. ``commands``: from the arrival of the last command to the
-    first state, 200 a second, of an arm at rest. Each also split by signal. Empty shelf, straight
-    reach; ``stop_real_time`` is 1 where reachd was granted a real-time priority.
+    ``features``, ``arm_state``: from the capture of the last one that came to the arrival of the
+    zero twist after which only zero twists came. ``commands``: from the arrival of the last command
+    to the first state, 200 a second, of an arm at rest. Each is also split by signal. Empty shelf,
+    straight reach. ``stop_real_time``: 1 if reachd was granted a real-time priority.
     """
     times = TIMES_QUICK if quick else TIMES
     found: dict[str, list[float]] = {}
@@ -74,7 +74,7 @@ def bench_stop(*, quick: bool = False) -> dict[str, float]:
 
 
 def _trial(live: LiveReach, case: Case, number: signal.Signals, rng: np.random.Generator) -> float:
-    """ms from the last word of the process to standing still."""
+    """Milliseconds from the last message of the process to standing still."""
     for left in reversed(range(TRIES)):
         live.begin()
         live.until(live.moving, "motion")
@@ -100,7 +100,7 @@ def _trial(live: LiveReach, case: Case, number: signal.Signals, rng: np.random.G
 
 
 def zero_after(live: LiveReach, topic: Topic, since: int) -> float:
-    """ms from the capture of the last ``topic`` to the arrival of the zero twist for good."""
+    """Milliseconds from capture of the last ``topic`` to arrival of the final zero twist."""
     kept = live.decoded(topic)
     commands = live.decoded(COMMAND)
     moving = [k for k, (_, m) in enumerate(commands) if is_moving(m.twist)]
@@ -112,7 +112,7 @@ def zero_after(live: LiveReach, topic: Topic, since: int) -> float:
 
 
 def rest_after(live: LiveReach, since: int) -> float:
-    """ms from the arrival of the last command to the first state of an arm at rest."""
+    """Milliseconds from the arrival of the last command to the first state of an arm at rest."""
     commands, states = live.decoded(COMMAND), live.decoded(ARM_STATE)
     moving = [k for k, (_, m) in enumerate(states) if is_moving(m.twist)]
     if not commands or not moving or states[moving[-1]][1].captured_ns < since:

@@ -1,4 +1,4 @@
-"""Reaching for an hour on a machine that has more to do than it can."""
+"""Reaching for an hour on an overloaded machine."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ while True:
     heap = [[random.random() for _ in range(50)] for _ in range(20_000)]
     sum(sum(row) for row in heap)
 """
-"""Keeps a processor busy and its caches and memory churned."""
+"""Keeps a processor busy and disturbs its caches and memory."""
 
 
 def bench_stress(*, quick: bool = False) -> dict[str, float]:
-    """Return lateness of every control cycle of an hour, ms, with a busy process a processor.
+    """Return the lateness of every control cycle of an hour, ms, with a busy process per processor.
 
-    Reaches in three real processes go on meanwhile, one after another. ``stress_late_moving``:
-    cycles more than 50 ms late that commanded anything but zero. ``stress_real_time``: 1 where
-    reachd was granted a real-time priority.
+    Meanwhile reaches in three real processes follow one another. ``stress_late_moving``: cycles
+    more than 50 ms late that commanded anything but zero. ``stress_real_time``: 1 if reachd was
+    granted a real-time priority.
     """
     seconds = SECONDS_QUICK if quick else SECONDS
     late: list[float] = []
@@ -48,7 +48,7 @@ def bench_stress(*, quick: bool = False) -> dict[str, float]:
             end = time.monotonic() + seconds
             while time.monotonic() < end:
                 live.clear()
-                # A loaded machine may stop feeling or moving for a second: then it is armed anew.
+                # On a loaded machine sensing or the arm may stop for a second: then arm it again.
                 with contextlib.suppress(WatchError):
                     live.begin(reaches)
                     reaches += 1
@@ -75,7 +75,7 @@ def bench_stress(*, quick: bool = False) -> dict[str, float]:
 
 @contextlib.contextmanager
 def _burners() -> Iterator[None]:
-    """A busy process for every processor while the block runs."""
+    """Run a busy process for every processor while the block runs."""
     burners = [subprocess.Popen([sys.executable, "-c", BURNER]) for _ in range(os.cpu_count() or 1)]
     try:
         yield

@@ -1,4 +1,4 @@
-"""The live page beside the raw bus, and what the client costs above the codec."""
+"""Latency of the live page beside the raw bus, and cost of the client above the codec."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WAIT_S = 120.0
 
 @contextlib.contextmanager
 def _finger(folder: Path) -> Iterator[str]:
-    """A simulated finger at 100 Hz and its tactiled; yields the endpoint."""
+    """Simulated finger at 100 Hz and its tactiled; yields the endpoint."""
     board, endpoint = folder / "b", socket_at(folder, "tactiled")
     daemon = [command("tactiled"), "--port", str(board), "--name", NAME, "--no-log"]
     with running(
@@ -44,8 +44,8 @@ def bench_view(*, quick: bool = False) -> dict[str, float]:
     """Return ``view_latency_ms_p50``, ``_p99`` and ``view_cpu_pct`` with one viewer.
 
     Latency: from the arrival of features at a raw subscriber in this process to that of the first
-    frame that holds them or later ones, over all features. ``view_cpu_pct``: of one core, all of
-    the page's process.
+    frame that holds them or later ones, over all features. ``view_cpu_pct``: percent of one core,
+    for the page's whole process.
     """
     seconds = 8.0 if quick else 40.0
     with tempfile.TemporaryDirectory(prefix="tactile-view-") as name:
@@ -82,7 +82,7 @@ def _watch(port: int, endpoint: str, pid: int, seconds: float) -> dict[str, floa
         close_session(session)
     if len(shown) < 2 or len(bus) < 10:
         raise RuntimeError(f"only {len(shown)} frames and {len(bus)} features came")
-    # Both are in the order of their sequence numbers, but for a tare that begins anew.
+    # Both are in the order of their sequence numbers, except for a tare, which starts again.
     late, at = [], 0
     for came, sequence in bus:
         while at < len(shown) and shown[at][1] < sequence:
@@ -125,10 +125,10 @@ def _take(socket: ClientConnection, shown: list[tuple[int, int]], seconds: float
 
 
 def bench_client(*, quick: bool = False) -> dict[str, float]:
-    """Return ``client_us``, ``codec_us`` and ``client_overhead_us``, medians a features message.
+    """Return ``client_us``, ``codec_us`` and ``client_overhead_us``, medians per features message.
 
-    ``client``: from a sample in zenoh's callback to typed features in the reader's hands.
-    ``codec``: decoding of the same bytes alone, in turn with it.
+    ``client``: from a sample in zenoh's callback to typed features at the reader.
+    ``codec``: decoding of the same bytes alone, measured alternately.
     """
     rounds = 3 if quick else 10
     with tempfile.TemporaryDirectory(prefix="tactile-client-") as name:
@@ -147,7 +147,7 @@ def bench_client(*, quick: bool = False) -> dict[str, float]:
                 raise RuntimeError(f"only {len(samples)} features came")
             subscriber.undeclare()
             stream = bus.board(NAME).features()
-            stream.close()  # what follows comes from the samples kept, one by one
+            stream.close()  # from here on it gets the samples kept, one by one
             stream._closed = False
             client, bare = [], []
             for _ in range(rounds):

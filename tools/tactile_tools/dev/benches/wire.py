@@ -27,7 +27,7 @@ BURST = 45  # frames written at once: below the 4,000 bytes at which the baselin
 
 
 def bench_decode(*, quick: bool = False) -> dict[str, float]:
-    """Return ``decode_fps``: serial frames of about 250 bytes a second of one core."""
+    """Return ``decode_fps``: serial frames of about 250 bytes per second on one core."""
     rng = np.random.default_rng(0)
     taxels = next(n for n in range(1, 129) if len(_samples(rng, 0, n)) >= FRAME_BYTES)
     stream = b"".join(_samples(rng, s, taxels) for s in range(FRAMES))
@@ -47,9 +47,9 @@ def bench_decode(*, quick: bool = False) -> dict[str, float]:
 def bench_anyskin(*, quick: bool = False) -> dict[str, float]:
     """Return ``anyskin_speedup``: CPU time of AnySkin's host loop over ours, same bytes, same pty.
 
-    The published loop runs in a process of its own and hands each sample over through shared
-    memory; ``anyskin_speedup_bare`` leaves that handing over out. Ours decodes to arrays, burst by
-    burst; ``anyskin_speedup_one_by_one`` makes an object of every frame instead.
+    The published loop runs in its own process and passes each sample through shared memory;
+    ``anyskin_speedup_bare`` leaves that out. Ours decodes to arrays, burst by burst;
+    ``anyskin_speedup_one_by_one`` makes an object of every frame instead.
     """
     rng = np.random.default_rng(0)
     burst = b"".join(_anyskin_frame(rng) for _ in range(BURST))
@@ -102,9 +102,9 @@ def _median_cpu_seconds(work: Callable[[], object], repeats: int) -> float:
 
 
 def _timed(read_all: Callable[[], None], master: int, burst: bytes) -> float:
-    """CPU seconds to read a burst that already lies in the tty; mean of several in a row.
+    """CPU seconds to read a burst that is already in the tty; mean of several in a row.
 
-    In a row, because each reader would otherwise pay for the caches the other one has just taken.
+    In a row, because otherwise each reader would pay for the caches that the other one has filled.
     """
     spent = 0.0
     for _ in range(IN_A_ROW):
@@ -116,7 +116,7 @@ def _timed(read_all: Callable[[], None], master: int, burst: bytes) -> float:
 
 
 def _ours(port: serial.Serial, decoder: AnySkinDecoder) -> None:
-    """What tactiled does with a burst: read what there is, decode."""
+    """Do what tactiled does with a burst: read what there is, decode."""
     left = BURST * (16 * MAGNETOMETERS + 2)
     while left:
         data = port.read(port.in_waiting or 1)
@@ -134,7 +134,7 @@ def _ours_one_by_one(port: serial.Serial, decoder: AnySkinDecoder) -> None:
 
 
 class _SharedSample:
-    """What the published loop keeps for its parent process: time, reading and count."""
+    """Shared memory of the published loop for its parent process: time, reading and count."""
 
     def __init__(self) -> None:
         self.time = multiprocessing.Value(ctypes.c_double)
@@ -145,8 +145,8 @@ class _SharedSample:
 def _baseline(port: serial.Serial, shared: _SharedSample | None) -> None:
     """Do for one burst what the AnySkin library's host loop does, sample by sample.
 
-    It asks how much waits (once against overflow, once for a whole frame), reads just one frame,
-    checks CR LF, unpacks with a format string made anew, makes an array and drops the
+    It asks how many bytes wait (once against overflow, once for a whole frame), reads just one
+    frame, checks CR LF, unpacks with a format string made each time, makes an array and drops the
     temperatures. Its busy waiting for the next frame costs nothing here: the bytes are there.
     """
     size = 16 * MAGNETOMETERS + 2

@@ -1,1 +1,1 @@
-"""What `tactile fuzz` spoils, a module a codec."""
+"""Fuzzers of `tactile fuzz`, one module per codec."""

@@ -1,4 +1,4 @@
-"""Spoilt CAN buses: frames of several boards interleaved, lost, moved, changed and grafted."""
+"""Corrupted CAN buses: frames of several boards interleaved, lost, moved, changed and grafted."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ POOL = 600
 BOARDS = (0, 5, 77, 126)
 FD_BOARDS = frozenset({5, 126})
 TRANSFERS = 32
-"""Per board and batch."""
+"""Transfers per board and batch."""
 
 MAX_TAXELS = 32
-"""Longer samples are 130 frames of CAN 2.0B each and teach nothing new."""
+"""Most taxels of a message: longer samples take 130 frames of CAN 2.0B and test nothing new."""
 
 KINDS = (
     "flip_data",
@@ -42,7 +42,7 @@ _HARMLESS = frozenset({"duplicate", "intact"})
 
 
 class CanFuzzer:
-    """One bus with its decoder; `run` may be called again and again."""
+    """One bus with its decoder; `run` may be called repeatedly."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -59,11 +59,11 @@ class CanFuzzer:
 
     @property
     def counters(self) -> dict[str, int]:
-        """Those of the decoder."""
+        """Counters of the decoder."""
         return self._decoder.counters
 
     def run(self) -> int:
-        """Send one batch; how many transfers were spoilt."""
+        """Send one batch. Returns how many transfers were corrupted."""
         before = self.touched
         queues: list[list[CanFrame]] = []
         for board in BOARDS:
@@ -74,7 +74,7 @@ class CanFuzzer:
         return self.touched - before
 
     def finish(self) -> None:
-        """Nothing waits on a bus: an unfinished transfer was spoilt."""
+        """Do nothing: on a bus nothing waits, and an unfinished transfer was corrupted."""
 
     def _transfers(self, board: int) -> tuple[list[Hashable], list[list[CanFrame]]]:
         """Keys and frames of the messages that a board sends in one batch."""
@@ -85,7 +85,7 @@ class CanFuzzer:
         return names, [list(self._encoders[board].encode(message)) for message, _ in chosen]
 
     def _spoil(self, names: list[Hashable], transfers: list[list[CanFrame]]) -> list[CanFrame]:
-        """Frames of one board after each transfer met with its fate."""
+        """Frames of one board, with each transfer mutated."""
         out: list[CanFrame] = []
         delayed: list[CanFrame] = []
         kinds = self._rng.integers(0, len(KINDS), len(transfers)).tolist()
@@ -95,14 +95,14 @@ class CanFuzzer:
             self.kinds[kind] += 1
             spoilt, later = self._one(kind, list(frames), transfers, r)
             if kind == "repeat_later" and len(frames) == 1:
-                # The whole message was sent twice. Only at once is that told from a new one.
+                # The whole message was sent twice; a later copy cannot be told from a new one.
                 self.judge.send(name)
             if spoilt != frames and kind not in _HARMLESS:
                 self.touched += 1
             out += spoilt
-            # What stays behind turns up in the middle of whatever is sent two transfers on.
+            # Delayed frames appear in the middle of whatever is sent two transfers later.
             if len(delayed) > 2 or (delayed and r[3] % 3 == 0):
-                # Not between a frame and its repetition, which would then be a message of its own.
+                # Not between a frame and its repetition, which would then be a separate message.
                 at = len(out) - (0 if kind == "duplicate" else r[3] % (len(spoilt) + 1))
                 out[at:at] = delayed
                 self.strays += len(delayed)
@@ -114,7 +114,7 @@ class CanFuzzer:
     def _one(
         self, kind: str, frames: list[CanFrame], others: list[list[CanFrame]], r: list[int]
     ) -> tuple[list[CanFrame], list[CanFrame]]:
-        """What becomes of a transfer now, and what of it comes later."""
+        """Frames of a mutated transfer to send now, and frames of it to send later."""
         at = r[0] % len(frames)
         frame = frames[at]
         later: list[CanFrame] = []
@@ -149,7 +149,7 @@ class CanFuzzer:
         return frames, later
 
     def _interleave(self, queues: list[list[CanFrame]]) -> list[CanFrame]:
-        """All frames in random order, those of one board in their own."""
+        """All frames in random order, but those of one board in their own order."""
         owners = np.repeat(np.arange(len(queues)), [len(q) for q in queues])
         sources = [iter(q) for q in queues]
         return [next(sources[owner]) for owner in self._rng.permutation(owners).tolist()]
@@ -164,8 +164,8 @@ def _flip(data: bytes, draw: int) -> bytes:
 def _graft(frames: list[CanFrame], other: list[CanFrame], at: int) -> list[CanFrame]:
     """Continue with the data of another transfer under our own identifier and tails.
 
-    This is what 32 lost transfers, or a board that was reset, look like: nothing but the CRC
-    tells that two transfers were mixed.
+    This is what 32 lost transfers, or a board that was reset, look like: only the CRC shows that
+    two transfers were mixed.
     """
     joined = frames[:at]
     for ours, theirs in zip(frames[at:], other[at:], strict=False):
@@ -173,6 +173,6 @@ def _graft(frames: list[CanFrame], other: list[CanFrame], at: int) -> list[CanFr
         same = len(theirs.data) == len(ours.data)
         joined.append(replace(ours, data=theirs.data[:-1] + tail) if same else ours)
     if [f.data[:-1] for f in joined] == [f.data[:-1] for f in other]:
-        # Where the two differ in the graft only, it is the other message, unspoilt.
+        # If the two differ only in the graft, the result is the other message, intact.
         return frames[:-1]
     return joined

@@ -1,4 +1,4 @@
-"""What the fuzzer sends, and the judge of what comes out again."""
+"""Messages that the fuzzers send, and the judge of what is decoded from them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from sensor_proto.packets import (
 
 TEXTS = ("chip 3 does not answer", "up, reset: watchdog", "9 µT", "")
 TAXELS = (1, 2, 4, 9, 16, 32)
-_LARGE = 60  # one samples message in so many is as long as can be
+_LARGE = 60  # one samples message in so many has the greatest length
 
 
 def random_samples(rng: np.random.Generator) -> Samples:
@@ -99,19 +99,19 @@ def key(message: Message | FloatSamples, board: int) -> Hashable:
 
 
 class Judge:
-    """Holds what was sent against what was accepted; each copy sent may come out once."""
+    """Compares what was sent with what was accepted; each copy sent may come out once."""
 
     def __init__(self) -> None:
         self._open: Counter[Hashable] = Counter()
         self.sent = self.accepted = self.wrong = 0
 
     def send(self, sent: Hashable) -> None:
-        """Note a message on its way."""
+        """Note a message as sent."""
         self._open[sent] += 1
         self.sent += 1
 
     def receive(self, received: Iterable[Received]) -> None:
-        """Count as wrong what was not sent, or not so often."""
+        """Count as wrong every message that was not sent, or came out more often than sent."""
         for item in received:
             found = key(item.message, item.board)
             if self._open[found] > 0:

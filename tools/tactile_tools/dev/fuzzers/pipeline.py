@@ -1,7 +1,7 @@
-"""A hostile board in front of tactiled's own links and pipeline, on virtual time.
+"""Hostile board in front of tactiled's own links and pipeline, on virtual time.
 
 Its frames are well formed and their CRCs are right, so that everything behind the decoder has to
-cope with what they say: any values, types, lengths and orders. After each block an honest board is
+handle what they contain: any values, types, lengths and orders. After each block an honest board is
 plugged in, and must be in service within `RECOVERY_S`.
 """
 
@@ -45,10 +45,10 @@ STEP_NS = NS_PER_S // 200
 POWER_ON = Instant(500 * NS_PER_S)
 WALL = WallClock(1_700_000_000 * NS_PER_S)
 HONEST_S = 1.0
-"""s of an honest stream before the first mutation: an identity, a tare, a clock."""
+"""Seconds of an honest stream before the first mutation: an identity, a tare, a clock."""
 
 RECOVERY_S = 6.0
-"""s that an honest board may take into service after a block: greeting, clock, tare."""
+"""Seconds until an honest board must be in service after a block: greeting, clock, tare."""
 
 MUTATED_SHARE = 0.5
 """Share of the frames that are mutated; the others keep the links and the pipeline busy."""
@@ -57,15 +57,15 @@ EXTREMES = (0x00, 0xFF, 0x7F, 0x80, 0x01)
 FLOATS = (math.nan, math.inf, -math.inf, 3.4e38, -3.4e38, 1e-40, -0.0, 0.0, 65535.0, -32768.0, 1e9)
 NODE = 5
 MAX_STATIONS = 128
-"""Numbers a CAN bus has: a table with more entries grows without bound."""
+"""Most boards of a port: the addresses of a CAN bus. A larger table grows without bound."""
 
 
 class PipelineFailure(Exception):  # noqa: N818 - a finding of the fuzzer
-    """Something behind the decoder gave way; the text says what."""
+    """Something behind the decoder failed; the text says what."""
 
 
 class Sink:
-    """`tactiled.publisher.Sink` that encodes everything as the bus would, and judges features."""
+    """`tactiled.publisher.Sink` that encodes everything as the bus would, and checks features."""
 
     def __init__(self) -> None:
         self.wall = WALL
@@ -82,7 +82,7 @@ class Sink:
         return self.moment
 
     def send(self, topic: Topic, name: str, message: Any, stamp_ns: int) -> None:  # noqa: ARG002
-        """Encode and judge; `PipelineFailure` for a force that is valid and not finite."""
+        """Encode and check; `PipelineFailure` for a force that is valid and not finite."""
         data = codec().encode(topic, message)
         self.sent += 1
         self.oversized += len(data) > MAX_PAYLOAD
@@ -93,23 +93,23 @@ class Sink:
                 raise PipelineFailure(f"valid features with a force of {message.peak_force} N")
 
     def announce(self, *_: Any, **__: Any) -> None:
-        """A line of the daemon's own log."""
+        """Count a line of the daemon's own log."""
         self.told += 1
 
     def firmware_text(self, *_: Any, **__: Any) -> None:
-        """A text of the board's."""
+        """Count a text of the board's."""
         self.told += 1
 
 
 class Source(RecordedSource):
-    """A port whose writes reach the board."""
+    """Port whose writes reach the board."""
 
     def __init__(self, medium: Medium) -> None:
         super().__init__("fuzz", medium)
         self.written: list[Any] = []
 
     def write(self, data: Any) -> None:
-        """Keep what the host says for the board."""
+        """Keep what the host sends, for the board."""
         self.written.append(data)
 
 
@@ -166,7 +166,7 @@ class PipelineFuzzer:
         return self.port.admit(node, who)
 
     def _plug(self) -> None:
-        """An honest board, from power-on."""
+        """Connect an honest board, from power-on."""
         if self._board is not None:
             self._inbox.put(PortLost("pulled out"))
         if self.kind == "floats":
@@ -181,7 +181,7 @@ class PipelineFuzzer:
         self._inbox.put(PortOpened("", 0.0))
 
     def run(self, mutations: int) -> None:
-        """An honest second, ``mutations`` hostile frames, and an honest board again."""
+        """Run an honest second, ``mutations`` hostile frames, and an honest board again."""
         self._run(HONEST_S, hostile=False)
         wanted = self.mutated + mutations
         while self.mutated < wanted:
@@ -223,7 +223,7 @@ class PipelineFuzzer:
             for station in list(self.port.stations.values()):
                 station.each_second(self.now)
 
-    # What becomes of a frame
+    # Mutations of a frame
 
     def _spoil(self, payload: Any) -> Any:
         if self.kind == "floats":
@@ -236,7 +236,7 @@ class PipelineFuzzer:
                 continue
             self.mutated += 1
             out += self._mutate(raw)
-        if not raws:  # a board that was told to be silent goes on lying
+        if not raws:  # a board that was told to stop still sends
             self.mutated += 1
             out += self._mutate(self._pool[int(self._rng.integers(len(self._pool)))][1])
         if self.kind == "serial":
@@ -247,7 +247,7 @@ class PipelineFuzzer:
         return tuple(frames)
 
     def _raws(self, payload: Any) -> Iterator[bytes]:
-        """Packets in what a board says."""
+        """Packets in what a board sends."""
         if self.kind == "serial":
             for frame in payload.split(b"\0"):
                 if frame:

@@ -1,4 +1,4 @@
-"""Spoilt serial lines: everything that can befall a frame, and what only the CRC can notice."""
+"""Corrupted serial streams: every mutation of a frame, and those that only the CRC can detect."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from sensor_proto.packets import pack
 from tactile_tools.dev.fuzzers.messages import Judge, key, random_messages
 
 POOL = 3000
-"""Different messages that are sent again and again; making them takes longer than spoiling them."""
+"""Different messages that are sent again and again; making them takes longer than corrupting
+them."""
 
 BATCH = 256
-"""Frames spoilt at a time."""
+"""Frames corrupted at a time."""
 
 DRAWS = 6
 LONGEST_RUN = 32
@@ -70,10 +71,10 @@ _SPOIL: dict[str, Callable[[bytes, Draw], bytes]] = {
     "insert": _insert,
     "blank": _blank,
 }
-"""Applied to the frame as it stands on the wire, its ending zero included."""
+"""Mutations of the frame as it is on the wire, with its final zero."""
 
 _INSIDE = ("flip_inside", "burst_inside", "graft_inside", "noise_inside")
-"""Applied to the packet, which is then stuffed anew: framing notices nothing."""
+"""Mutations of the packet, which is then encoded again: framing notices nothing."""
 
 _WHOLE = ("splice", "noise", "drop", "reorder", "duplicate", "intact")
 KINDS = (*_SPOIL, *_INSIDE, *_WHOLE)
@@ -81,7 +82,7 @@ _HARMLESS = frozenset({"reorder", "duplicate", "intact"})
 
 
 class SerialFuzzer:
-    """One line with its decoder; `run` may be called again and again."""
+    """One line with its decoder; `run` may be called repeatedly."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -96,11 +97,11 @@ class SerialFuzzer:
 
     @property
     def counters(self) -> dict[str, int]:
-        """Those of the decoder."""
+        """Counters of the decoder."""
         return self._decoder.counters
 
     def run(self) -> int:
-        """Send one batch; how many frames were spoilt."""
+        """Send one batch. Returns how many frames were corrupted."""
         rng = self._rng
         chosen = rng.permutation(POOL)[: BATCH + 1].tolist()
         kinds = rng.integers(0, len(KINDS), BATCH).tolist()
@@ -114,7 +115,7 @@ class SerialFuzzer:
         return self.touched - before
 
     def finish(self) -> None:
-        """End the last frame, so that nothing is left unjudged."""
+        """End the last frame, so that everything is judged."""
         self._feed(b"\0")
 
     def _feed(self, data: bytes) -> None:
@@ -126,7 +127,7 @@ class SerialFuzzer:
             at += size
 
     def _one(self, kind: str, chosen: list[int], r: Draw, wire: list[bytes]) -> int:
-        """Append what becomes of a frame (and, for some kinds, the next); frames used up."""
+        """Append the mutated frame (for some kinds also the next). Returns how many were used."""
         name, raw, frame = self._pool[chosen[0]]
         other_name, other_raw, other = self._pool[chosen[1]]
         self.kinds[kind] += 1
@@ -154,7 +155,7 @@ class SerialFuzzer:
             wire.append(frame)
             return used
         self.touched += 1
-        # A frame without its end takes the next one with it.
+        # A frame without its end also destroys the next one.
         self.glued += bool(spoilt) and spoilt[-1] != 0
         wire.append(spoilt)
         return used
@@ -169,6 +170,6 @@ class SerialFuzzer:
             cut = 4 + r[0] % (len(raw) - 4)
             tail = other[-(len(raw) - cut) :]
             grafted = raw[:cut] + tail.rjust(len(raw) - cut, b"\0")
-            # Where the two differ in the tail only, the graft is the other message, unspoilt.
+            # If the two differ only in the tail, the graft is the other message, intact.
             return _flip(grafted, r) if grafted == other else grafted
         return raw[:4] + self._rng.bytes(len(raw) - 4)
