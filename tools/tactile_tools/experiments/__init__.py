@@ -1,1 +1,1 @@
-"""The paper's experiments: many trials, one row each, and what the rows say."""
+"""The paper's experiments: many trials, one row each, and reports on the rows."""

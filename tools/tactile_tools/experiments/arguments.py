@@ -1,4 +1,4 @@
-"""NAME=VALUE arguments as values."""
+"""Parse NAME=VALUE arguments."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 def named_values(option: str, given: Iterable[str]) -> dict[str, Any]:
     """Values by name; numbers, true, false and lists as in JSON, anything else as text.
 
-    ValueError that shows what was given.
+    ValueError shows what was given.
     """
     values: dict[str, Any] = {}
     for text in given:

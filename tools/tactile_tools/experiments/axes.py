@@ -1,4 +1,4 @@
-"""What a robustness map varies, one thing at a time."""
+"""Axes of a robustness map: what it varies, one thing at a time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tactile_tools.experiments.spec import Conditions
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """One value of an axis. ``nominal``: it is the parameter set's own, nothing is changed."""
+    """One value of an axis. ``nominal``: the parameter set's own value, nothing is changed."""
 
     label: str
     parameters: Mapping[str, Any] = field(default_factory=dict)
@@ -46,11 +46,11 @@ class Axis:
 
 
 OBJECTS = MappingProxyType({"authors_sim": (20, 30), "hardware": (15, 22)})
-"""Numbers of objects that the generators draw from."""
+"""Range of the number of objects that each generator draws from."""
 
 
 def levels_of(axis: str, set_name: str) -> list[Level]:
-    """Levels of ``axis`` for the parameter set ``set_name``, rising."""
+    """Levels of ``axis`` for the parameter set ``set_name``, in rising order."""
     return AXES[axis].levels(set_name)
 
 
@@ -80,7 +80,8 @@ def _friction_all(set_name: str) -> list[Level]:
 
 
 def _force(set_name: str) -> list[Level]:
-    """The gate's force goes along: what stands above the motors' limit stays above it."""
+    """Levels of the arm's force limit. The gate's force limit is scaled with it, so that a gate
+    limit above the motors' limit stays above it."""
     safety = parameters(set_name).safety
     levels = []
     for force in (5.0, 7.5, 10.0, 15.0):
@@ -150,4 +151,4 @@ AXES: Mapping[str, Axis] = MappingProxyType(
         "dead": Axis("dead taxels", _dead, "%"),
     }
 )
-"""By the name a user gives."""
+"""Axes by the name a user gives."""

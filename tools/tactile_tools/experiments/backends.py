@@ -1,4 +1,4 @@
-"""Who runs the trials: processes of this machine, or a Dask cluster."""
+"""Backends that run the trials: processes of this machine, or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ Batch = Sequence[TrialSpec]
 """Trials that one worker runs one after another, of the same scene where possible."""
 
 BATCH = 10
-"""Trials in a batch: enough for a scene, which costs as much as a trial, to be made only once."""
+"""Trials in a batch: enough that a scene, which costs as much as a trial, is made only once."""
 
 ATTEMPTS = 2
 """Workers that may die of one trial before it is given up: the first may have been bad luck."""
 
 FRUITLESS = 20
-"""Workers that may die one after another with no row in between before the run is given up."""
+"""Workers that may die in succession, without a row in between, before the run is given up."""
 
 _ENVIRONMENT = {
-    # Linear algebra keeps to one thread: its neighbours use the other cores.
+    # Linear algebra uses one thread: the other workers use the other cores.
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
-    # glibc's threshold otherwise rises with the first physics engine that is freed. From then on
-    # each comes from the heap, which splinters: 7 MB in 1,000 trials.
+    # glibc's threshold otherwise rises with the first physics engine that is freed. After that
+    # each engine comes from the heap, which fragments: 7 MB in 1,000 trials.
     "MALLOC_MMAP_THRESHOLD_": str(1 << 20),
 }
-"""Of the workers; it must be there when they start."""
+"""Environment of the workers; it must be set when they start."""
 
 
 class BackendError(Exception):
-    """Trials cannot be run: why, what to do."""
+    """Trials cannot be run; the message says why and what to do."""
 
 
 class Backend(Protocol):
@@ -56,7 +56,7 @@ class Backend(Protocol):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """End."""
+        """End all that still runs."""
         ...
 
     @property
@@ -70,7 +70,7 @@ class Backend(Protocol):
 
 
 def batches(specs: Sequence[TrialSpec], size: int) -> list[list[TrialSpec]]:
-    """``specs``, which come scene by scene, in batches of one scene."""
+    """``specs``, which are sorted by scene, in batches of one scene."""
     made: list[list[TrialSpec]] = []
     scene = None
     for spec in specs:
@@ -83,7 +83,7 @@ def batches(specs: Sequence[TrialSpec], size: int) -> list[list[TrialSpec]]:
 
 
 class _Worker:
-    """A process and what it was asked."""
+    """A process, and the trials it has been given."""
 
     def __init__(self) -> None:
         context = get_context("spawn")
@@ -94,7 +94,7 @@ class _Worker:
         self.asked: deque[TrialSpec] = deque()
 
     def ask(self, batch: Batch) -> None:
-        """Give it ``batch``; its death is seen when its answer is waited for."""
+        """Send it ``batch``. If it has died, that is noticed when its answer is awaited."""
         self.asked.extend(batch)
         try:
             self.pipe.send(list(batch))
@@ -102,21 +102,21 @@ class _Worker:
             return
 
     def end(self) -> None:
-        """Kill it: there is nothing in it that is to be kept."""
+        """Kill it: it holds nothing worth keeping."""
         self.process.kill()
         self.process.join()
         self.pipe.close()
 
 
 class Processes:
-    """``jobs`` processes of this machine. One that dies costs its trial alone."""
+    """Runs trials in ``jobs`` processes of this machine. One that dies costs only its trial."""
 
     def __init__(self, jobs: int) -> None:
         self.workers = jobs
         self._crew: list[_Worker] = []
 
     def __enter__(self) -> Self:
-        """Processes are started as they are needed."""
+        """Start nothing yet: processes are started as they are needed."""
         return self
 
     def __exit__(
@@ -125,14 +125,14 @@ class Processes:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """End them."""
+        """End all processes."""
         for worker in self._crew:
             worker.end()
         self._crew.clear()
 
     def run(self, specs: Sequence[TrialSpec]) -> Iterator[Row]:
-        """Rows as they are finished."""
-        # Small batches when there is little to do: no worker shall wait long for the last one.
+        """Rows of ``specs`` as they are finished, in any order; BackendError."""
+        # Small batches when there is little to do, so that no worker waits long for the last one.
         size = max(1, min(BATCH, len(specs) // (4 * self.workers)))
         waiting = deque(batches(specs, size))
         deaths: dict[TrialSpec, int] = {}
@@ -173,7 +173,7 @@ class Processes:
     def _bury(
         self, worker: _Worker, waiting: deque[list[TrialSpec]], deaths: dict[TrialSpec, int]
     ) -> Iterator[Row]:
-        """Put back what a dead worker did not do; the trial that killed it twice is lost."""
+        """Requeue what a dead worker did not do; a trial that killed two workers is lost."""
         worker.end()
         killer = worker.asked[0]
         rest = list(worker.asked)[1:]
@@ -196,7 +196,7 @@ def _how(process: BaseProcess) -> str:
 
 
 def _hire() -> _Worker:
-    """A worker in an environment of its own."""
+    """Start a worker with its own environment."""
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
     os.environ.update(_ENVIRONMENT)
     try:
@@ -210,8 +210,8 @@ def _hire() -> _Worker:
 
 
 def _serve(pipe: Connection) -> None:
-    """A worker's life: batches in, rows out one by one, until the other end is gone."""
-    # Ctrl-C reaches the whole group; the parent decides what becomes of its workers.
+    """Main loop of a worker: batches in, rows out one by one, until the other end is gone."""
+    # Ctrl-C reaches the whole group; the parent decides when its workers end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     from tactile_tools.experiments.trial import run_one
 

@@ -1,4 +1,4 @@
-"""Arguments of ``tactile experiment``; what each word does is in `commands`."""
+"""Arguments of ``tactile experiment``; `commands` holds the commands themselves."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tactile_tools.options import add_depth, add_engine, add_strategy
 AXIS_NAMES = (
     "density", "friction_objects", "friction_all", "force", "width", "time", "noise", "rate", "dead"
 )  # fmt: skip
-"""As in `axes`, which takes half a second to import: a test holds them equal."""
+"""Names of `axes`, which takes half a second to import; a test checks that they are equal."""
 
 HERE = "tactile_tools.experiments.cli"
 

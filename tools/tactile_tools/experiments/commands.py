@@ -1,4 +1,4 @@
-"""What each word of ``tactile experiment`` does, and what is said when it cannot be done."""
+"""Commands of ``tactile experiment``, and their messages when they fail."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ from tactile_tools.experiments.studies import (
 )
 
 SETS, DEPTHS = ("authors_sim",), ("contacts",)
-"""Of a study that names none."""
+"""Defaults of a study that names none."""
 
 TOLD_EVERY_S = 30.0
-"""s between lines of progress where there is no terminal to draw a bar on."""
+"""Seconds between lines of progress where there is no terminal for a bar."""
 
 
 def _told(work: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
-    """``work`` as a command: every failure that a user can cause is a `CommandError`."""
+    """``work`` as a command: every failure that a user can cause becomes a `CommandError`."""
 
     def command(options: argparse.Namespace) -> int:
         try:
             return work(options)
         except (FolderError, TableError, ValueError) as error:
-            # Settings, strategies and scenes that cannot be are ValueErrors, with their remedy.
+            # Invalid settings, strategies and scenes raise ValueError, with their remedy.
             raise CommandError(str(error)) from error
         except (DiskError, BackendError) as error:
             raise CommandError(str(error), REFUSED) from error
@@ -100,7 +100,7 @@ robustness = _studied(
 
 
 def _study(study: Study, options: argparse.Namespace, word: str) -> int:
-    """Run ``study``, tell how it goes and what came out."""
+    """Run ``study``, show progress and print the result. Returns the exit status."""
     check(study)
     directory: Path = options.out or Path("runs") / word
     backend: Backend = DaskCluster(options.dask) if options.dask else Processes(options.jobs)
@@ -130,7 +130,7 @@ def _study(study: Study, options: argparse.Namespace, word: str) -> int:
 
 
 class _Teller:
-    """Tells how far a run is, and remembers the first failures."""
+    """Prints how far a run is, and keeps the first failures."""
 
     def __init__(self, console: Console, bar: Progress) -> None:
         self._console, self._bar = console, bar
@@ -141,11 +141,11 @@ class _Teller:
         self.failed: list[str] = []
 
     def __call__(self, finished: int, total: int, row: Row | None) -> None:
-        """As `runner.Progress`."""
+        """Report progress; see `runner.Progress`."""
         self.finished, self.total = finished, total
         if row is None:
             self._before = finished
-            # Only what is run now says how fast it goes.
+            # Only trials of this session say how fast it goes.
             self._task = self._bar.add_task("trials", total=total - finished)
             if finished:
                 self._console.print(f"resuming: {finished} of {total} trials are finished")

@@ -22,7 +22,7 @@ from tactile_tools.experiments.statistics import (
 from tactile_tools.experiments.tables import load_run
 
 COMPARED = ("source", "set", "engine", "depth", "parameters", "conditions")
-"""Columns that may be what two runs differ in: those that are one value throughout each of them."""
+"""Columns in which two runs may differ as a whole: those with one value throughout each run."""
 
 
 def compare_runs(first: Path, second: Path, csv: Path | None = None) -> int:
@@ -59,7 +59,7 @@ def compare_runs(first: Path, second: Path, csv: Path | None = None) -> int:
 
 
 def differences(a: Sequence[Row], b: Sequence[Row]) -> list[str]:
-    """What the runs differ in, one line each."""
+    """Differences between the runs, one line each."""
     return [
         f"{name}: {a[0][name]} against {b[0][name]}"
         for name in _constant(a, b)
@@ -114,7 +114,7 @@ def _tables(success: list[list[str]], values: list[list[str]]) -> tuple[TableDat
 def _success(
     left: Collection[Row], right: Collection[Row], of_a: list[Row], of_b: list[Row]
 ) -> list[str]:
-    """Rates of all trials, their difference of the paired ones where there are any."""
+    """Rates of all trials, and the difference of the paired ones if there are any."""
     rate_a, rate_b = _rate(left), _rate(right)
     cells = [percent(rate_a), percent(rate_b)]
     if not of_a:
@@ -142,7 +142,7 @@ def _values(of_a: list[Row], of_b: list[Row]) -> list[str]:
 
 
 def _constant(a: Sequence[Row], b: Sequence[Row]) -> list[str]:
-    """Columns of `COMPARED` that are one value throughout a and one throughout b."""
+    """Columns of `COMPARED` that have one value throughout a and one throughout b."""
     return [n for n in COMPARED if all(len({row[n] for row in rows}) == 1 for rows in (a, b))]
 
 
@@ -152,5 +152,5 @@ def _rate(rows: Collection[Row]) -> Rate:
 
 
 def _order(names: set[str]) -> list[str]:
-    """The paper's strategies first, in its order."""
+    """Names of strategies: the paper's first, in its order."""
     return [*(n for n in STRATEGIES if n in names), *sorted(names - set(STRATEGIES))]

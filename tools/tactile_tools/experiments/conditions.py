@@ -1,4 +1,4 @@
-"""Scene, world, parameters and touch of a trial, with what its conditions change."""
+"""Scene, world, parameters and touch of a trial, as its conditions change them."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from tactile_tools.experiments.spec import Conditions, TrialSpec
 from tactile_tools.reach.touch_senses import Sense
 
 CACHED_SCENES = 8
-"""Scenes kept by a worker: trials come scene by scene, and a few scenes may be under way at once
-where a worker has several threads."""
+"""Scenes kept by a worker: trials come scene by scene, and a worker with several threads may have
+a few scenes in progress at once."""
 
 MISSED_FEATURES = 3
-"""Periods of the feature stream that the safety gate lets pass before it stops the arm. Without
-this, features at 5 Hz would be judged by a limit on their age that was set for 15 Hz."""
+"""Periods of the feature stream that the safety gate waits before it stops the arm. Without this,
+features at 5 Hz would be judged by a limit on their age that was set for 15 Hz."""
 
 
 @lru_cache(maxsize=CACHED_SCENES)
 def build_scene(source: str, seed: int, objects: tuple[int, int] | None) -> Scene:
-    """The scene; ValueError, RuntimeError or OSError where there is none."""
+    """Scene of a generator or file; ValueError, RuntimeError or OSError if it cannot be had."""
     if objects is None:
         return load_scene(source, seed)
     if source not in GENERATORS:
@@ -40,12 +40,12 @@ def build_scene(source: str, seed: int, objects: tuple[int, int] | None) -> Scen
 
 
 def scene_of(spec: TrialSpec) -> Scene:
-    """The scene of ``spec``, as `build_scene`."""
+    """Scene of ``spec``; errors as in `build_scene`."""
     return build_scene(spec.source, spec.scene_seed, spec.changed.objects)
 
 
 def world_of(spec: TrialSpec, scene: Scene) -> World:
-    """The world of ``spec``; ConfigError, or ValueError where the engine is not installed."""
+    """World of ``spec``; ConfigError, or ValueError if the engine is not installed."""
     figures = world_parameters(scene.parameters)
     changed = _figures(figures, spec.changed)
     return make_world(spec.engine, scene, changed)
@@ -57,7 +57,7 @@ def _figures(figures: WorldParameters, conditions: Conditions) -> WorldParameter
     if (each := conditions.friction_all) is not None:
         friction = Friction(each, each, each, each, each)
     if (mu := conditions.friction_objects) is not None:
-        # The engines take the greater of two surfaces' coefficients, so no pair can have less.
+        # The engines use the greater of two surfaces' coefficients, so no pair can have less.
         friction = replace(
             friction,
             objects=mu,
@@ -73,7 +73,7 @@ def _figures(figures: WorldParameters, conditions: Conditions) -> WorldParameter
 
 
 def parameters_of(spec: TrialSpec) -> Parameters:
-    """The parameters of ``spec``; ConfigError."""
+    """Parameters of ``spec``; ConfigError."""
     resolved = spec.resolved()
     rate = spec.changed.feature_rate
     if rate is None:
@@ -87,7 +87,7 @@ def parameters_of(spec: TrialSpec) -> Parameters:
 
 
 def sense_of(spec: TrialSpec, scene: Scene) -> Sense | None:
-    """The sense of touch of ``spec``; None where it is the plain one of its depth."""
+    """Sense of touch of ``spec``; None for the plain one of its depth."""
     conditions = spec.changed
     if conditions == replace(
         conditions, noise=0.0, feature_rate=None, dead_taxels=0.0, finger_width=None

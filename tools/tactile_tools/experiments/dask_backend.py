@@ -1,4 +1,4 @@
-"""Trials on a Dask cluster, of one machine or many."""
+"""Run trials on a Dask cluster of one or more machines."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from tactile_tools.experiments.rows import Row
 from tactile_tools.experiments.spec import TrialSpec
 
 BATCH = 5
-"""Trials in a task: a scene's five strategies. What a lost worker had of it runs again."""
+"""Trials in a task: a scene's five strategies. If its worker is lost, the task runs again."""
 
 AHEAD = 2
-"""Tasks handed out for each thread of the cluster: none waits, and few are under way at an end."""
+"""Tasks submitted per thread of the cluster: no thread waits, and few tasks are lost at an end."""
 
 CONNECT_S = 10.0
 
 
 class DaskCluster:
-    """The workers that the scheduler at ``address`` has, however many come and go."""
+    """Workers of the scheduler at ``address``, however many come and go."""
 
     def __init__(self, address: str) -> None:
         self._address = address
@@ -56,17 +56,17 @@ class DaskCluster:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Disconnect; the scheduler forgets what nobody waits for."""
+        """Disconnect; the scheduler drops tasks that nobody waits for."""
         if self._client is not None:
             self._client.close()
 
     @property
     def workers(self) -> int:
-        """Threads of the cluster now."""
+        """Number of threads of the cluster now."""
         return max(1, sum(int(n) for n in self._client.nthreads().values()))
 
     def run(self, specs: Sequence[TrialSpec]) -> Iterator[Row]:
-        """Rows as they are finished."""
+        """Rows of ``specs`` as they are finished, in any order; BackendError."""
         from distributed import as_completed
 
         waiting = deque(batches(specs, BATCH))
@@ -91,20 +91,20 @@ class DaskCluster:
     def _submit(self, batch: Sequence[TrialSpec]) -> Any:
         from tactile_tools.experiments.trial import run_batch
 
-        # Not pure: a trial that is asked for again, asked by another run, is to be run again.
+        # Not pure: a trial requested again, or by another run, must run again.
         return self._client.submit(run_batch, list(batch), pure=False)
 
     def _take(
         self, future: Any, batch: list[TrialSpec], suspects: deque[TrialSpec]
     ) -> Iterator[Row]:
-        """Rows of a task that ended; the trials of one whose workers died are suspects."""
+        """Rows of a task that ended; if its workers died, its trials become suspects."""
         if self._died(future):
             suspects.extend(batch)
         else:
             yield from future.result()
 
     def _try(self, spec: TrialSpec) -> Row:
-        """The row of a suspect, run while nothing else runs that could kill its worker."""
+        """Row of a suspect, run while nothing else runs that could kill its worker."""
         from distributed import wait
 
         from tactile_tools.experiments.trial import lost
@@ -118,8 +118,9 @@ class DaskCluster:
         return row
 
     def _died(self, future: Any) -> bool:
-        """Whether the workers of a task that ended died of it, or of its neighbours; BackendError
-        where it ended in any other way than with its rows.
+        """Whether a task ended because its workers died, of it or of its neighbours.
+
+        BackendError if it ended otherwise, but without its rows.
         """
         from distributed.scheduler import KilledWorker
 
@@ -135,7 +136,7 @@ class DaskCluster:
         )
 
     def _check(self) -> None:
-        """Every worker has this software in this version; BackendError."""
+        """Check that every worker has this version of the software; BackendError."""
         try:
             found: dict[str, str] = self._client.run(version, "tactile-reach", on_error="return")
         except OSError as error:

@@ -1,4 +1,4 @@
-"""Touch that is worse than it should be: noise, a slow stream, dead taxels, a stretched finger."""
+"""Degraded touch: noise, a slow stream, dead taxels, a stretched finger."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from tactile_tools.reach.touch_senses import ContactSense, TaxelSense
 from tactiled.sensing.pipeline import PipelineSettings
 
 BOARD_RATE = 25.0
-"""Hz of a board that nobody set up otherwise, as the paper's."""
+"""Rate of a board with default settings, Hz: the paper's."""
 
 FIELD_PER_NEWTON_UT = 152.0
-"""µT that 1 N moves a chip's reading by, in the simulated skin: turns noise in N to one in µT."""
+"""Change of a chip's reading by 1 N, µT, in the simulated skin: converts noise from N to µT."""
 
 SAME_COLUMN = 1e-3
-"""m along the outline within which taxels stand above one another."""
+"""Distance along the outline, m, within which taxels are above one another."""
 
 
 def dead_taxels(seed: int, fraction: float) -> list[tuple[str, int]]:
-    """Array and number of the taxels that are dead: ``fraction`` of all, drawn by ``seed``.
+    """Array and number of the dead taxels: ``fraction`` of all, drawn by ``seed``.
 
-    A greater fraction of the same seed holds the taxels of a lesser one.
+    With the same seed, a greater fraction contains the taxels of a lesser one.
     """
     every = [(a.name, i) for a in finger().arrays for i in range(a.taxels)]
     order = np.random.default_rng([seed, 4]).permutation(len(every))
@@ -43,7 +43,7 @@ def dead_taxels(seed: int, fraction: float) -> list[tuple[str, int]]:
 
 
 class SeenWorld:
-    """What a sense looks at of a world: its contacts, changed by ``change``."""
+    """The part of a world that a sense reads, with its contacts changed by ``change``."""
 
     def __init__(
         self,
@@ -55,34 +55,34 @@ class SeenWorld:
 
     @property
     def scene(self) -> Scene:
-        """Of the world itself."""
+        """Scene of the world."""
         return self._world.scene
 
     def contacts(self) -> tuple[FingerContact, ...]:
-        """The world's, changed."""
+        """Contacts of the world, changed."""
         return self._change(self._world.contacts())
 
     def finger(self) -> FingerState:
-        """Of the world itself."""
+        """Finger of the world."""
         return self._world.finger()
 
 
 class Unstretched:
-    """Between a finger stretched across by ``stretch`` and the skin of the finger as built.
+    """Converts between a finger stretched across by ``stretch`` and the finger as built.
 
-    The skin of the other finger has the same taxels at the same places along its outline.
+    The skin of the stretched finger has the same taxels at the same places along its outline.
     """
 
     def __init__(self, stretch: float) -> None:
         self._stretch = stretch
 
     def contacts(self, contacts: Sequence[FingerContact]) -> tuple[FingerContact, ...]:
-        """Contacts of the stretched finger where they are on the finger as built."""
+        """Contacts of the stretched finger, at their places on the finger as built."""
         if self._stretch == 1.0:
             return tuple(contacts)
         moved = []
         for c in contacts:
-            # A normal goes with the inverse of the stretch; what it makes of the force stays.
+            # A normal scales with the inverse of the stretch; normal force and shear stay.
             nx, ny = c.normal_x / self._stretch, c.normal_y
             length = math.hypot(nx, ny)
             ax, ay = nx / length, ny / length
@@ -101,18 +101,18 @@ class Unstretched:
         return tuple(moved)
 
     def touch(self, touch: Touch) -> Touch:
-        """``touch`` of the finger as built on the stretched one."""
+        """``touch`` of the finger as built, on the stretched one."""
         if self._stretch == 1.0:
             return touch
         return replace(touch, peak_y=touch.peak_y * self._stretch)
 
 
 class DegradedContacts:
-    """The engine's contacts, worse.
+    """Degraded contacts of the engine.
 
-    ``noise``: N, of peak, tip and total force alike. ``rate``: Hz, None for every cycle. ``dead``:
-    fraction of dead taxels; a contact is felt in part as the taxels of its column are alive.
-    ``stretch``: of the finger across.
+    ``noise``: N, added alike to peak, tip and total force. ``rate``: Hz, None for every cycle.
+    ``dead``: fraction of dead taxels; of a contact, the share is felt that is alive among the
+    taxels of its column. ``stretch``: factor of the finger's width.
     """
 
     cycle = None
@@ -130,7 +130,7 @@ class DegradedContacts:
         self._columns = _columns(seed, dead) if dead > 0 else None
 
     def settle(self, world: World, now: Instant) -> Instant:
-        """There is nothing to start."""
+        """Return at once: there is nothing to start."""
         return self._inner.settle(world, now)
 
     def feel(self, world: World, now: Instant) -> Touch | None:
@@ -140,7 +140,7 @@ class DegradedContacts:
         if self._period is not None:
             self._due = after(now if self._due is None else self._due, self._period)
         seen = SeenWorld(world, self._felt)
-        # A sense only looks at a world, and a `SeenWorld` is all that there is to look at.
+        # A sense only reads a world, and `SeenWorld` has everything that it reads.
         touch = self._inner.feel(cast(World, seen), now)
         if self._noise > 0:
             touch = self._disturbed(touch)
@@ -172,14 +172,14 @@ class DegradedContacts:
 
 
 class DegradedTaxels(TaxelSense):
-    """The whole chain of taxels with a worse board: noisier chips, slower, some of them failed."""
+    """The whole chain of taxels with a degraded board: noisier chips, slower, some of them dead."""
 
     def __init__(
         self, seed: int, *, noise: float, rate: float | None, dead: float, stretch: float
     ) -> None:
         rate = BOARD_RATE if rate is None else rate
         extra = noise * FIELD_PER_NEWTON_UT
-        # A user knows the noise of the board at hand and sets it, or every field fit would fail.
+        # A user would set the noise of the board at hand; otherwise every field fit would fail.
         x, y, z = (math.hypot(n, extra) for n in PipelineSettings().noise_ut)
         super().__init__(seed, rate=rate, settings=PipelineSettings(noise_ut=(x, y, z)))
         parameters = SkinParameters()
@@ -202,14 +202,14 @@ class DegradedTaxels(TaxelSense):
         self._unstretched = Unstretched(stretch)
 
     def feel(self, world: World, now: Instant) -> Touch | None:
-        """As a `TaxelSense`, through the stretched finger."""
+        """As `TaxelSense`, through the stretched finger."""
         seen = SeenWorld(world, self._unstretched.contacts)
         touch = super().feel(cast(World, seen), now)
         return None if touch is None else self._unstretched.touch(touch)
 
 
 def _columns(seed: int, fraction: float) -> tuple[Any, Any]:
-    """Places (n, 2) m of the taxels, and what share of the taxels above one another is alive."""
+    """Places (n, 2) m of the taxels, and for each the share of its column that is alive."""
     dead = set(dead_taxels(seed, fraction))
     places, alive = [], []
     for array in finger().arrays:

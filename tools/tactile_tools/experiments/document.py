@@ -1,4 +1,4 @@
-"""A report as sections of text, tables and figures; written as one HTML file, PNGs and CSVs."""
+"""Report as sections of text, tables and figures; written as one HTML file, PNGs and CSVs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tactile_tools.experiments.statistics import Rate
 
 @dataclass(frozen=True, slots=True)
 class TableData:
-    """A table of text. ``name``: of its CSV file; "" for none."""
+    """Table of text. ``name``: name of its CSV file; "" for none."""
 
     caption: str
     head: list[str]
@@ -26,7 +26,7 @@ class TableData:
     name: str = ""
 
     def to_csv(self) -> str:
-        """As CSV."""
+        """Table as CSV."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(self.head)
@@ -36,7 +36,7 @@ class TableData:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A figure: its file's name without ending, its PNG, and what it shows."""
+    """Figure: its file's name without ending, its PNG, and a caption."""
 
     name: str
     png: bytes
@@ -44,13 +44,13 @@ class Picture:
 
     @property
     def data(self) -> str:
-        """The PNG for a page that needs no other file."""
+        """PNG in base64, for a page that needs no other file."""
         return base64.b64encode(self.png).decode()
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of the report, tables before figures."""
+    """Part of the report, tables before figures."""
 
     title: str
     text: list[str] = field(default_factory=list)
@@ -61,7 +61,7 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """The report. ``lead``: what this is, for a reader who knows nothing of it."""
+    """The report. ``lead``: introduction for a reader who does not know the subject."""
 
     title: str
     lead: list[str]
@@ -94,13 +94,13 @@ class Document:
 
 
 def typeset(text: str) -> str:
-    """``text`` with signs that are not torn from their numbers, and minus for a hyphen there."""
+    """``text`` with signs kept with their numbers by hard spaces, and minus signs for hyphens."""
     text = re.sub(r" (?=%)|(?<=\bp) (?=[=<] )|(?<=\bp [=<]) (?=\d)", "\u00a0", text)
     return re.sub(r"(?<![\w.–])-(?=\d)", "−", text)
 
 
 def percent(rate: Rate) -> str:
-    """A rate with its interval, such as "63 % [57, 68]"."""
+    """Rate with its interval, such as "63 % [57, 68]"."""
     if not rate.trials:
         return "–"
     low, high = rate.interval
@@ -108,19 +108,19 @@ def percent(rate: Rate) -> str:
 
 
 def whole(value: float) -> str:
-    """A fraction in whole percent, halves rounded up as in print; "–" for NaN."""
+    """Fraction in whole percent, halves rounded up as in print; "–" for NaN."""
     return "–" if math.isnan(value) else f"{math.floor(100 * value + 0.5)}"
 
 
 def points(difference: float, interval: tuple[float, float]) -> str:
-    """A difference of rates in percentage points with its interval."""
+    """Difference of rates in percentage points with its interval."""
     # Adding 0 turns the −0 that rounding leaves into 0.
     shown, low, high = (round(100 * v) + 0 if v == v else v for v in (difference, *interval))
     return f"{shown:+.0f} [{low:+.0f}, {high:+.0f}]"
 
 
 def shown_p(p: float) -> str:
-    """A p-value as it is read."""
+    """A p-value for a table."""
     if math.isnan(p):
         return "–"
     if p < 1e-4:
@@ -129,7 +129,7 @@ def shown_p(p: float) -> str:
 
 
 def told_p(p: float) -> str:
-    """A p-value in a sentence."""
+    """A p-value for a sentence."""
     shown = shown_p(p)
     return f"p {shown}" if shown.startswith("<") else f"p = {shown}"
 
@@ -140,7 +140,7 @@ def slug(text: str) -> str:
 
 
 def spoken(name: str) -> str:
-    """A strategy's name in a sentence: the paper's in words, a user's own as given."""
+    """Name of a strategy in a sentence: the paper's in words, a user's own as given."""
     return name.replace("_", " ") if name in STRATEGIES else name
 
 

@@ -1,4 +1,4 @@
-"""What the rows of a strategies study say, in plain words: every sentence follows from the data."""
+"""Findings of a strategies study in plain sentences, each computed from the rows."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ByStrategy = Mapping[str, Sequence[Row]]
 
 
 def rate_of(rows: Sequence[Row], column: str = "success") -> Rate:
-    """How often ``column`` is true."""
+    """Rate at which ``column`` is true."""
     return Rate(sum(bool(row[column]) for row in rows), len(rows))
 
 
@@ -30,7 +30,7 @@ def means_of(rows: ByStrategy, column: str) -> dict[str, float]:
 
 
 def worst_is_straight(means: Mapping[str, float], pairs: Sequence[PairedValues], what: str) -> str:
-    """Whether straight is significantly worst in a measure where less is better."""
+    """Say whether straight is significantly worst in a measure where less is better."""
     others = [name for name in means if name != "straight"]
     if "straight" not in means or not others:
         return ""
@@ -60,7 +60,7 @@ def worst_is_straight(means: Mapping[str, float], pairs: Sequence[PairedValues],
 
 
 def faster_by_touch(means: Mapping[str, float], pairs: Sequence[PairedValues]) -> str:
-    """Whether hybrid event is significantly faster than hybrid clock."""
+    """Say whether hybrid event is significantly faster than hybrid clock."""
     pair = _pair(pairs, "hybrid_clock", "hybrid_event")
     if pair is None:
         return ""
@@ -76,7 +76,7 @@ def faster_by_touch(means: Mapping[str, float], pairs: Sequence[PairedValues]) -
 
 
 def order_of_success(rates: Mapping[str, Rate], reference: Reference | None) -> str:
-    """From least to most successful, and the paper's order beside it."""
+    """Order from least to most successful, with the paper's order."""
     ranked = sorted(rates, key=lambda name: rates[name].value)
     text = "By success, from least to most: " + ", ".join(
         f"{spoken(n)} {whole(rates[n].value)} %" for n in ranked
@@ -91,7 +91,7 @@ def order_of_success(rates: Mapping[str, Rate], reference: Reference | None) -> 
 
 
 def beside(rates: Mapping[str, Rate], reference: Reference, column: str = "success") -> str:
-    """Which rates differ from those of ``reference`` beyond chance."""
+    """Say which rates differ from those of ``reference`` beyond chance."""
     theirs = reference.success if column == "success" else reference.entered
     differ, agree = [], []
     for name, rate in rates.items():
@@ -116,7 +116,7 @@ def beside(rates: Mapping[str, Rate], reference: Reference, column: str = "succe
 
 
 def solved_by_touch(rows: ByStrategy) -> str:
-    """The paper's count: scenes that event alone fails, and that others fail and event does not."""
+    """The paper's count: scenes that only event fails, and scenes that only event solves."""
     if "hybrid_event" not in rows or len(rows) < 2:
         return ""
     solved = {name: {r["scene_seed"] for r in of if r["success"]} for name, of in rows.items()}
@@ -134,7 +134,7 @@ def solved_by_touch(rows: ByStrategy) -> str:
 
 
 def pushed_out(rows: ByStrategy) -> str:
-    """Objects pushed out of the front by the two hybrids, beside the paper's."""
+    """Objects pushed out of the front by the two hybrids, with the paper's numbers."""
     if not {"hybrid_clock", "hybrid_event"} <= set(rows):
         return ""
     told, counts = [], {}
@@ -164,7 +164,7 @@ def _pair(pairs: Sequence[PairedValues], a: str, b: str) -> PairedValues | None:
 
 
 def _signed(pair: PairedValues, name: str) -> float:
-    """Rank effect of ``name`` over the other: positive where its values are greater."""
+    """Rank effect of ``name`` over the other: positive if its values are greater."""
     return pair.effect if pair.a == name else -pair.effect
 
 

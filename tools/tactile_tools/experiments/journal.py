@@ -1,7 +1,8 @@
-"""An experiment's folder: what it is an experiment of, and finished trials as they finish.
+"""Folder of an experiment: its definition, and finished trials as they finish.
 
-``experiment.json`` says what it is of. ``trials.jsonl`` holds a line a finished trial, written in
-one piece; of a process killed in between at most its last line is torn, and that trial runs again.
+``experiment.json`` holds the definition. ``trials.jsonl`` holds one line per finished trial,
+written in one piece. If the process is killed in between, at most its last line is torn, and that
+trial runs again.
 """
 
 from __future__ import annotations
@@ -20,26 +21,27 @@ from tactile_tools.experiments.rows import Row, replace_file, whole
 from tactile_tools.experiments.spec import TrialSpec, spec_of
 
 FORMAT = 1
-"""Version of the folder's files; another one is refused."""
+"""Version of the folder's files; any other is refused."""
 
 FLUSH_S = 1.0
-"""s at most between a trial's end and its being safe from a loss of power; a kill loses nothing."""
+"""Longest time, s, from a trial's end until it is safe from a loss of power. A kill loses
+nothing."""
 
 
 class FolderError(Exception):
-    """A folder that cannot be used: which, why, what to do."""
+    """A folder cannot be used; the message says which, why and what to do."""
 
 
 class DiskError(Exception):
-    """Something could not be written: what, why, what became of the rest, what to do."""
+    """Something could not be written; the message says what, why, what was kept and what to do."""
 
 
 class Journal:
-    """The folder of one run, held so that no other process writes to it. A context manager.
+    """Folder of one run, locked so that no other process writes to it. A context manager.
 
-    ``definition``: what the experiment is of, plain JSON values; it may be the folder's own or
-    one that has all of that one's trials and more. Raises FolderError for a folder of another
-    experiment, or of none, or in use, and DiskError.
+    ``definition``: what is to be run, as plain JSON values. It may equal the folder's own or
+    contain all of its trials and more. Raises FolderError if the folder belongs to another
+    experiment, is not an experiment's or is in use; and DiskError.
     """
 
     def __init__(self, directory: Path, definition: Mapping[str, Any]) -> None:
@@ -67,7 +69,7 @@ class Journal:
             raise
 
     def __enter__(self) -> Journal:
-        """Ready to be written to."""
+        """Return itself, ready to be written to."""
         return self
 
     def __exit__(
@@ -76,13 +78,13 @@ class Journal:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Let go of the folder."""
+        """Release the folder."""
         self.close()
 
     def load(self) -> dict[TrialSpec, Row]:
-        """Finished trials, and make the file ready for more; DiskError.
+        """Return the finished trials and open the file for more; DiskError.
 
-        ``damaged`` then counts the lines that were no trials; theirs run again.
+        ``damaged`` then counts the lines that were not trials; those trials run again.
         """
         try:
             data = self._lines.read_bytes() if self._lines.exists() else b""
@@ -110,14 +112,14 @@ class Journal:
             raise disk_error(self.directory, error) from error
 
     def close(self) -> None:
-        """Let go of the folder; what was added stays."""
+        """Release the folder; what was added stays."""
         for descriptor in (self._stream, self._lock):
             if descriptor is not None:
                 os.close(descriptor)
         self._stream = self._lock = None
 
     def _hold(self) -> None:
-        """Take the lock, which the system lets go of when the process is gone, however it goes."""
+        """Take the lock. The system releases it when the process ends, however it ends."""
         self._lock = os.open(
             self.directory / ".lock", os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644
         )
@@ -130,7 +132,7 @@ class Journal:
 
 
 def read_definition(directory: Path) -> dict[str, Any]:
-    """What ``directory`` is an experiment of; FolderError."""
+    """Definition of the experiment in ``directory``; FolderError."""
     path = directory / "experiment.json"
     try:
         raw = json.loads(path.read_text(encoding="utf-8"))
@@ -148,7 +150,7 @@ def read_definition(directory: Path) -> dict[str, Any]:
 
 
 def read_lines(directory: Path) -> dict[TrialSpec, Row]:
-    """Finished trials of a run that need not be over; FolderError."""
+    """Finished trials of a run, which may still be going on; FolderError."""
     path = directory / "trials.jsonl"
     try:
         return parse_lines(path.read_bytes())[0]
@@ -157,7 +159,7 @@ def read_lines(directory: Path) -> dict[TrialSpec, Row]:
 
 
 def parse_lines(data: bytes) -> tuple[dict[TrialSpec, Row], int]:
-    """Finished trials in ``data``, and how many lines held none."""
+    """Finished trials in ``data``, and the number of lines that are not trials."""
     finished: dict[TrialSpec, Row] = {}
     damaged = 0
     for line in data.splitlines(keepends=True):
@@ -173,7 +175,7 @@ def parse_lines(data: bytes) -> tuple[dict[TrialSpec, Row], int]:
 
 
 def disk_error(directory: Path, error: OSError) -> DiskError:
-    """What to tell the user about ``error``."""
+    """Error for the user about ``error`` in ``directory``."""
     kept = "finished trials are kept, and the same command runs the rest"
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DiskError(f"the disk of {directory} is full: make room; {kept}")
@@ -185,7 +187,7 @@ def _line(row: Row) -> bytes:
 
 
 def _write_whole(stream: int, line: bytes) -> None:
-    """Write ``line`` or, on a full disk, nothing of it."""
+    """Write ``line`` whole; if the disk is full, leave nothing of it."""
     written = os.write(stream, line)
     if written == len(line):
         return
@@ -195,7 +197,7 @@ def _write_whole(stream: int, line: bytes) -> None:
 
 
 def _grows(directory: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
-    """Whether ``wanted`` is more of what was ``found``; FolderError naming what is neither."""
+    """Whether ``wanted`` extends ``found``; FolderError names what differs otherwise."""
     # Through JSON, as a tuple comes back as a list.
     wanted = json.loads(json.dumps(wanted))
     names = [n for n in dict.fromkeys([*found, *wanted]) if found.get(n) != wanted.get(n)]
@@ -223,8 +225,8 @@ def _more(name: str, found: object, wanted: object) -> bool:
 
 
 def _refuse_strangers(directory: Path) -> None:
-    """FolderError for a folder with files of somebody else's."""
-    # What a run leaves that was killed in its first moment.
+    """Raise FolderError if the folder has files of others."""
+    # A run that was killed at its very start leaves these.
     ours = {".lock", "experiment.json.part"}
     others = sorted(p.name for p in directory.iterdir() if p.name not in ours)
     if others:

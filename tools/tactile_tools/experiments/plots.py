@@ -1,4 +1,4 @@
-"""Figures of the studies as PNG: boxes, rates, contours, heat maps; legible in print."""
+"""Figures of the studies as PNG: boxes, rates, contours, heat maps; readable in print."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tactile_tools.experiments.statistics import Rate
 
 DPI = 130
 COLOURS = {
-    # Okabe and Ito's, which the colour-blind can tell apart.
+    # Okabe and Ito's, which colour-blind readers can distinguish.
     "straight": "#999999",
     "burrow": "#E69F00",
     "excavate": "#56B4E9",
@@ -32,7 +32,7 @@ MARKS = ("D", "s", "^")
 
 @dataclass(frozen=True, slots=True)
 class Bracket:
-    """A bar over two boxes, numbered from 0, with what it says."""
+    """Bar over two boxes, numbered from 0, with its text."""
 
     left: int
     right: int
@@ -40,7 +40,7 @@ class Bracket:
 
 
 def colour_of(strategy: str) -> str:
-    """The strategy's colour in every figure."""
+    """Colour of a strategy in every figure."""
     return COLOURS.get(strategy, OTHER_COLOUR)
 
 
@@ -106,13 +106,13 @@ def _brackets(
         axes.text((left + right) / 2, y, bracket.text, ha="center", va="bottom", fontsize=8)
     ticks = [tick for tick in axes.get_yticks() if -1e-9 <= tick <= top + 1e-9]
     axes.set_ylim(-0.03 * top, 1.05 * top + (highest + 1.2) * step if brackets else 1.06 * top)
-    axes.set_yticks(ticks)  # above lie the brackets, where there are no values
+    axes.set_yticks(ticks)  # none above the values, where the brackets are
 
 
 def rates(
     ours: Mapping[str, Rate], others: Sequence[tuple[str, Mapping[str, Rate]]], title: str
 ) -> bytes:
-    """Success of each strategy with its interval, and marks of those it is set beside."""
+    """Success of each strategy with its interval, and marks for those it is compared with."""
     figure, axes = _figure(6.6, 3.9)
     names = list(ours)
     for index, name in enumerate(names):
@@ -160,7 +160,7 @@ def _bar(axes: Axes, x: float, value: float, low: float, high: float) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """A contour plot: values by row (y) and column (x), where the paper's own setting lies."""
+    """Contour plot: values by row (y) and column (x). ``nominal``: x, y of the paper's setting."""
 
     title: str
     values: FloatArray
@@ -172,7 +172,7 @@ class Surface:
 
 
 def contours(surfaces: Sequence[Surface], bar_label: str) -> bytes:
-    """Contour plots of ratios, two a row; darker is worse."""
+    """Contour plots of ratios, two per row; darker is worse."""
     rows = (len(surfaces) + 1) // 2
     figure = Figure(figsize=(8.6, 3.55 * rows), layout="constrained")
     FigureCanvasAgg(figure)
@@ -195,8 +195,8 @@ def _contour(figure: Figure, axes: Axes, surface: Surface, bar_label: str) -> No
     low, high = max(float(values.min()), 1e-3), float(values.max())
     if high - low < 1e-9:
         low, high = low / 1.01, low * 1.01
-    # The scale is this plot's own, so that its shape shows, and even in the ratio: where a few
-    # cells are many times worse, the others would all be of one colour.
+    # Each plot has its own scale, so that its shape shows, even in the ratio: otherwise a few cells
+    # that are many times worse would leave all others in one colour.
     levels = np.geomspace(low, high, 11)
     filled = axes.contourf(
         surface.x,
@@ -230,7 +230,7 @@ def heat_map(
     nominal: int | None,
     x_label: str,
 ) -> bytes:
-    """Success in % by strategy and level; ``nominal``: the column that is the set's own."""
+    """Success in % by strategy and level; ``nominal``: the column of the set's own value."""
     figure, axes = _figure(1.9 + 0.85 * len(columns), 1.35 + 0.36 * len(rows))
     shown = np.ma.masked_invalid(100 * values)
     axes.imshow(shown, cmap="cividis", vmin=0, vmax=100, aspect="auto")

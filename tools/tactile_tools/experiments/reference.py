@@ -1,4 +1,4 @@
-"""Figures of the paper and of its authors' simulator, which ours are set beside."""
+"""Results of the paper and of its authors' simulator, for comparison with ours."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from tactile_tools.experiments.statistics import Rate
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """What others found, by strategy; empty where they do not say.
+    """Results of others, by strategy; empty where they give none.
 
-    ``label``: what to call it. ``what``: where it is from. ``entered``: tip ever within 7.5 mm.
+    ``label``: short name. ``what``: source. ``entered``: tip came within 7.5 mm.
     ``distance``, ``time``: means of d_goal/d_scene and of t_comp/t_tot.
     """
 
@@ -26,7 +26,7 @@ class Reference:
 
 
 def _rates(trials: int, **percent: int) -> Mapping[str, Rate]:
-    """Rates from published percentages: the counts are rounded from them."""
+    """Rates from published percentages; the counts are rounded from them."""
     return MappingProxyType(
         {name: Rate(round(value * trials / 100), trials) for name, value in percent.items()}
     )
@@ -63,10 +63,10 @@ REFERENCES: Mapping[str, tuple[Reference, ...]] = MappingProxyType(
         "hardware": (PAPER_HARDWARE,),
     }
 )
-"""What the runs of a parameter set are set beside, where they are of the set's own scenes."""
+"""References for the runs of each parameter set, if they use the set's own scenes."""
 
 PAPER_EJECTED = MappingProxyType({"hybrid_clock": (5, 25), "hybrid_event": (1, 25)})
-"""Objects pushed out of the front, in so many trials on hardware."""
+"""Objects pushed out of the front, and the number of trials on hardware."""
 
 
 @dataclass(frozen=True, slots=True)

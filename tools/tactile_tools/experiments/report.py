@@ -42,9 +42,10 @@ TITLES = {
 
 
 def write_report(run_directory: Path, out: Path, *, rows: bool = False) -> Path:
-    """Write the report of the run into ``out``; its path. FolderError, TableError or OSError.
+    """Write the report of the run into ``out`` and return its path. FolderError, TableError,
+    OSError.
 
-    ``rows``: put the run's table there too, from which any row can be run and the report be made
+    ``rows``: also put the run's table there, from which any row can be rerun and the report made
     again.
     """
     run = load_run(run_directory)
@@ -55,7 +56,7 @@ def write_report(run_directory: Path, out: Path, *, rows: bool = False) -> Path:
 
 
 def build(run: Run) -> Document:
-    """The report of ``run``; TableError where it has no rows yet."""
+    """Report of ``run``; TableError if it has no rows yet."""
     if not any(row["error"] is None for row in run.rows):
         raise TableError(
             f"{run.directory} has no finished trials"
@@ -80,7 +81,7 @@ def build(run: Run) -> Document:
 
 
 def _failures(run: Run) -> Section | None:
-    """What could not be run, by reason."""
+    """Trials that could not be run, by reason; None if there are none."""
     errors = Counter(row["error"] for row in run.rows if row["error"] is not None)
     if not errors:
         return None
@@ -101,7 +102,7 @@ def _failures(run: Run) -> Section | None:
 
 
 def _facts(run: Run) -> list[tuple[str, str]]:
-    """Where the figures come from and what they took."""
+    """Origin and cost of the figures."""
     summary = summarize(run.rows)
     options = run.options
     memory = summary["memory"]

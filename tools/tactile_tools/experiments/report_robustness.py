@@ -1,4 +1,4 @@
-"""Heat maps of a robustness study, and which conclusions survive."""
+"""Report of a robustness study: heat maps, and which conclusions survive."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ EXPLAINED = (
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """A conclusion of the paper: ``better`` does better than ``worse`` in ``column``."""
+    """Conclusion of the paper: ``better`` does better than ``worse`` in ``column``."""
 
     text: str
     better: str
@@ -64,13 +64,13 @@ UNKNOWN = "–"
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """The trials at one level: by strategy, by scene."""
+    """Trials at one level: by strategy, by scene."""
 
     level: Level
     rows: Mapping[str, Mapping[int, Row]]
 
     def rate(self, strategy: str) -> Rate:
-        """Success; a trial that the gate did not let begin has failed."""
+        """Rate of success; a trial that the gate did not let begin has failed."""
         rows = self.rows.get(strategy, {}).values()
         return Rate(sum(bool(r["success"]) for r in rows), len(rows))
 
@@ -120,7 +120,7 @@ def robustness_sections(run: Run) -> list[Section]:
 
 
 def points_of(run: Run, axis: str, set_name: str, rows: Sequence[Row]) -> list[Point]:
-    """The trials at every level of ``axis``; those that could not be run at all are left out."""
+    """Trials at every level of ``axis``, without those that could not be run at all."""
     base = dict(run.options.parameters)
     found = []
     for level in levels_of(axis, set_name):
@@ -137,7 +137,7 @@ def points_of(run: Run, axis: str, set_name: str, rows: Sequence[Row]) -> list[P
 
 
 def _findings(axes: Mapping[str, Sequence[Point]], strategies: Sequence[str]) -> list[str]:
-    """A sentence for each claim that all its strategies were run for."""
+    """A sentence for each claim for which all its strategies were run."""
     told = []
     for claim in _testable(strategies):
         verdicts = [(axis, p.level, p.verdict(claim)) for axis, p in _conditions(axes)]
@@ -165,7 +165,7 @@ def _findings(axes: Mapping[str, Sequence[Point]], strategies: Sequence[str]) ->
 
 
 def _conditions(axes: Mapping[str, Sequence[Point]]) -> list[tuple[str, Point]]:
-    """Every level with its axis; the set's own values, which most axes have, but once."""
+    """Every level with its axis; the set's own values, which most axes have, only once."""
     own = [(axis, p) for axis, points in axes.items() for p in points if p.level.nominal]
     rest = [(axis, p) for axis, points in axes.items() for p in points if not p.level.nominal]
     return [*own[:1], *rest]
@@ -219,7 +219,7 @@ def _label(point: Point) -> str:
 
 
 def _remarks(points: Sequence[Point]) -> str:
-    """What was refused, and where there are no trials."""
+    """Say what was refused, and where there are no trials."""
     refused = [
         f"{point.level.label} ({n})"
         for point in points

@@ -1,4 +1,4 @@
-"""Tables and figures of a strategies study."""
+"""Report of a strategies study: tables and figures."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ SHOWN_PAIRS = (
     ("burrow", "hybrid_event"),
     ("hybrid_clock", "hybrid_event"),
 )
-"""Pairs that a figure marks; all ten in one would hide the boxes. The tables have all."""
+"""Pairs that a figure marks: all ten would hide the boxes. The tables have all."""
 
 
 def strategy_sections(run: Run) -> list[Section]:
@@ -88,7 +88,7 @@ def strategy_sections(run: Run) -> list[Section]:
 
 
 def _across(run: Run) -> list[TableData]:
-    """Groups of the same scenes that differ in their engine, or in what is felt, side by side."""
+    """Compare groups of the same scenes that differ only in engine or only in depth."""
     tables = []
     for (left, a), (right, b) in combinations(run.groups().items(), 2):
         apart = [i for i in range(len(GROUP)) if left[i] != right[i]]
@@ -168,7 +168,7 @@ def _beside(
     sources: str,
     prefix: str,
 ) -> TableData:
-    """How often ``column`` is true, beside the rates of others."""
+    """Rate at which ``column`` is true, beside the rates of others."""
     head = ["strategy", "scenes", "ours [95 %]"]
     for label in others:
         head += [label, "difference [95 %]", "p"]

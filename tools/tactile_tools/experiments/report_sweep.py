@@ -1,4 +1,4 @@
-"""Tables and figures of a parameter sweep."""
+"""Report of a parameter sweep: tables and figures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tactile_tools.experiments.studies import (
 from tactile_tools.experiments.tables import Run, title_of
 
 SIGMA = 1.0
-"""Cells, of the Gaussian that the paper smooths with."""
+"""Width of the Gaussian with which the paper smooths, in cells."""
 
 METRICS = {"distance": "normalized_distance", "time": "normalized_time"}
 NAMES = {
@@ -40,7 +40,7 @@ NOMINAL = {"burrow": (1.0, 0.83), "excavate": (5.0, 5.0)}
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A 10 × 10 grid: ratios to straight by metric, unsmoothed, and success; NaN: no trials."""
+    """10 × 10 grid: ratios to straight by metric, unsmoothed, and success; NaN: no trials."""
 
     key: tuple[str, str]
     cells: Sequence[Cell]
@@ -48,7 +48,7 @@ class Grid:
     success: FloatArray
 
     def smooth(self, metric: str) -> FloatArray:
-        """The ratio as the paper draws it; cells without trials take no part."""
+        """The ratio as the paper draws it, smoothed; cells without trials are left out."""
         return smoothed(self.ratio[metric])
 
 
@@ -105,7 +105,7 @@ def _section(run: Run, name: str, rows: Sequence[Row], prefix: str) -> Section |
 
 
 def grids_of(run: Run, rows: Sequence[Row], straight: Sequence[Row]) -> list[Grid]:
-    """The grids that the run sweeps, each scene's trials beside straight in the same scenes."""
+    """Grids that the run sweeps, each compared with straight in the same scenes."""
     definition = run.study.definition
     cells = sweep_cells(definition["primitives"], definition["readings"])
     base = dict(run.options.parameters)
@@ -133,7 +133,7 @@ def grids_of(run: Run, rows: Sequence[Row], straight: Sequence[Row]) -> list[Gri
 
 
 def _finding(grid: Grid) -> str:
-    """How bad the worst cell is, and whether the paper's claim holds."""
+    """Say how bad the worst cell is, and whether the paper's claim holds."""
     distance, time = (float(np.nanmax(grid.smooth(metric))) for metric in METRICS)
     claim_d = distance <= PAPER_SWEEP.worst_distance_ratio * 1.1
     claim_t = time <= PAPER_SWEEP.worst_time_ratio * 1.05
@@ -161,7 +161,7 @@ def _finding(grid: Grid) -> str:
 
 
 def _where(grid: Grid) -> str:
-    """Which quarter of the grid is worst, and which the paper says should be avoided."""
+    """Say which quarter of the grid is worst, and which the paper says to avoid."""
     rows, columns = ("A_bur", "f_bur") if grid.key[0] == "burrow" else ("t_excv", "t_trig")
     told = []
     for metric in METRICS:
@@ -215,7 +215,7 @@ def _setting(grid: Grid, row: int, column: int) -> str:
 
 
 def _grid_tables(grid: Grid, prefix: str) -> list[TableData]:
-    """Success, and the ratios of each cell as they are, unsmoothed."""
+    """Success, and the ratios of each cell, unsmoothed."""
     burrow = grid.key[0] == "burrow"
     across = SWEEP_FREQUENCIES if burrow else SWEEP_TIMES
     down = SWEEP_AMPLITUDES if burrow else SWEEP_TIMES

@@ -1,4 +1,4 @@
-"""One row again: with its log, its picture, and whether it came out the same to the bit."""
+"""Rerun one row: with its log and picture, and a check that it is the same bit for bit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from tactile_tools.experiments.trial import run_one
 
 
 def run_again(options: argparse.Namespace) -> int:
-    """Run the trial that ``options`` name; 0 where it ran and, of a row, came out the same."""
+    """Run the trial that ``options`` name. Returns 0 if it ran and, for a row, came out the
+    same."""
     if options.png is not None and options.log is None:
         raise ValueError("--png is drawn from the log: give --log as well")
     recorded = None if options.row is None else _recorded(options.row)
@@ -47,7 +48,7 @@ def run_again(options: argparse.Namespace) -> int:
 
 
 def _judge(recorded: Row, row: Row) -> int:
-    """Say whether the row came out the same."""
+    """Print whether the row came out the same. Returns the exit status."""
     before, now = outcome_of(recorded), outcome_of(row)
     different = [name for name in before if before[name] != now[name]]
     if not different:
@@ -61,7 +62,7 @@ def _judge(recorded: Row, row: Row) -> int:
 
 
 def _recorded(text: str) -> Row:
-    """The row that RUN:N names."""
+    """Row that RUN:N names; ValueError."""
     run, colon, number = text.rpartition(":")
     if not colon or not number.isdigit():
         raise ValueError(f"--row {text!r} is not RUN:N, a run's folder and a row's number")
@@ -73,7 +74,7 @@ def _recorded(text: str) -> Row:
 
 
 def _spec(options: argparse.Namespace) -> TrialSpec:
-    """The trial that the options describe, by the columns' names."""
+    """Trial that the options describe, by the columns' names."""
     conditions = canonical(named_values("--condition", options.condition))
     scene_seed, seed = seeds_of(options)
     return TrialSpec(
@@ -90,15 +91,15 @@ def _spec(options: argparse.Namespace) -> TrialSpec:
 
 
 def _run(spec: TrialSpec, path: Path | None) -> Row:
-    """The row, and its log at ``path``; DiskError."""
+    """Run ``spec`` and return its row, with a log at ``path`` unless None; DiskError."""
     if path is None:
         return run_one(spec)
-    # Only now: a log's messages and its writer take a quarter of a second to import.
+    # Imported only now: a log's messages and its writer take a quarter of a second.
     from tactile_tools.reach.trial_log import TrialLog
 
     try:
         with TrialLog(path, scene_of(spec), spec.strategy, spec.trial_seed) as log:
             return run_one(spec, watch=log, done=log.outcome)
     except (RecorderError, OSError, RuntimeError) as error:
-        # A log that is not whole is a RuntimeError; those of the trial itself are in its row.
+        # An incomplete log raises RuntimeError; errors of the trial itself are in its row.
         raise DiskError(f"cannot write {path}: {error}") from error

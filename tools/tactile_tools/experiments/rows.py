@@ -1,4 +1,4 @@
-"""The columns of the table of trials, and the table as Parquet and CSV."""
+"""Columns of the table of trials, and the table as Parquet and CSV."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TRIGGERS = ("clock", "stall", "push", "other")
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column: its type, unit and meaning. ``provenance``: no part of what a trial is or gave."""
+    """Column: its type, unit and meaning. ``provenance``: how a row was made, not its result."""
 
     name: str
     kind: type
@@ -81,7 +81,7 @@ PROVENANCE = frozenset(c.name for c in COLUMNS if c.provenance)
 
 
 class TableError(Exception):
-    """A table that cannot be read: which file, what is wrong, what to do."""
+    """A table cannot be read; the message says which file, what is wrong and what to do."""
 
 
 def outcome_of(row: Mapping[str, Any]) -> Row:
@@ -90,7 +90,7 @@ def outcome_of(row: Mapping[str, Any]) -> Row:
 
 
 def sort_rows(rows: Sequence[Row]) -> list[Row]:
-    """``rows`` in the table's order, which does not depend on who finished first."""
+    """``rows`` in the table's order, which does not depend on the order of finishing."""
     return sorted(rows, key=lambda row: tuple(row[name] for name in IDENTITY))
 
 
@@ -136,7 +136,7 @@ def parquet_bytes(rows: Sequence[Row]) -> bytes:
 
 
 def csv_text(rows: Sequence[Row], names: Sequence[str] = NAMES) -> str:
-    """``rows`` as CSV; numbers so that they read back the same, nothing where there is None."""
+    """``rows`` as CSV; numbers read back exactly, None is empty."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(names)
@@ -159,7 +159,7 @@ def replace_file(path: Path, data: bytes) -> None:
 
 
 def read_table(path: Path) -> list[Row]:
-    """Rows of a Parquet file of ours; TableError."""
+    """Rows of a Parquet file made by `parquet_bytes`; TableError."""
     import pyarrow
     import pyarrow.parquet
 

@@ -1,4 +1,4 @@
-"""Runs the trials of a study that are not finished yet, and writes the tables when all are."""
+"""Run the unfinished trials of a study, and write its tables."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from tactile_tools.experiments.studies import Study
 from tactile_tools.experiments.trial import software_version
 
 REFERENCE_CPU = 0.30
-"""CPU-s that the authors' simulator needs for a simulated second, without making the scene."""
+"""CPU-seconds that the authors' simulator needs per simulated second, without making the scene."""
 
 WARM_UP = 100
 """Trials after which caches and the allocator's pools of a worker have filled."""
 
 Progress = Callable[[int, int, Row | None], None]
-"""Called with trials finished, trials in all, and the row that was finished just now."""
+"""Called with trials finished, trials in all, and the row that was just finished."""
 
 
 class StudyError(ValueError):
-    """A study that cannot be run as it was asked for."""
+    """A study cannot be run as it was asked for."""
 
 
 def check(study: Study) -> None:
-    """Refuse what every trial would fail of, before the first: StudyError, or ValueError."""
+    """Check before the first trial what would make every trial fail; StudyError or ValueError."""
     if not study.specs:
         raise StudyError("the experiment has no trials: at least one scene and one strategy")
     import numpy as np
@@ -58,7 +58,7 @@ def check(study: Study) -> None:
 
 
 def _check_source(spec: TrialSpec) -> None:
-    """A scene that cannot be made is a row; a source that does not exist is a wrong argument."""
+    """Check that the source exists. A scene that cannot be made is not an error: it gives a row."""
     try:
         build_scene(spec.source, spec.scene_seed, None)
     except RuntimeError:
@@ -75,8 +75,8 @@ def run_study(
 ) -> dict[str, Any]:
     """Run what is not finished in ``directory``, write tables and summary, return the summary.
 
-    ``retry``: run trials again that ended in an error. FolderError, DiskError, BackendError; what
-    was finished by then is kept.
+    ``retry``: rerun trials that ended in an error. FolderError, DiskError, BackendError; what was
+    finished by then is kept.
     """
     began = time.perf_counter()
     with Journal(directory, study.definition) as journal:
@@ -121,7 +121,7 @@ def _key(row: Row) -> TrialSpec:
 
 
 def summarize(rows: Sequence[Row]) -> dict[str, Any]:
-    """What the rows took: CPU, speed beside the authors' simulator, memory of the workers."""
+    """Cost of the rows: CPU, speed relative to the authors' simulator, memory of the workers."""
     good = [row for row in rows if row["error"] is None]
     cpu = sum(row["cpu_s"] for row in good)
     scenes = sum(row["scene_cpu_s"] for row in good)
@@ -142,10 +142,10 @@ def summarize(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def memory_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Resident memory of the workers: peak, and growth by a line through each one's course.
+    """Resident memory of the workers, MB: peak, and growth by a line fitted to each worker.
 
     ``growth_mb_per_1000``: the greatest of workers with enough trials after their first
-    `WARM_UP`; None where there is none.
+    `WARM_UP`; None if there is no such worker.
     """
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""What a trial is: everything its outcome depends on, as plain values that are its columns too."""
+"""Specification of a trial: everything its outcome depends on, as values that are its columns."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ STRATEGIES = ("straight", "burrow", "excavate", "hybrid_clock", "hybrid_event")
 class Conditions:
     """How the world and the sense of touch differ from those of the parameter set.
 
-    What is None is as the set says.
+    None: as the set says.
     """
 
     objects: Annotated[
@@ -63,7 +63,7 @@ class Conditions:
     ] = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse values that no world has."""
+        """Check that a world can have these values; ConfigError."""
         check_fields(self)
         if self.objects is not None:
             low, high = self.objects
@@ -72,7 +72,7 @@ class Conditions:
                 raise ConfigError(problem, ("objects",))
 
     def to_json(self) -> str:
-        """Canonical text of what differs; "{}" when nothing does."""
+        """Canonical text of what differs; "{}" if nothing does."""
         default = Conditions()
         return canonical(
             {k: v for k, v in asdict(self).items() if v != getattr(default, k)},
@@ -106,17 +106,17 @@ class TrialSpec:
     conditions: str = "{}"
 
     def resolved(self) -> Parameters:
-        """The parameters; ConfigError."""
+        """Parameters of the trial; ConfigError."""
         return parameters(self.set, _table(self.parameters, "parameters"))
 
     @property
     def changed(self) -> Conditions:
-        """The conditions; ConfigError."""
+        """Conditions of the trial; ConfigError."""
         return Conditions.from_json(self.conditions)
 
     @property
     def typed_depth(self) -> Depth:
-        """The depth of sensing; ConfigError."""
+        """Depth of sensing; ConfigError."""
         if self.depth not in DEPTHS:
             raise ConfigError(f"unknown depth {self.depth!r}; available: {', '.join(DEPTHS)}")
         return self.depth
@@ -126,7 +126,7 @@ IDENTITY = tuple(f.name for f in fields(TrialSpec))
 
 
 def spec_of(row: Mapping[str, Any]) -> TrialSpec:
-    """The trial that ``row`` is of."""
+    """Specification of the trial in ``row``."""
     return TrialSpec(**{name: row[name] for name in IDENTITY})
 
 
@@ -136,7 +136,7 @@ def canonical(values: Mapping[str, Any]) -> str:
 
 
 def _table(text: str, what: str) -> dict[str, Any]:
-    """The JSON object in ``text``; ConfigError."""
+    """JSON object in ``text``; ConfigError."""
     try:
         raw = json.loads(text)
     except json.JSONDecodeError as error:

@@ -16,14 +16,14 @@ SIGNIFICANT = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """``count`` of ``trials`` with its 95 % Wilson score interval; NaN of no trials."""
+    """``count`` of ``trials`` with its 95 % Wilson score interval; NaN without trials."""
 
     count: int
     trials: int
 
     @property
     def value(self) -> float:
-        """The rate."""
+        """Count over trials."""
         return self.count / self.trials if self.trials else math.nan
 
     @property
@@ -48,7 +48,7 @@ class Contrast:
 class PairedRates:
     """Successes of a and b in the same ``scenes``: difference a − b, 95 % interval, McNemar's p.
 
-    ``only_a``, ``only_b``: scenes where one succeeded and the other did not.
+    ``only_a``, ``only_b``: scenes where only one succeeded.
     """
 
     scenes: int
@@ -61,7 +61,7 @@ class PairedRates:
 
 @dataclass(frozen=True, slots=True)
 class PairedValues:
-    """a against b in the same ``scenes`` by Wilcoxon's signed ranks.
+    """Compare a and b in the same ``scenes`` by Wilcoxon's signed ranks.
 
     ``mean_difference`` a − b. ``effect``: matched-pairs rank-biserial correlation, −1 (a always
     less) to 1. ``p``: two-sided; ``adjusted``: by Holm within its family.
@@ -77,7 +77,7 @@ class PairedValues:
 
 
 def contrast(a: Rate, b: Rate) -> Contrast:
-    """Two rates of independent samples (Newcombe 1998, method 10, and Fisher's exact test)."""
+    """Compare two rates of independent samples (Newcombe 1998, method 10; Fisher's exact test)."""
     difference = a.value - b.value
     (low_a, high_a), (low_b, high_b) = a.interval, b.interval
     low = difference - math.hypot(a.value - low_a, high_b - b.value)
@@ -88,7 +88,7 @@ def contrast(a: Rate, b: Rate) -> Contrast:
 
 
 def paired_rates(a: Sequence[bool], b: Sequence[bool]) -> PairedRates:
-    """Successes in the same scenes, in the same order.
+    """Compare successes in the same scenes, in the same order.
 
     McNemar's exact test: the discordant pairs against a fair coin. Interval: Agresti and Min 2005,
     half a pair added to each of the four cells.
@@ -108,9 +108,9 @@ def paired_rates(a: Sequence[bool], b: Sequence[bool]) -> PairedRates:
 
 
 def signed_rank(a: Sequence[float], b: Sequence[float]) -> tuple[float, float]:
-    """Wilcoxon's two-sided p of a − b, and the rank-biserial effect; pairs that tie are dropped.
+    """Wilcoxon's two-sided p of a − b, and the rank-biserial effect; ties are dropped.
 
-    1 and 0 where all pairs tie.
+    1 and 0 if all pairs tie.
     """
     difference = np.asarray(a, dtype=np.float64) - np.asarray(b, dtype=np.float64)
     difference = difference[difference != 0]
@@ -155,7 +155,7 @@ def all_pairs(values: Mapping[str, Mapping[int, float]]) -> list[PairedValues]:
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float]:
-    """95 % interval of a mean by Student's t; NaN of fewer than two values."""
+    """95 % interval of a mean by Student's t; NaN for fewer than two values."""
     n = len(values)
     if n < 2:
         return math.nan, math.nan
@@ -165,7 +165,7 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float]:
 
 
 def stars(p: float) -> str:
-    """The paper's marks: **** below 0.0001, *** 0.001, ** 0.01, * 0.05, else "ns"."""
+    """Marks as in the paper: **** below 0.0001, *** 0.001, ** 0.01, * 0.05, else "ns"."""
     for mark, bound in (("****", 1e-4), ("***", 1e-3), ("**", 1e-2), ("*", SIGNIFICANT)):
         if p < bound:
             return mark

@@ -18,15 +18,15 @@ SWEEP_TIMES = tuple(1.875 + 0.625 * i for i in range(10))
 """The paper's Table II: A_bur; f_bur, in "Hz"; t_excv and t_trig, s."""
 
 READINGS: Mapping[str, float] = {"rad": 1.0, "hz": 2.0 * math.pi}
-"""What the paper's f_bur may mean, as rad/s to one of it. It writes sin(f t) and calls f a
-frequency in Hz; its authors' simulator takes it as rad/s in the sweep."""
+"""Readings of the paper's f_bur: factor from its number to rad/s. The paper writes sin(f t) and
+calls f a frequency in Hz; its authors' simulator takes it as rad/s in the sweep."""
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What all studies have in common.
+    """Options common to all studies.
 
-    ``seed``: of the first scene, the others follow. ``source``: scenes, None for those of the
+    ``seed``: of the first scene; the others follow. ``source``: scenes, None for those of the
     set. ``parameters``: what differs from the set in every trial.
     """
 
@@ -41,7 +41,7 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """An experiment: what it is of (plain JSON values), and its trials, scene by scene."""
+    """Experiment: its definition (plain JSON values), and its trials, scene by scene."""
 
     definition: dict[str, Any]
     specs: tuple[TrialSpec, ...]
@@ -49,7 +49,7 @@ class Study:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A point of a sweep: primitive, reading of its frequency ("" for excavate), two values."""
+    """Point of a sweep: primitive, reading of its frequency ("" for excavate), two values."""
 
     primitive: str
     reading: str
@@ -58,7 +58,7 @@ class Cell:
     parameters: Mapping[str, float]
 
     def of(self, base: Mapping[str, Any]) -> str:
-        """The column ``parameters`` of its trials, where all have ``base``."""
+        """Value of the column ``parameters`` for its trials, on top of ``base``."""
         return canonical({**base, **self.parameters})
 
 
@@ -85,8 +85,8 @@ def sweep_study(options: Options, primitives: tuple[str, ...], readings: tuple[s
 
 
 def sweep_cells(primitives: Iterable[str], readings: Iterable[str]) -> list[Cell]:
-    """Every cell: of burrow rows are amplitudes, columns frequencies; of excavate rows are
-    excavation times, columns times between them.
+    """Every cell. Burrow: rows are amplitudes, columns frequencies. Excavate: rows are excavation
+    times, columns times between excavations.
     """
     cells = []
     if "burrow" in primitives:
@@ -131,7 +131,7 @@ def robustness_study(
 
 
 def _bases(options: Options) -> list[TrialSpec]:
-    """A straight line for each scene and kind of trial, scenes outermost."""
+    """A straight trial for each scene, set, engine and depth, scenes outermost."""
     return [
         TrialSpec(
             source=options.source or name,
@@ -169,7 +169,7 @@ def _with(
 
 
 def _study(name: str, options: Options, specs: Iterable[TrialSpec], **more: Any) -> Study:
-    """The study with each trial once: several axes have the set's own values among their levels."""
+    """Study with each trial once: several axes have the set's own values among their levels."""
     definition = {"study": name, **asdict(options), **{k: list(v) for k, v in more.items()}}
     for key in ("sets", "engines", "depths"):
         definition[key] = list(definition[key])
@@ -177,7 +177,7 @@ def _study(name: str, options: Options, specs: Iterable[TrialSpec], **more: Any)
 
 
 def rebuild(directory: Path, definition: Mapping[str, Any]) -> tuple[Study, Options]:
-    """The study that ``definition`` is of, and what it has in common with others; FolderError."""
+    """Study that ``definition`` describes, and its common options; FolderError."""
     try:
         options = Options(
             scenes=definition["scenes"],

@@ -1,4 +1,4 @@
-"""A run's rows, whether it is finished or not."""
+"""Rows of a run, finished or not."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tactile_tools.experiments.spec import spec_of
 from tactile_tools.experiments.studies import Options, Study, rebuild
 
 GROUP = ("set", "engine", "depth")
-"""Columns that part a run into studies of their own."""
+"""Columns that divide a run into separate studies."""
 
 
 _WORDS = {
@@ -26,15 +26,15 @@ _WORDS = {
 
 
 def title_of(group: Sequence[str]) -> str:
-    """A group in words."""
+    """Group in words."""
     return " · ".join(_WORDS.get(value, value) for value in group)
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A run: its folder, what it is of, its rows in the table's order, and how many it is to have.
+    """Run: its folder, its study and options, and its rows in the table's order.
 
-    ``error`` rows are among ``rows``.
+    ``rows`` include trials that ended in an error.
     """
 
     directory: Path
@@ -44,12 +44,12 @@ class Run:
 
     @property
     def kind(self) -> str:
-        """Which study."""
+        """Name of the study."""
         return str(self.study.definition["study"])
 
     @property
     def missing(self) -> int:
-        """Trials that are not finished."""
+        """Number of trials that are not finished."""
         return len(self.study.specs) - len(self.rows)
 
     def groups(self) -> dict[tuple[str, ...], list[Row]]:
@@ -61,12 +61,12 @@ class Run:
 
 
 def load_run(directory: Path) -> Run:
-    """The run in ``directory``, or what was put by of one; FolderError or TableError."""
+    """Load the run in ``directory``, or one kept by `put_by`; FolderError or TableError."""
     definition: dict[str, Any] = read_definition(directory)
     study, options = rebuild(directory, definition)
     table = directory / "trials.parquet"
     if table.exists() and not (directory / "trials.jsonl").exists():
-        # A run that was put by: `put_by` leaves the table alone.
+        # A run kept by `put_by`, which writes only the table.
         found = read_table(table)
     else:
         found = list(read_lines(directory).values())
@@ -76,7 +76,7 @@ def load_run(directory: Path) -> Run:
 
 
 def put_by(run: Run, directory: Path) -> None:
-    """Put into ``directory`` what `load_run` needs of ``run``, as small as it can be; OSError."""
+    """Write to ``directory`` what `load_run` needs of ``run``, as small as possible; OSError."""
     directory.mkdir(parents=True, exist_ok=True)
     replace_file(directory / "experiment.json", (run.directory / "experiment.json").read_bytes())
     replace_file(directory / "trials.parquet", parquet_bytes(run.rows))

@@ -1,4 +1,4 @@
-"""One trial from its specification to its row. The same specification gives the same row."""
+"""Run one trial from its specification to its row. The same specification gives the same row."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tactile_tools.experiments.spec import IDENTITY, TrialSpec, canonical
 from tactile_tools.reach.lockstep import Result, Step, run_trial
 
 _run_here: Counter[str] = Counter()
-"""Trials by worker, of this process: for the memory's course over them."""
+"""Trials run in this process, by worker: needed to see memory grow with their number."""
 
 
 def run_one(
@@ -29,9 +29,9 @@ def run_one(
     watch: Callable[[Step], None] | None = None,
     done: Callable[[Result], None] | None = None,
 ) -> Row:
-    """The row of ``spec``. What goes wrong in the trial is in its column ``error``.
+    """Run ``spec`` and return its row. Errors of the trial are in the column ``error``.
 
-    ``watch``: called once a control cycle. ``done``: called with the result.
+    ``watch``: called once per control cycle. ``done``: called with the result.
     """
     began_wall, began = time.perf_counter(), time.thread_time()
     row: Row = dict.fromkeys(NAMES)
@@ -54,7 +54,7 @@ def run_one(
         row.update(_outcome(scene, spec, result))
         if done is not None:
             done(result)
-    except Exception as error:  # noqa: BLE001 - the border of a trial: others must not suffer
+    except Exception as error:  # noqa: BLE001 - boundary of a trial: the others must go on
         row["error"] = f"{type(error).__name__}: {error}"
     row.update(_provenance(time.perf_counter() - began_wall, time.thread_time() - began))
     return row
@@ -66,7 +66,7 @@ def run_batch(specs: Sequence[TrialSpec]) -> list[Row]:
 
 
 def lost(spec: TrialSpec, why: str) -> Row:
-    """Row of a trial whose worker died, which leaves nothing but ``why``."""
+    """Row of a trial whose worker died; it holds only ``why``."""
     row: Row = dict.fromkeys(NAMES)
     row.update({name: getattr(spec, name) for name in IDENTITY})
     row["error"] = why
@@ -75,7 +75,7 @@ def lost(spec: TrialSpec, why: str) -> Row:
 
 
 def _outcome(scene: Scene, spec: TrialSpec, result: Result) -> Row:
-    """What a trial gave, by column."""
+    """Result of a trial, by column."""
     o = result.outcome
     limit = spec.resolved().time_limit
     counts = Counter(
@@ -91,7 +91,7 @@ def _outcome(scene: Scene, spec: TrialSpec, result: Result) -> Row:
         "closest_m": o.closest,
         "normalized_distance": o.distance / scene.depth,
         "normalized_closest": o.closest / scene.depth,
-        # What did not arrive took all the time there was, also where the gate ended it sooner.
+        # A reach that did not arrive took all its time, even if the gate ended it sooner.
         "time_s": o.time if o.success else limit,
         "time_limit_s": limit,
         "normalized_time": o.time / limit if o.success else 1.0,
@@ -113,7 +113,7 @@ def _outcome(scene: Scene, spec: TrialSpec, result: Result) -> Row:
 
 
 def _provenance(wall: float, cpu: float) -> Row:
-    """Who ran it and what it took."""
+    """Worker, version and cost of the trial, by column."""
     worker = f"{socket.gethostname()}:{os.getpid()}"
     _run_here[worker] += 1
     return {
@@ -128,7 +128,7 @@ def _provenance(wall: float, cpu: float) -> Row:
 
 @cache
 def software_version() -> str:
-    """Version of the package; in a checkout also its commit, "+" where files were changed."""
+    """Version of the package; in a checkout also its commit, with "+" if files were changed."""
     name = version("tactile-reach")
     here = Path(__file__)
     try:
@@ -141,7 +141,7 @@ def software_version() -> str:
 
 
 def _git(directory: Path, *words: str) -> str:
-    """What git says; SubprocessError where this is no checkout."""
+    """Output of git; SubprocessError outside a checkout."""
     done = subprocess.run(
         ["git", *words], cwd=directory, capture_output=True, text=True, check=True, timeout=10
     )

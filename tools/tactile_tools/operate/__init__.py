@@ -1,1 +1,1 @@
-"""Running rigs: status, tare, health, keys, service units."""
+"""Operate rigs: status, tare, health, keys, service units."""

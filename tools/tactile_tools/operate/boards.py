@@ -1,4 +1,4 @@
-"""The boards of running tactileds, for tools that ask them something over the bus."""
+"""Boards of running tactileds, for tools that send them requests over the bus."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from tactile_core.cli import DONE, REFUSED, USAGE, CommandError
 from tactile_core.options import BusTable, bus_config
 
 FIND_S = 3.0
-"""s for a tactiled to be found on the bus."""
+"""Seconds to find a tactiled on the bus."""
 
 GATHER_S = 0.2
-"""s more for others, once one has been found."""
+"""Extra seconds to find others, once one has been found."""
 
 STATUS_S = 3.0
-"""s for a tactiled to answer what takes it no time."""
+"""Seconds for a tactiled to answer a request that takes it no time."""
 
 
 class BoardError(CommandError):
-    """What was asked of a board cannot be done."""
+    """A request to a board failed."""
 
 
 def told(work: Callable[[argparse.Namespace], None]) -> Callable[[argparse.Namespace], int]:
-    """``work`` as a command: what the bus or a daemon refuses is a `CommandError`."""
+    """``work`` as a command: what the bus or a daemon refuses becomes a `CommandError`."""
 
     def command(options: argparse.Namespace) -> int:
         try:
@@ -46,7 +46,7 @@ def told(work: Callable[[argparse.Namespace], None]) -> Callable[[argparse.Names
 
 @contextlib.contextmanager
 def bus(options: argparse.Namespace) -> Iterator[zenoh.Session]:
-    """A session as the flags ask for."""
+    """Open a session as the options ask for."""
     session = open_session(bus_config(options, BusTable(), "tool"))
     try:
         yield session
@@ -55,7 +55,7 @@ def bus(options: argparse.Namespace) -> Iterator[zenoh.Session]:
 
 
 def find(session: zenoh.Session, options: argparse.Namespace) -> list[str]:
-    """Names of all boards, at least one; `BoardError` when no tactiled is there."""
+    """Names of all boards, at least one; `BoardError` if there is no tactiled."""
     names = set(list_alive(session, FIND_S))
     if names:
         time.sleep(GATHER_S)
@@ -72,7 +72,7 @@ def find(session: zenoh.Session, options: argparse.Namespace) -> list[str]:
 
 
 def choose(wanted: str | None, names: list[str]) -> str:
-    """The board that is meant; `BoardError` when that is not one of ``names``, or not clear."""
+    """Name of the board that is meant; `BoardError` if it is not in ``names`` or ambiguous."""
     there = ", ".join(names)
     if wanted is None and len(names) == 1:
         return names[0]

@@ -1,4 +1,4 @@
-"""``tactile bus``: keys for a lab, the secret of this user's rigs, who is connected."""
+"""``tactile bus``: make keys for a lab, show the secret of this user's rigs."""
 
 from __future__ import annotations
 

@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     import zenoh
 
 HEALTHY, DEGRADED, USAGE, NOBODY, FAILED = range(5)
-"""Exit status: all well; to be looked at; bad argument; nobody answers; something has failed."""
+"""Exit statuses: all well; needs attention; bad argument; no answer; something has failed."""
 
 WORDS = {HEALTHY: "OK", DEGRADED: "WARNING", FAILED: "CRITICAL", NOBODY: "NOBODY"}
 
 LATE_S = 0.010
-"""s of the control loop's lateness (99.9 %) that is too much: a whole cycle."""
+"""Lateness of the control loop (99.9 %) that is too much, s: a whole cycle."""
 
 KINDS = ("tactile", "reach", "arm")
 CALLED = {"tactile": "board", "reach": "reach", "arm": "arm"}
@@ -36,13 +36,13 @@ class Part:
     problems: list[str] = field(default_factory=list)
 
     def add(self, level: int, problem: str) -> None:
-        """Something is not as it should be."""
+        """Note a problem and raise the level."""
         self.level = max(self.level, level)
         self.problems.append(problem)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Ask and tell; the exit status says how it is."""
+    """Ask, print and return the exit status."""
     from tactile_core.bus.session import BusError, close_session, open_session
 
     try:
@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def line(level: int, parts: list[Part]) -> str:
-    """All of it in one line: what is wrong first."""
+    """Result in one line, problems first."""
     if not parts:
         return f"{WORDS[level]}: no board, reach or arm answers on this bus"
     wrong = [f"{p.kind} {p.name}: {'; '.join(p.problems)}" for p in parts if p.problems]
@@ -73,7 +73,7 @@ def line(level: int, parts: list[Part]) -> str:
 
 
 def look(session: zenoh.Session, wanted: dict[str, list[str]], timeout: float) -> list[Part]:
-    """Ask whoever is there, and whoever is wanted; in a fixed order."""
+    """Ask those that are there, or those ``wanted``; in a fixed order. ``timeout``: s."""
     from tactile_core.bus.services import ServiceError, call
     from tactile_core.bus.topics import service_key
 
@@ -95,7 +95,7 @@ def look(session: zenoh.Session, wanted: dict[str, list[str]], timeout: float) -
 
 
 def _alive(session: zenoh.Session, kind: str, timeout: float) -> list[str]:
-    """Names that have a token; links take a moment to come about, so it is asked again."""
+    """Names that have a token; links take a moment to form, so it asks repeatedly."""
     import time
 
     key, found = f"{kind}/*/alive", set()

@@ -1,7 +1,7 @@
-"""A certificate authority for a lab, and a folder of keys for each party of its rigs.
+"""Certificate authority of a lab, and a folder of keys for each party of its rigs.
 
 The authority's own key stays in the lab's folder and is needed only to make more keys; nothing that
-runs reads it. Every party has a folder of its own to be carried to its machine.
+runs reads it. Every party has its own folder, to be copied to its machine.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
     from cryptography.x509 import Certificate, CertificateBuilder, Name
 
 CA_KEY = "ca.key"
-"""The authority's private key, in the lab's folder."""
+"""File of the authority's private key, in the lab's folder."""
 
 HERE = ("localhost", "127.0.0.1", "::1")
-"""Names of the machine itself, which every daemon's certificate has."""
+"""Names of the machine itself, which every daemon's certificate contains."""
 
 LISTENS: tuple[CertificateRole, ...] = ("tactiled", "reachd", "arm")
-"""Roles that others connect to; nobody else's certificate can pass for one of a server."""
+"""Roles that others connect to; no other certificate can pass as a server's."""
 
 PARTY = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
-"""What a party may be called: its folder and the common name of its certificate."""
+"""Allowed names of a party: its folder and the common name of its certificate."""
 
 BACKDATED = datetime.timedelta(hours=1)
-"""Certificates hold from so much earlier, for machines whose clocks are behind."""
+"""Certificates are valid from this much earlier, for machines whose clocks are behind."""
 
 
 class LabError(Exception):
@@ -46,7 +46,7 @@ class LabError(Exception):
 
 @dataclass(frozen=True)
 class Order:
-    """``parties`` (name, role), ``hosts`` that daemons are reached at, ``days`` they hold."""
+    """``parties``: names and roles. ``hosts``: where daemons are reached. ``days``: validity."""
 
     folder: Path
     parties: Sequence[tuple[str, CertificateRole]]
@@ -62,9 +62,9 @@ DEFAULT_PARTIES: tuple[tuple[str, CertificateRole], ...] = tuple(
 
 
 def make_keys(order: Order) -> list[Path]:
-    """Make the authority where there is none, and a folder for each party; returns the folders.
+    """Make the authority if there is none, and a folder for each party. Returns the folders.
 
-    All folders get the new list of roles. `LabError` when a party is there already (unless
+    All folders get the new list of roles. `LabError` if a party exists already (unless
     ``again``), a name cannot be used, or `cryptography` is not installed.
     """
     _check(order)
@@ -96,7 +96,7 @@ def make_keys(order: Order) -> list[Path]:
 
 
 def known_roles(folder: Path) -> dict[CertificateRole, tuple[str, ...]]:
-    """The lab's list of roles, empty where there is none yet."""
+    """The lab's list of roles, empty if there is none yet."""
     path = folder / ROLES
     if not path.exists():
         return {}
@@ -107,7 +107,7 @@ def known_roles(folder: Path) -> dict[CertificateRole, tuple[str, ...]]:
 
 
 def remove_party(folder: Path, name: str) -> CertificateRole:
-    """Take a name off the list of roles, in all folders; `LabError` when it is not on it.
+    """Remove a name from the list of roles, in all folders; `LabError` if it is not on it.
 
     Machines that have their own copies need the new ``roles.toml``.
     """
@@ -164,7 +164,7 @@ class _Authority:
 
 
 def _authority(order: Order) -> _Authority:
-    """The lab's authority: what lies in its folder, or a new one."""
+    """Load the lab's authority from its folder, or make a new one."""
     from cryptography import x509
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -293,7 +293,7 @@ def _private(key: EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(path: Path, data: bytes, mode: int) -> None:
-    """Write at once, with its mode from the first byte on."""
+    """Write in one step, with the file mode set from the first byte on."""
     new = path.with_name(f".{path.name}.{os.getpid()}")
     file = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, mode)
     try:

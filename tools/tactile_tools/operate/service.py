@@ -1,4 +1,4 @@
-"""``tactile service``: units, udev rules and configurations, put in place and taken away."""
+"""``tactile service``: install and remove units, udev rules and configurations."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ PLACES = {
     "tactiled.toml": CONFIGURATION,
     "reachd.toml": CONFIGURATION,
 }
-"""Our files and the folders they go to, below the root."""
+"""Files to install, and their folders below the root."""
 
 NAMES = {"tactile.sysusers": "tactile.conf"}
-"""Names they have there, where they differ."""
+"""Names of installed files, where they differ."""
 
 UNITS = ("tactiled.service", "reachd.service")
 
@@ -41,15 +41,15 @@ class Plan:
 
     @property
     def live(self) -> bool:
-        """Whether this is the running system, whose managers must be told."""
+        """Whether this is the running system, so that its managers must be told."""
         return self.root == Path("/") and not self.dry
 
     def target(self, name: str) -> Path:
-        """Where a file of ours goes."""
+        """Path at which a file is installed."""
         return self.root / PLACES[name] / NAMES.get(name, name)
 
     def text(self, name: str) -> str:
-        """What goes there."""
+        """Text of an installed file."""
         text = files("tactile_tools.operate.deploy").joinpath(name).read_text(encoding="utf-8")
         at_home = self.programs.is_relative_to("/home") or self.programs.is_relative_to("/root")
         return (
@@ -149,7 +149,8 @@ def _write(path: Path, text: str) -> None:
 
 
 def _tell(*commands: Iterable[str]) -> None:
-    """Run what the managers of the system need to hear; what is not there is said and left out."""
+    """Run commands that notify the system's managers; those not installed are reported and
+    skipped."""
     for words in commands:
         line = list(words)
         if shutil.which(line[0]) is None:

@@ -1,4 +1,4 @@
-"""``tactile status``: how the boards of a running tactiled do."""
+"""``tactile status``: state of the boards of a running tactiled."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from tactile_core.bus.topics import service_key
 from tactile_tools.operate import boards
 
 INDENT = 13
-"""Columns before what is said of each matter."""
+"""Width of the labels' column."""
 
 
 def status(options: argparse.Namespace) -> None:
-    """Print what tactiled says of one board, or of all."""
+    """Print what tactiled reports of one board, or of all."""
     with boards.bus(options) as session:
         names = boards.find(session, options)
         if options.board is not None:
@@ -41,7 +41,7 @@ run = boards.told(status)
 
 
 def describe(name: str, values: Mapping[str, Any], width: int) -> list[str]:
-    """What ``tactile status`` says of one board, in lines of at most ``width`` columns."""
+    """Status of one board, in lines of at most ``width`` columns."""
     board = " ".join(str(values[k]) for k in ("model", "serial_number") if values.get(k))
     port = f" on {values['port']}" if values.get("port") else ""
     out = _wrap(f"{name}: {values.get('state', 'unknown')}", f"{board}{port}".strip(), width)
@@ -52,7 +52,7 @@ def describe(name: str, values: Mapping[str, Any], width: int) -> list[str]:
 
 
 def matters(values: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Label and text of each thing to say; empty texts where there is nothing."""
+    """Label and text of each line; the text is empty if there is nothing to say."""
     reasons = "; ".join(str(reason) for reason in values.get("reasons", ()))
     felt = _force(values)
     valid = values.get("features_valid")
@@ -134,7 +134,7 @@ def _log(log: Mapping[str, Any] | None) -> str:
 
 
 def _wrap(label: str, text: str, width: int) -> list[str]:
-    """``text`` beside its label, broken between words only."""
+    """``text`` beside its label, broken only between words."""
     head = f"{label:{INDENT}} "
     if len(label) > INDENT:
         head = f"{label}  "

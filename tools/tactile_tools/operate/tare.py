@@ -1,4 +1,4 @@
-"""``tactile tare``: what the untouched skin reads now becomes its rest."""
+"""``tactile tare``: take what the untouched skin reads now as its rest field."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from tactile_tools.operate import boards
 from tactile_tools.operate.boards import BoardError
 
 TARE_S = 120.0
-"""s to wait for the end of a tare: eight frames of a board at 0.5 Hz, several times over."""
+"""Seconds to wait for the end of a tare: eight frames of a board at 0.5 Hz, several times over."""
 
 NOT_TAKEN = "tare refused"
-"""Beginning of what tactiled says of a tare that it did not take."""
+"""Beginning of tactiled's message when it refuses a tare."""
 
 
 def tare(options: argparse.Namespace) -> None:
-    """Tare and say what came of it; `BoardError` when it was refused."""
+    """Tare and print the result; `BoardError` if it was refused."""
     with boards.bus(options) as session:
         name = boards.choose(options.board, boards.find(session, options))
         if sys.stderr.isatty():  # a slow board takes a quarter of a minute

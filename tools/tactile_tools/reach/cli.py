@@ -14,8 +14,8 @@ from tactile_tools.plot.series import LogUnreadableError
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run one trial and print what became of it."""
-    # Physics and strategies take half a second to import: not before a trial is really wanted.
+    """Run one trial and print its outcome. Returns the exit status."""
+    # Physics and strategies take half a second to import: only when a trial is really run.
     from reachd.strategies import StrategyError
     from sim_device.world.base import WorldError
     from tactile_core.config import ConfigError
@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"tactile reach: {error}", file=sys.stderr)
         return 2
     except BrokenPipeError:
-        raise  # whoever read our words has gone, which is the umbrella's affair
+        raise  # the reader of our output has gone; the command ``tactile`` handles that
     except (WorldError, RecorderError, LogUnreadableError, OSError, RuntimeError) as error:
         print(f"tactile reach: {error}", file=sys.stderr)
         return 3
@@ -62,14 +62,14 @@ def _run(options: argparse.Namespace) -> int:
     from tactile_tools.reach.trial_log import TrialLog
 
     if ":" in options.strategy and os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # one of the user's own may lie here
+        sys.path.append(os.getcwd())  # a user's own strategy may be here
     scene_seed, seed = seeds_of(options)
     if options.trial_seed is not None:
         print("tactile reach: note: --trial-seed is now called --seed", file=sys.stderr)
         seed = options.trial_seed
     scene = load_scene(options.scene, scene_seed)
     parameters = parameter_set(options.set or scene.parameters)
-    # Before a log is begun, for one that cannot be loaded must not leave one behind.
+    # Before a log is begun: a strategy that cannot be loaded must not leave a log behind.
     load_strategy(options.strategy, parameters, np.random.default_rng(0))
     world = make_world(options.engine, scene)
     trial = partial(

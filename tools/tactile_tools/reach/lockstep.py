@@ -1,4 +1,4 @@
-"""A reach in one process on virtual time: the daemons' own objects, faster than real time.
+"""Reach in one process on virtual time: the daemons' own objects, faster than real time.
 
 World → (contacts or board bytes → decoder → pipeline) → strategy → safety gate → arm → world. A
 trial is a function of scene, strategy, parameters, seed and depth; nothing reads a clock.
@@ -32,12 +32,12 @@ from tactiled.blocks import Cycle
 Depth = Literal["contacts", "taxels"]
 
 BEGIN = Instant(1_000_000_000)
-"""Virtual time at which every trial begins; not 0, so that what was never set shows."""
+"""Virtual time at which every trial begins; not 0, so that an instant never set is noticed."""
 
 
 @record
 class Step:
-    """One control cycle of a trial, for whoever logs or draws it."""
+    """One control cycle of a trial, for logs and drawings."""
 
     now: Instant
     world: World
@@ -49,9 +49,9 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What became of a trial.
+    """Result of a trial.
 
-    ``mean_load``, ``peak_load``: summed normal forces in N. ``entered``: the tip was ever within
+    ``mean_load``, ``peak_load``: summed normal forces in N. ``entered``: the tip came within
     7.5 mm of the goal. ``ejected``: objects past the front edge. ``simulated_s``: virtual time.
     """
 
@@ -65,7 +65,7 @@ class Result:
 
 
 ENTERED = 0.0075
-"""m, the paper's goal region."""
+"""Radius of the paper's goal region, m."""
 
 
 def run_trial(
@@ -79,10 +79,10 @@ def run_trial(
     sense: Sense | None = None,
     watch: Callable[[Step], None] | None = None,
 ) -> Result:
-    """Run one trial to its end. StrategyError, ConfigError or WorldError where it cannot be run.
+    """Run one trial to its end. StrategyError, ConfigError or WorldError if it cannot be run.
 
-    ``seed``: strategy, board and arm draw from generators made of it. ``world``: another engine
-    than MuJoCo. ``watch``: called once a control cycle.
+    ``seed``: strategy, board and arm draw from generators made from it. ``world``: None for
+    MuJoCo's. ``sense``: None for that of ``depth``. ``watch``: called once per control cycle.
     """
     world = MujocoWorld(scene) if world is None else world
     if sense is None:
@@ -129,6 +129,7 @@ def run_trial(
 
 
 def _next(arm: SimulatedArm, now: Instant, period: float) -> tuple[Instant, ArmState]:
-    """One control period on; the newest state of an arm that has no faults."""
+    """Advance one control period. Returns the instant and the newest state of an arm without
+    faults."""
     now = after(now, period)
     return now, arm.advance(now)[-1]

@@ -1,4 +1,4 @@
-"""A reach as three real processes with somebody who watches: for benchmarks of the daemons."""
+"""Reach as three real processes with an observer, for benchmarks of the daemons."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ WAIT_S = 40.0  # for anything to come about on a busy machine
 WATCHED = (FEATURES, ARM_STATE, COMMAND, REACH_STATE)
 NAMES = {FEATURES: BOARD, ARM_STATE: ARM, COMMAND: ARM, REACH_STATE: REACH}
 MAX_HEARD = 60_000
-"""Samples of each topic that are kept between two `clear`: ten minutes' worth."""
+"""Most samples of each topic that are kept between two `clear`: ten minutes' worth."""
 
 
 class WatchError(RuntimeError):
-    """Something did not come about in time; the text holds what the processes said."""
+    """Something did not happen in time; the text holds what the processes printed."""
 
 
 class Relay:
-    """Passes bytes between the simulated board and tactiled, and notes when they went.
+    """Passes bytes between the simulated board and tactiled, and notes when they were sent.
 
     ``written``: by sequence of a cycle, the monotonic ns at which the write of its last bytes
-    returned. ``path`` is the port for tactiled.
+    returned. ``path``: the port for tactiled.
     """
 
     def __init__(self, board: Path) -> None:
@@ -61,7 +61,7 @@ class Relay:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop passing anything on."""
+        """Stop passing data on."""
         self._stopping = True
         self._thread.join()
         for end in (self._board, self._master, self._slave):
@@ -90,9 +90,9 @@ class Relay:
 
 
 class LiveReach:
-    """``simdevice cupboard``, ``tactiled`` and ``reachd --serve`` on ports of their own.
+    """``simdevice cupboard``, ``tactiled`` and ``reachd --serve``, each with its own endpoint.
 
-    A context manager; `WatchError` where something does not come about. ``heard``: arrival
+    A context manager; `WatchError` if something does not happen in time. ``heard``: arrival
     (monotonic ns) and bytes of every sample of the topics in `WATCHED`, since `clear`.
     """
 
@@ -111,13 +111,13 @@ class LiveReach:
         self._with_relay = relay
         self._scene = scene
         self._strategy = strategy
-        # What is asked of reachd beside: no priority even where the system would grant it.
+        # A further setting of reachd: no priority even where the system would grant it.
         self._config: list[str] = []
         if not real_time:
             (folder / "ordinary.toml").write_text("[loop]\npriority = 0\n", encoding="utf-8")
             self._config = ["--config", "ordinary.toml"]
         self._stack = contextlib.ExitStack()
-        # Not in ``folder``: a socket's path may have a hundred bytes, and that one's is the user's.
+        # Not in ``folder``: the user chose that path, and a socket's path has at most ~100 bytes.
         place = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="tactile-bus-")))
         self._ends = {n: socket_at(place, n) for n in ("cupboard", "tactiled", "reachd")}
         self._started = 0
@@ -191,7 +191,7 @@ class LiveReach:
             wait_for(self.folder / BOARD, self._running[name], said)
 
     def _words(self, name: str) -> list[str]:
-        log = f"{name}-{self._started}.mcap"  # of its own after every start
+        log = f"{name}-{self._started}.mcap"  # a new one after every start
         arm, skin, reach = (self._ends[n] for n in ("cupboard", "tactiled", "reachd"))
         if name == "cupboard":
             return [
@@ -211,7 +211,7 @@ class LiveReach:
         ]
 
     def signal(self, name: str, number: signal.Signals) -> int:
-        """Signal one of the three; the instant right before, monotonic ns."""
+        """Signal one of the three. Returns the instant just before, monotonic ns."""
         now = time.monotonic_ns()
         self._running[name].send_signal(number)
         if number == signal.SIGKILL:
@@ -229,12 +229,12 @@ class LiveReach:
             kept.clear()
 
     def decoded(self, topic: Topic) -> list[tuple[int, Any]]:
-        """Arrival and message of what was heard."""
+        """Arrival, monotonic ns, and message of what was heard."""
         decode = codec().decode
         return [(at, decode(topic, data)) for at, data in list(self.heard[topic])]
 
     def until(self, done: Callable[[], object], what: str, seconds: float = WAIT_S) -> None:
-        """Wait until ``done()``; WatchError that says ``what`` was waited for."""
+        """Wait until ``done()``; WatchError says that ``what`` did not come."""
         end = time.monotonic() + seconds
         while not done():
             for name, process in self._running.items():
@@ -248,7 +248,7 @@ class LiveReach:
         return (self.folder / f"{name}.txt").read_text(errors="replace")[-800:]
 
     def wait_ready(self) -> None:
-        """Wait until all three speak, and the features are valid."""
+        """Wait until all three send, and the features are valid."""
         self.clear()
         for topic in (ARM_STATE, FEATURES, REACH_STATE):
             self.until(partial(self._hears, topic), f"the first {topic.template}")
@@ -269,11 +269,11 @@ class LiveReach:
             self.ask("reset")
         end = time.monotonic() + WAIT_S
         goal = None
-        while True:  # the arm comes to rest, faults become past: then it is granted
+        while True:  # granted once the arm has come to rest and faults are over
             try:
                 if goal is None:
                     goal = self.ask("reset", {"seed": seed}, "world")["goal"]
-                    time.sleep(0.3)  # until skin and state tell of it
+                    time.sleep(0.3)  # until skin and state show it
                 self.ask("arm")
                 self.ask("goal", {"x": goal[0], "y": goal[1]})
                 return
@@ -283,7 +283,7 @@ class LiveReach:
                 time.sleep(0.05)
 
     def ended(self) -> bool:
-        """Whether the last that was heard of the reach is its end."""
+        """Whether the last state heard says that the reach has ended."""
         return bool(self.heard[REACH_STATE]) and self.last(REACH_STATE).state == "resetting"
 
     def moving(self) -> bool:

@@ -25,37 +25,38 @@ from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 UP = np.array([0.0, 0.0, 1.0])
 
 CELL_M = 1e-4
-"""m; fifty times finer than taxels lie apart. A search of the nearest costs more than a trial's
-whole control cycle, and a finger is touched in few of these cells."""
+"""Size of a cell for finding the nearest taxel, m; fifty times finer than their spacing. A search
+costs more than a trial's whole control cycle, and a finger is touched in few of these cells."""
 
 SETTLE_S = 1.0
-"""s that a board is given to be identified, its clock to be mapped and its first fits made."""
+"""Seconds for a board to be identified, its clock to be mapped and its first fits to be made."""
 
 
 class Sense(Protocol):
-    """Where a trial's touch comes from."""
+    """Source of a trial's touch."""
 
     def settle(self, world: World, now: Instant) -> Instant:
-        """Start up before the trial; returns when it is done. The world stands still."""
+        """Start up before the trial. Returns the instant at which that is done. The world stands
+        still."""
         ...
 
     def feel(self, world: World, now: Instant) -> Touch | None:
-        """Return the newest touch at ``now``; None before the first."""
+        """Newest touch at ``now``; None before the first."""
         ...
 
     @property
     def cycle(self) -> Cycle | None:
-        """The cycle behind the newest touch; None where contacts are felt as they are."""
+        """Cycle behind the newest touch; None if contacts are felt directly."""
         ...
 
 
 class ContactSense:
-    """The engine's contacts as they are, at every control cycle, in the features' own type."""
+    """Touch from the engine's contacts, exact, at every control cycle."""
 
     cycle: Cycle | None = None
 
     def settle(self, world: World, now: Instant) -> Instant:
-        """There is nothing to start."""
+        """Return at once: there is nothing to start."""
         del world
         return now
 
@@ -77,16 +78,16 @@ class ContactSense:
 
 
 def side_of(x: float, y: float) -> Side:
-    """Part of the skin that a contact at (x, y) m in ``ee`` is felt by: that of the nearest taxel.
+    """Part of the skin that feels a contact at (x, y) m in ``ee``: that of the nearest taxel.
 
-    Places are told apart to `CELL_M`.
+    Places are resolved to `CELL_M`.
     """
     return _side_of_cell(math.floor(x / CELL_M), math.floor(y / CELL_M))
 
 
 @lru_cache(maxsize=1 << 16)
 def _side_of_cell(column: int, row: int) -> Side:
-    """Part of the skin that the middle of a cell belongs to."""
+    """Part of the skin to which the middle of a cell belongs."""
     places, sides = _taxels()
     middle = ((column + 0.5) * CELL_M, (row + 0.5) * CELL_M)
     return sides[int(((places - middle) ** 2).sum(axis=1).argmin())]
@@ -113,12 +114,12 @@ class TaxelSense:
 
     @staticmethod
     def _admit(node: int, identity: Identity) -> Refusal | None:
-        """Every board of ours is welcome."""
+        """Admit every board: it is our own."""
         del node, identity
         return None
 
     def settle(self, world: World, now: Instant) -> Instant:
-        """Identify the board, map its clock, see the first cycles; the finger touches nothing."""
+        """Identify the board, map its clock, take the first cycles; the finger touches nothing."""
         self._line.connect(now)
         end = after(now, SETTLE_S)
         while now < end:
@@ -127,9 +128,9 @@ class TaxelSense:
         return now
 
     def feel(self, world: World, now: Instant) -> Touch | None:
-        """Pass the bytes there are both ways; the newest touch, if a cycle was completed."""
+        """Pass the waiting bytes both ways. Returns the newest touch, None before the first."""
         board = self._board
-        # As functions: a board samples four times more rarely than it is asked for bytes.
+        # As functions: a board samples four times less often than it is asked for bytes.
         board.contacts = lambda _: on_skin(world.contacts(), world.scene)
         board.attitude = lambda _: rotation_about(UP, world.finger().heading)
         events: list[Event] = [e.event for e in self._line.tick(now)]
@@ -148,7 +149,7 @@ class TaxelSense:
 
 
 def touch_of(cycle: Cycle) -> Touch:
-    """Return what a strategy sees of a cycle; the same fields as go over the bus."""
+    """Touch that a strategy gets from a cycle; the same fields as go over the bus."""
     features = cycle.features
     x, y = (float(v) for v in features.peak_position[:2])
     return Touch(

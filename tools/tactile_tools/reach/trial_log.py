@@ -1,4 +1,4 @@
-"""A trial in lockstep as a log: the same topics and messages as the daemons write."""
+"""Log of a trial in lockstep: the same topics and messages as the daemons write."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from tactiled.publisher import MessageMaker
 from tactiled.skin_picture import SkinPicture, patch_markers
 
 EPOCH_NS = 1_700_000_000_000_000_000
-"""Wall-clock time at which every trial begins: a log is a function of the trial alone."""
+"""Wall-clock time at which every trial begins: a log depends on the trial alone."""
 
 WORLD_PERIOD_NS = 100_000_000
 FRAME_PERIOD_NS = 40_000_000
@@ -72,7 +72,7 @@ class TrialLog:
         self._state = ""
 
     def __enter__(self) -> TrialLog:
-        """Ready to be called."""
+        """Return itself, ready to be called."""
         return self
 
     def __exit__(
@@ -81,7 +81,7 @@ class TrialLog:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close the file; RuntimeError where something could not be written."""
+        """Close the file; RuntimeError if something could not be written."""
         whole = self._recorder.close(30.0)
         if error is None and (not whole or self._recorder.stats.dropped):
             raise RuntimeError(f"the log is not whole: {self._recorder.stats}")
@@ -146,7 +146,7 @@ class TrialLog:
                 self._write(CONTACTS, BOARD, picture, captured)
 
     def _contacts(self, touch: Touch, contacts: tuple[FingerContact, ...]) -> None:
-        """Write what was felt where there are no taxels: the engine's own contacts."""
+        """Write what was felt without taxels: the engine's own contacts."""
         self._write(FEATURES, BOARD, self._features(touch, contacts), touch.captured)
         if self._picture.due(touch.captured):
             wall_ns = self._wall.wall_ns(touch.captured)
@@ -186,7 +186,7 @@ class TrialLog:
         )
 
     def _features(self, touch: Touch, contacts: tuple[FingerContact, ...]) -> Any:
-        """What was felt; the patches are the engine's contacts, which a picture wants to show."""
+        """Features message; its patches are the engine's contacts, for the picture."""
         patches = [
             MSG.ContactPatch(
                 array=0,
