@@ -1,4 +1,4 @@
-"""Simulated skins, and a way to drive boards through the real codecs."""
+"""Simulated skins, and a host that drives boards through the real codecs."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ Log = list[tuple[int, Received]]
 
 
 class Host:
-    """Sends commands at given milliseconds and notes every message with the millisecond it came."""
+    """Sends commands at given milliseconds and records every message with its arrival in ms."""
 
     def __init__(self, board: SerialBoard | CanBoard, fd: bool = False) -> None:
         self.board = board
@@ -121,7 +121,7 @@ def host() -> type[Host]:
 
 @pytest.fixture
 def serial(real_skin: Callable[..., SkinModel], identity: Identity) -> Callable[..., Host]:
-    """A host on a serial line, with its board."""
+    """Host on a serial line, with its board."""
 
     def make(**options: Any) -> Host:
         return Host(SerialBoard(real_skin(), identity, **options))

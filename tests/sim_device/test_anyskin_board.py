@@ -1,4 +1,4 @@
-"""The off-the-shelf board: floats, repeats and unflagged failures."""
+"""Simulated off-the-shelf board: floats, repeats and unflagged failures."""
 
 from __future__ import annotations
 

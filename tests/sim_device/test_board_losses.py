@@ -1,4 +1,4 @@
-"""What slow hosts, slow lines and planned faults do to a board: all of it is counted."""
+"""Slow hosts, slow lines and planned faults: a board counts everything that is lost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What broken chips make of a reading."""
+"""Broken chips: how each fault changes a reading."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from sim_device.skin.damage import BrokenTaxels
 
 TAXELS = {"left": 2, "skin": 3}
 COUNTS = np.array([[100, 200, 300], [9, 8, 7], [-5, 40, 9000], [1, 2, -8000], [7, 7, 7]], np.int16)
-"""Of left 0 and 1, skin 0, 1 and 2."""
+"""Taxels, in order: left 0 and 1, skin 0, 1 and 2."""
 
 
 def reading(number: int = 0) -> Reading:
-    """A reading unlike any other."""
+    """Reading number ``number``; no two are alike."""
     counts = COUNTS + np.int16(number)
     return Reading(counts, np.zeros(5, np.uint8), np.full(5, 27.0))
 
 
 def spoilt(faults: str, seconds: float = 1.0) -> Reading:
-    """The first reading under a plan."""
+    """First reading under a plan."""
     return BrokenTaxels(FaultPlan.parse(faults), TAXELS).spoil(reading(), seconds)
 
 

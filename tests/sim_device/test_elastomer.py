@@ -1,4 +1,4 @@
-"""Spreading, compliance, creep and hysteresis of the rubber."""
+"""Elastomer: spreading, compliance, creep and hysteresis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wires that spoil what they carry, and account for every frame of it."""
+"""Wires that corrupt what they carry, and account for every frame."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def frames(n: int) -> list[bytes]:
 
 
 def carry(wire: SerialWire, sent: list[bytes]) -> list[bytes]:
-    """What the wire lets through, a frame every 10 ms, and then a minute of nothing."""
+    """What the wire lets through: a frame every 10 ms, then nothing for a minute."""
     out = []
     for i, frame in enumerate(sent):
         out += wire.pass_on([frame], i * 0.01)
@@ -114,8 +114,8 @@ def test_a_delayed_frame_holds_up_those_behind_it() -> None:
         times += [i] * len(out)
     assert wire.counters["delayed"] > 100
     assert times == sorted(times)
-    # Half of the frames start a delay of 0.1 s: whatever comes out is at least that late or
-    # stood behind one.
+    # Half of the frames start a delay of 0.1 s: whatever comes out is at least that late or was
+    # behind one that is.
     assert wire.counters["held"] >= 95
     assert len(sent) == 2
 
@@ -148,12 +148,12 @@ def test_bit_flips_in_can_frames_are_detected() -> None:
     wire, decoder = CanWire(FaultPlan(seed=1, flip=0.002)), CanDecoder()
     encoder = CanEncoder(3, True)
     for i in range(500):
-        # 33 characters fill 48 bytes: no padding, in which a flip would do no harm.
+        # 33 characters fill 48 bytes: there is no padding, where a flip would do no harm.
         for got in decoder.feed(wire.pass_on(encoder.encode(Log(20, i, "x" * 33)), i * 0.01)):
             assert got.message == Log(20, i, "x" * 33)
     intact = wire.counters["intact"]
     assert 100 < intact < 400
-    # A transfer of one frame may survive a flip in its transfer number, which nothing rests on.
+    # A transfer of one frame may survive a flip in its transfer number, on which nothing depends.
     assert intact <= decoder.counters["accepted"] <= intact + 10
 
 

@@ -1,4 +1,4 @@
-"""Simulated boards as a host meets them, through the real codecs."""
+"""Simulated boards as a host sees them, through the real codecs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MS = 1_000_000
 
 @pytest.fixture(params=["serial", "can", "canfd"])
 def talk(request, real_skin, identity, host):
-    """A host on each medium, with its board."""
+    """Host on each medium, with its board."""
 
     def make(**options):
         if request.param == "serial":
@@ -89,7 +89,7 @@ def test_samples_carry_the_board_clock_of_their_start(serial) -> None:
     ticks = np.array([m.ticks for m in host.of(Samples)])
     assert ticks[0] == pytest.approx(200_000 * 1.01, abs=2)
     assert np.diff(ticks) == pytest.approx(np.full(len(ticks) - 1, 10_000), abs=1)
-    # A clock 1 % fast samples 1 % faster: that is what the host has to find out.
+    # A clock 1 % fast samples 1 % faster: this is what the host has to find out.
     assert len(ticks) == 101
 
 

@@ -1,4 +1,4 @@
-"""The simulator writes as people's sketches do, and each of these is read or told apart."""
+"""The simulator writes as published sketches do, and each format is read or detected."""
 
 from __future__ import annotations
 

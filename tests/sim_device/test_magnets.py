@@ -1,4 +1,4 @@
-"""Dipole fields against closed forms and the published figures of the magnets in use."""
+"""Dipole fields against closed forms and the published figures of the magnets used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What PROTOCOL.md answers beside the bytes, held by simulated board and reference codec."""
+"""Behaviour that PROTOCOL.md requires beside the bytes, of simulated board and reference codec."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole field model: sensitivity, range, calibration, determinism."""
+"""Whole field model: sensitivity, range, calibration, determinism."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_sensitivity_matches_real_skins(ideal_skin) -> None:
     shear = change(model, press(model, 5, (1.0, 0, 0)))[5]
     assert 100 < normal[2] < 250
     assert 100 < abs(shear[0]) < 250
-    # Half of the earth's field, turned about, looks like some tenths of a newton.
+    # Half of the earth's field, turned around, looks like some tenths of a newton.
     assert 0.2 < 50 / normal[2] < 0.5
 
 

@@ -1,4 +1,4 @@
-"""A cupboard with one heavy disc in the finger's way, on a bus of its own, as a real process."""
+"""Cupboard with one heavy disc in the finger's way, on its own bus, as a real process."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory, scene_file: Path) -> Iterat
 
 @pytest.fixture
 def cupboard(shared: Cupboard) -> Cupboard:
-    """The one process of a module, as new."""
+    """The one process of a module, reset."""
     shared.settled()
     return shared
 

@@ -1,4 +1,4 @@
-"""``simdevice cupboard`` as a user meets it before anything moves."""
+"""Command line of ``simdevice cupboard``, before anything moves."""
 
 from __future__ import annotations
 

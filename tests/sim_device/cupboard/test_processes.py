@@ -1,4 +1,4 @@
-"""The cupboard as a real process: its arm on a real bus, its board on a real terminal."""
+"""Cupboard as a real process: its arm on a real bus, its board on a real terminal."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ Wait = Callable[..., None]
 
 
 def rest_after(cupboard: Any) -> float:
-    """s from the last command that the arm obeyed to the last state in which it moves."""
+    """Seconds from the last command that the arm obeyed to the last state in which it moves."""
     cupboard.rest()
     last = cupboard.call("status")["last_command_ns"]
     moving = [s.captured_ns for s in cupboard.states if abs(s.twist.linear.x) > STILL]
@@ -87,7 +87,7 @@ def test_states_are_stamped_at_100_hz_under_any_load(cupboard: Any) -> None:
     wait_until(lambda: len(cupboard.states) >= first + 150)
     states = cupboard.states[first:]
     stamps = np.array([s.captured_ns for s in states])
-    # Late ones are sent, too; the bus may drop one when a link is full.
+    # Late states are sent as well; the bus may drop one when a link is full.
     assert np.median(np.diff(stamps)) == 10_000_000
     assert (np.diff(stamps) > 0).all()
     assert stamps[-1] <= monotonic_now()
@@ -157,7 +157,7 @@ def test_second_commander_is_refused_until_the_first_is_gone(cupboard: Any) -> N
 
 
 def test_strangers_move_nothing_and_block_nobody(cupboard: Any) -> None:
-    """Row 45: whoever reads all that the commander sends, and sends a hundred times as much."""
+    """Row 45: a stranger who reads all that the commander sends, and sends a hundred times more."""
     heard: list[bytes] = []
     tap = Tap(cupboard.session, COMMAND.key("arm"), lambda s: heard.append(s.data))
     owner = cupboard.commander(AHEAD)
@@ -217,7 +217,7 @@ def test_damaged_oversized_and_anonymous_commands_move_nothing(cupboard: Any) ->
         ("late", lambda: publisher.put(command(ago=NS_PER_S), 1)),
         ("not_finite", lambda: publisher.put(command(Twist(math.nan, 0.0, 0.0)), 1)),
     ):
-        # Again and again: on a busy machine one may come too late.
+        # Repeatedly: on a busy machine one may come too late.
         wait_until(lambda send=send, reason=reason: send() or refused(reason) > before[reason])
     after = cupboard.call("status")["counters"]
     assert after["accepted"] == before["accepted"]
@@ -227,7 +227,7 @@ def test_damaged_oversized_and_anonymous_commands_move_nothing(cupboard: Any) ->
 
 @pytest.mark.parametrize("delay", [0.25])
 def test_commands_expire_by_decision_time_despite_delays(delay: float, cupboard: Any) -> None:
-    """Row 37: a queue on the way holds what was decided before the stop."""
+    """Row 37: a queue on the way holds commands decided before the stop."""
     begin = cupboard.states[-1].x
     commander = cupboard.commander(AHEAD)
     wait_until(lambda: cupboard.states[-1].x > begin + 0.005)
@@ -289,7 +289,7 @@ def test_contact_of_the_finger_shows_in_the_bytes_of_its_board(cupboard: Any) ->
             commander.stop()
     finally:
         port.close()
-    # 2 kg on the shelf: what keeps it moving is μ·m·g = 0.2 · 2 · 9.81 N; the impact is harder.
+    # 2 kg on the shelf: μ·m·g = 0.2 · 2 · 9.81 N keeps it moving; the impact is harder.
     wait_until(lambda: min(s.wrench.force.x for s in cupboard.states[first:]) < -2.0)
     assert free < 1.0
 

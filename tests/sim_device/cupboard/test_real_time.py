@@ -1,4 +1,4 @@
-"""World and arm against a clock that is late, stops, and goes on; the clock is the test's."""
+"""World and arm with a clock that is late, stops, and goes on; the tests set the clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes of few objects, the recorded ones, and the simplest reach there is."""
+"""Scenes of few objects, recorded scenes, and the simplest possible reach."""
 
 from __future__ import annotations
 
@@ -75,13 +75,13 @@ def engine(request: pytest.FixtureRequest) -> Engine:
 
 @pytest.fixture(scope="session")
 def recorded() -> Path:
-    """Folder with four scenes of our own in the form of the authors' recordings."""
+    """Folder with four scenes of our own in the format of the authors' recordings."""
     return RECORDED
 
 
 @pytest.fixture(scope="session")
 def authors() -> Path:
-    """Folder with the sixty scenes of the authors' simulator; skips where nobody has put them."""
+    """Folder with the sixty scenes of the authors' simulator; skips if it is not there."""
     try:
         return find_recorded(RECORDED_SCENES).parent
     except SceneError as error:
@@ -90,7 +90,7 @@ def authors() -> Path:
 
 @dataclass(frozen=True)
 class Reach:
-    """``success``: within 1 mm. ``distance``: m of the tip from the goal at the end."""
+    """``success``: within 1 mm. ``distance``: m from the tip to the goal at the end."""
 
     success: bool
     distance: float
@@ -98,7 +98,7 @@ class Reach:
 
 
 def straight_reach(world: World, limit: float = 20.0) -> Reach:
-    """The authors' straight reach with their figures: no sensing, the least a world must bear."""
+    """The authors' straight reach with their figures, without sensing: the least for a world."""
     scene = world.scene
     for cycle in range(round(limit / 0.01)):
         finger = world.finger()

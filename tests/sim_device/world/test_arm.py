@@ -119,7 +119,7 @@ def test_arm_rests_within_100_ms_of_the_last_command(build: Any, expiry: float) 
     states = wait(arm, 0.3)
     still = next(s for s in states if math.hypot(s.twist.vx, s.twist.vy) < 1e-3)
     assert seconds_between(last, still.captured) <= 0.1
-    # It does obey until then: a command that dies at once is no command.
+    # It must obey until then: a command that expires at once does nothing.
     moving = [s for s in states if s.mode == "moving"]
     assert seconds_between(last, moving[-1].captured) >= min(expiry, MAX_EXPIRY) - 0.011
     assert states[-1].mode == "stopped"
@@ -181,7 +181,7 @@ def test_limits_are_confirmed_by_every_state(build: Any) -> None:
     assert (state.v_max, state.omega_max) == (0.5, 1.0)  # Flexiv's defaults
     asked = ArmLimits(v_max=0.04, omega_max=5.0, f_max=8.0, m_max=500.0)
     confirmed = arm.request_limits(asked)
-    # It never confirms more than it is made for.
+    # It never confirms more than its own limits.
     assert confirmed == ArmLimits(0.04, FACTORY_LIMITS.omega_max, 8.0, FACTORY_LIMITS.m_max)
     state = wait(arm, 0.01)[-1]
     assert ArmLimits(state.v_max, state.omega_max, state.f_max, state.m_max) == confirmed
@@ -236,7 +236,7 @@ def test_stale_state_has_old_stamps(arm: SimulatedArm) -> None:
 def test_wrongly_mounted_arm_deviates(
     fault: ArmFault, went: tuple[float, float, float], arm: SimulatedArm
 ) -> None:
-    """And says so: its state is true, its limits do not help."""
+    """Its state reports the true motion, and its limits do not prevent it."""
     arm.inject(fault)
     state = drive(arm, 0.3, Twist(0.01, -0.005, 0.1))[-1]
     twist = state.twist
@@ -301,7 +301,7 @@ def test_latency_delays_commands_and_states(build: Any) -> None:
     assert seconds_between(sent, moved.captured) == pytest.approx(0.04, abs=0.006)
     assert all(seconds_between(s.captured, s.received) == pytest.approx(0.02) for s in states)
     assert states[-1].captured == arm.now - 20_000_000
-    # A command on its way when its time is up is never obeyed.
+    # A command that expires on its way is never obeyed.
     slow = arm_in(build.cupboard(), ArmSettings(command_latency=0.06))
     slow.command(FORWARD, slow.now, 0.05)
     wait(slow, 0.3)

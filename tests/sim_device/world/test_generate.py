@@ -1,4 +1,4 @@
-"""Generated scenes have the figures of the simulator, and of the bench, that they stand for."""
+"""Generated scenes have the statistics of the simulator, and of the bench, that they imitate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scene as a 3D view shows it."""
+"""Scene as a 3D view shows it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cupboard against closed forms, in every engine."""
+"""Cupboard against closed forms, in every engine."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ Engine = Callable[..., World]
 
 
 def cylinder_error(engine: Engine) -> float:
-    """How far friction with the shelf may be from μ m g, as a fraction."""
-    # In Bullet a cylinder rests on a few points of its rim, which bear its weight unevenly.
+    """Allowed error of friction with the shelf relative to μ m g."""
+    # In Bullet a cylinder rests on a few points of its rim, which carry its weight unevenly.
     return 0.08 if "Pybullet" in repr(engine) else 0.04
 
 
@@ -109,7 +109,7 @@ def test_spinning_object_stops_after_w2_over_2_alpha(build: Any) -> None:
     run(world, 1.5, ZERO)
     # Torque μ m g ⅔r on an inertia of ½ m r².
     alpha = 0.20 * G * (2 / 3 * 0.04) / (0.5 * 0.04**2) / INERTIA
-    # A physics step is long beside the 0.5 s it spins: allow half of one at full speed.
+    # A physics step is long compared with the 0.5 s it spins: allow half a step at full speed.
     assert world.poses()[0, 2] == pytest.approx(spin**2 / (2 * alpha), abs=spin * 0.0025)
 
 
@@ -124,7 +124,7 @@ def test_mean_lever_is_the_mean_distance_from_the_centre(build: Any) -> None:
 
 def test_energy_is_never_created(engine: Engine) -> None:
     scene = authors_sim(3)
-    # Bullet's world leaves objects in the walls, as its users do, and they are shot out.
+    # Bullet's world leaves objects in the walls, as its users do, and it shoots them out.
     scene = replace(scene, objects=settled(scene, world_parameters("authors_sim")))
     world = engine(scene)
     rng = np.random.default_rng(5)
@@ -139,7 +139,7 @@ def test_energy_is_never_created(engine: Engine) -> None:
         # Objects are generated with overlaps of up to 0.6 mm, which let go of 0.3 mJ at first.
         assert energy <= world.motor_work + 5e-4
     assert greatest > 1e-2  # something did move
-    # With the motors braking it all comes to rest, and stays there.
+    # While the motors brake it all comes to rest, and stays at rest.
     run(world, 0.5, ZERO)
     assert world.kinetic_energy() < 1e-6
     assert world.motor_work > 0

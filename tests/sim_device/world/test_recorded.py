@@ -48,7 +48,7 @@ def test_outcomes_match_the_published_rates(authors: Path) -> None:
 def test_straight_reaches_end_as_recorded(
     authors: Path, reach_straight: Callable[..., Any]
 ) -> None:
-    """Four scenes of sixty; over all sixty 19 succeed, 20 there, and 55 end alike."""
+    """Four scenes of sixty. Over all sixty, 19 succeed here and 20 there, and 55 end alike."""
     scenes = load_recorded(authors / "scenes_1_60.json.gz")
     reference = {
         o.seed: o for o in load_outcomes(authors / "outcomes_1_60.csv") if o.strategy == "straight"
@@ -61,7 +61,7 @@ def test_straight_reaches_end_as_recorded(
 
 
 def test_recorded_scene_is_read_as_made(recorded: Path) -> None:
-    """At true scale and in our axes, to the millionth that the file keeps."""
+    """At true scale and in our axes, to the millionth that the file holds."""
     scenes = load_recorded(recorded / "scenes_5_8.json.gz")
     assert [scene.seed for scene in scenes] == [5, 6, 7, 8]
     for scene in scenes:

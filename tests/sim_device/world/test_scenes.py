@@ -1,4 +1,4 @@
-"""Scenes survive JSON to the last bit, and what cannot be is refused by name."""
+"""Scenes survive JSON bit for bit, and invalid ones are refused by name."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def test_wall_is_felt_over_the_full_height_and_a_coaster_not_at_all(build: Any) 
 
 
 def test_taxel_pressure_sums_to_the_contact_force(build: Any) -> None:
-    """The chain's first links: physics to contacts to taxels, in newtons."""
+    """First links of the chain: physics to contacts to taxels, in newtons."""
     world = MujocoWorld(build.cupboard(build.disc(0.17, 0.1), start=Pose(0.1, 0.0, 0.0)))
     for _ in range(150):
         world.step(0.01, Twist(0.0, 0.05, 0.0))

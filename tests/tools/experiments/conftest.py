@@ -35,7 +35,7 @@ def quick_options(scenes: int = 3, **changed: Any) -> Options:
 
 
 def silent(finished: int, total: int, row: Row | None) -> None:
-    """No progress."""
+    """Show no progress."""
 
 
 @pytest.fixture(scope="session")
@@ -50,7 +50,7 @@ def study() -> Study:
 
 @pytest.fixture(scope="session")
 def run_of() -> Callable[..., dict[str, Any]]:
-    """Runs a study: study, folder, workers."""
+    """Run a study, given study, folder and workers."""
 
     def run(study: Study, folder: Path, jobs: int = 1, **more: Any) -> dict[str, Any]:
         return run_study(study, folder, Processes(jobs), silent, **more)
@@ -64,7 +64,7 @@ def alone(
     run_of: Callable[..., dict[str, Any]],
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Path:
-    """A run by one worker that nobody disturbed."""
+    """A run by one worker, not interrupted."""
     folder = tmp_path_factory.mktemp("alone") / "run"
     run_of(study, folder)
     return folder
@@ -72,7 +72,7 @@ def alone(
 
 @pytest.fixture
 def command() -> Callable[..., subprocess.CompletedProcess[str]]:
-    """``tactile experiment`` in a process of its own."""
+    """Run ``tactile experiment`` as a separate process."""
 
     def call(*words: object, **more: Any) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
@@ -89,7 +89,7 @@ def command() -> Callable[..., subprocess.CompletedProcess[str]]:
 
 @pytest.fixture(scope="session")
 def made_row() -> Callable[..., Row]:
-    """A row without a trial: its outcome is given."""
+    """Make a row without a trial, from a given outcome."""
 
     def make(spec: TrialSpec, **outcome: Any) -> Row:
         row: Row = dict.fromkeys(NAMES)
@@ -133,7 +133,7 @@ def made_row() -> Callable[..., Row]:
 
 @pytest.fixture(scope="session")
 def filled(made_row: Callable[..., Row]) -> Callable[..., Path]:
-    """A run whose rows were made up: study, folder, and a function from trial to outcome."""
+    """Make a run with made-up rows, given study, folder, and a function from trial to outcome."""
 
     def fill(
         study: Study,

@@ -1,4 +1,4 @@
-"""What a user may get wrong, and what is said; and the words themselves."""
+"""Mistakes of a user and their messages; and the commands themselves."""
 
 from __future__ import annotations
 

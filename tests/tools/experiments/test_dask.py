@@ -1,4 +1,4 @@
-"""The same rows from a Dask cluster of two worker processes."""
+"""Same rows from a Dask cluster of two worker processes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ distributed = pytest.importorskip("distributed", reason="Dask is an optional ext
 
 
 def silent(finished: int, total: int, row: Row | None) -> None:
-    """No progress."""
+    """Show no progress."""
 
 
 KILLER = """
@@ -47,7 +47,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     (folder / "killer.py").write_text(KILLER)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(folder))  # which the workers' processes inherit
-        # One dead worker is enough to give a task up: each takes seconds to start again.
+        # One dead worker is enough to give up a task: each takes seconds to start again.
         with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
             yield from started()
 

@@ -83,7 +83,7 @@ def test_full_disk_keeps_finished_trials(
         if not data.startswith(b'{"source"'):
             return real(descriptor, data)
         left -= 1
-        # The last line that finds any room is written in part, as the kernel does.
+        # The last line for which there is any room is written in part, as the kernel does.
         if left < 0:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return real(descriptor, data if left else data[:100])

@@ -1,4 +1,4 @@
-"""Reports say what is in the rows: rows are made up so that the answer is known."""
+"""Reports say what is in the rows; the rows are made up, so that the answer is known."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def options(**changed: Any) -> Options:
 
 
 def like_the_paper(spec: TrialSpec, rng: Rng) -> dict[str, Any]:
-    """Success in the first so many scenes, as the paper has it; failures far from the goal."""
+    """Success in the first scenes, as many as in the paper; failures are far from the goal."""
     return ends(spec.scene_seed < round(100 * SUCCESS[spec.strategy]), spec.strategy, rng)
 
 
@@ -78,7 +78,7 @@ def ends(reached: bool, strategy: str, rng: Rng) -> dict[str, Any]:
 
 
 class Links(HTMLParser):
-    """Everything that a page would fetch."""
+    """Collects everything that a page would fetch."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -197,7 +197,7 @@ def test_sweep_is_smoothed_and_judged(filled: Filled, tmp_path: Path) -> None:
     def surface(spec: TrialSpec, rng: Rng) -> dict[str, Any]:
         if spec.strategy == "straight":
             return {"normalized_distance": 0.1, "normalized_time": 0.8, "success": False}
-        # Four times better everywhere, but for the greatest amplitude, which is half as good.
+        # Four times better everywhere, except for the greatest amplitude, which is half as good.
         high = json.loads(spec.parameters)["burrow_amplitude"] == 0.9
         return {
             "normalized_distance": 0.05 if high else 0.025,
@@ -263,7 +263,7 @@ def test_robustness_report_says_where_a_conclusion_flips(filled: Filled, tmp_pat
     claims, density = document.sections[0].tables
     assert [row[1] for row in claims.rows] == [HOLDS, HOLDS, HOLDS, FLIPS]
     assert density.head == ["strategy", "12–16", "16–20", "20–30 (own)", "30–34"]
-    # What the gate did not let begin has not reached the goal.
+    # A trial that the gate did not let begin has not reached the goal.
     assert density.rows[0][-1].startswith("92 %")
     assert "30–34 (1)" in density.note
     assert [p.name for p in document.sections[0].pictures] == ["density"]

@@ -1,4 +1,4 @@
-"""A run: the same rows whoever runs them, and after whatever befell it."""
+"""A run gives the same rows whoever runs it, and whatever interrupts it."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_run_killed_at_random_and_resumed_gives_the_same_table(
         children = psutil.Process(process.pid).children(recursive=True) if alive(process) else []
         process.kill()
         kills += process.wait() == -signal.SIGKILL
-        # Workers end by themselves once they see that nobody listens.
+        # Workers end by themselves once the parent has gone.
         _, left = psutil.wait_procs(children, timeout=60)
         assert not left
     assert kills
@@ -135,7 +135,7 @@ def test_scene_that_cannot_be_made_is_a_failed_row(
     assert rows[too_many.conditions]["success"] is None
     assert rows["{}"]["error"] is None
     assert summary["errors"] >= 1
-    # A failure stays when a run is resumed, and is tried again when that is asked for.
+    # A failure stays when a run is resumed, and is tried again only when asked for.
     assert run_of(mixed, tmp_path / "run")["this_session"]["trials"] == 0
     again = run_of(mixed, tmp_path / "run", retry=True)
     assert again["this_session"]["trials"] == again["errors"] == summary["errors"]

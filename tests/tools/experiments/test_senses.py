@@ -1,4 +1,4 @@
-"""Touch made worse in one way at a time, and what of it reaches a strategy."""
+"""Touch degraded in one way at a time, and what of it reaches a strategy."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ START = Instant(1_000_000_000)
 
 
 class Pressed:
-    """A world in which somebody presses on the finger."""
+    """A world in which something presses on the finger."""
 
     def __init__(self, *contacts: FingerContact) -> None:
         self._contacts = contacts
@@ -37,7 +37,7 @@ class Pressed:
 
 
 def press(x: float, y: float, force: float, *, side: float = 1.0) -> FingerContact:
-    """A force on the left side of the finger (on the right for −1), straight in."""
+    """A force straight into the left side of the finger (for −1: the right side)."""
     return FingerContact(x, y, 0.0, side, 0.0, -side * force, 0)
 
 

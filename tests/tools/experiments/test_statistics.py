@@ -1,4 +1,4 @@
-"""Against values computed by hand, and published examples."""
+"""Statistics against values computed by hand, and published examples."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_wilson_interval_of_15_in_148_matches_newcombe() -> None:
 
 
 def test_wilson_interval_matches_hand_calculation() -> None:
-    # 0 of 10: centre z²/(2(n + z²)), half as much again on either side.
+    # 0 of 10: centre z²/(2(n + z²)), and as much on either side.
     z2 = 1.959964**2
     assert Rate(0, 10).interval == pytest.approx((0.0, z2 / (10 + z2)), abs=1e-6)
     assert math.isnan(Rate(0, 0).value)
@@ -48,7 +48,7 @@ def test_mcnemar_matches_hand_calculation() -> None:
     a = [True] * 8 + [False] * 2 + [True] * 5
     b = [False] * 8 + [True] * 2 + [True] * 5
     found = paired_rates(a, b)
-    # 8 to 2 of a fair coin: 2 × (1 + 10 + 45) / 1024.
+    # 8 to 2 with a fair coin: 2 × (1 + 10 + 45) / 1024.
     assert found.p == pytest.approx(112 / 1024)
     assert (found.only_a, found.only_b, found.scenes) == (8, 2, 15)
     assert found.difference == pytest.approx(6 / 15)
@@ -71,7 +71,7 @@ def test_signed_ranks_match_hand_calculation() -> None:
 
 
 def test_signed_ranks_with_ties_match_hand_calculation() -> None:
-    # All of one sign and six pairs: 2 of 64 orders are as extreme; one tied pair is dropped.
+    # Six pairs of one sign: 2 of 64 orders are as extreme; one tied pair is dropped.
     p, effect = signed_rank([1, 2, 3, 4, 5, 6, 7], [0, 0, 0, 0, 0, 0, 7])
     assert p == pytest.approx(2 / 64)
     assert effect == 1.0

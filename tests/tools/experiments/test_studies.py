@@ -1,4 +1,4 @@
-"""What the studies are of: the paper's grids, and every level of every axis."""
+"""Trials of the studies: the paper's grids, and every level of every axis."""
 
 from __future__ import annotations
 

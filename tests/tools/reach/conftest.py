@@ -1,4 +1,4 @@
-"""Short trials in a crowded scene, and logs of them."""
+"""Short trials in a crowded scene, and their logs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.support import trial_trace
 
 @pytest.fixture(scope="session")
 def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The crowded scene as a user would give it."""
+    """Crowded scene in a file, as a user would give it."""
     path = tmp_path_factory.mktemp("scene") / "crowded.json"
     path.write_text(trial_trace.crowded().to_json(), encoding="utf-8")
     return path
@@ -23,7 +23,7 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def recorded(
     scene_file: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Callable[[str], tuple[int, Path]]:
-    """Exit code and log of a whole trial with a strategy felt through taxels; each run once."""
+    """Exit code and log of a whole trial at a depth; each is run once."""
     folder = tmp_path_factory.mktemp("logs")
     done: dict[str, tuple[int, Path]] = {}
 

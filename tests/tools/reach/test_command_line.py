@@ -1,4 +1,4 @@
-"""``tactile reach``, ``demo`` and ``bench`` as a user meets them."""
+"""Command lines of ``tactile reach``, ``demo`` and ``bench``."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_exit_code_says_whether_the_target_was_reached(
 def test_own_strategy_in_the_working_folder_may_fail(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Row 18: what it raises ends the reach with the zero twist, and is told."""
+    """Row 18: an exception ends the reach with the zero twist, and is reported."""
     Path("own_strategy.py").write_text(
         "from reachd.interfaces import Twist\n"
         "class Own:\n"

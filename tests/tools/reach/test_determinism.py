@@ -1,4 +1,4 @@
-"""A trial is a function of scene, strategy, parameters, seed and depth, to the bit."""
+"""A trial depends only on scene, strategy, parameters, seed and depth, bit for bit."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_same_seed_gives_the_same_trial_bit_for_bit(depth: str) -> None:
 
 @pytest.mark.parametrize("depth", DEPTHS)
 def test_separate_process_runs_the_same_trial(depth: str) -> None:
-    """In another process, with another hash seed; in this one another kind of trial came before."""
+    """In another process with another hash seed; this process ran another kind of trial before."""
     here = trial_trace.traced(trial_trace.crowded(), "hybrid_event", 3, depth)[1]
     said = subprocess.run(
         [sys.executable, trial_trace.__file__, "hybrid_event", "3", depth],

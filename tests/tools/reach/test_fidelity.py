@@ -23,7 +23,7 @@ def test_missing_recordings_are_reported(
 def test_scenes_are_compared_outcome_by_outcome(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Our own outcomes, so that they agree but where a machine calculates otherwise."""
+    """The outcomes are our own, so they agree unless another machine calculates differently."""
     report = tmp_path / "fidelity.json"
     words = ["fidelity", "--recorded", str(RECORDED / "scenes_5_8.json.gz"), "--limit", "1"]
     assert main([*words, "--repeats", "1", "--jobs", "2", "--json", str(report)]) == 0

@@ -1,4 +1,4 @@
-"""Three processes in real time: the demo, and what is measured of them."""
+"""Three processes in real time: the demo, and measurements on them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MS = 1_000_000
 def test_demo_reaches_and_leaves_log_and_picture(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """The first command that a newcomer runs; on a busy machine it may not reach."""
+    """First command that a newcomer runs; on a busy machine it may not reach."""
     log, picture = tmp_path / "demo.mcap", tmp_path / "demo.png"
     for _ in range(3):
         code = main(["demo", "--seed", "13", "--out", str(log), "--png", str(picture)])
@@ -45,7 +45,7 @@ def test_demo_reaches_and_leaves_log_and_picture(
 
 @pytest.mark.timeout(400)
 def test_stopping_any_of_the_three_processes_stops_the_arm(tmp_path: Path) -> None:
-    """Rows 13 to 15 and 24 with the whole chain; how soon is measured by `tactile bench`."""
+    """Rows 13 to 15 and 24 with the whole chain; `tactile bench` measures how soon."""
     shelf = dataclasses.replace(trial_trace.crowded(0), goal=(0.3, 0.0))
     (tmp_path / "shelf.json").write_text(shelf.to_json())
     with LiveReach(tmp_path, ("--scene", "shelf.json"), strategy="straight") as live:
@@ -76,7 +76,7 @@ def _still(live: LiveReach) -> bool:
 
 
 class Heard:
-    """What a `LiveReach` heard, made up."""
+    """Stands in for what a `LiveReach` heard."""
 
     def __init__(self, **heard: list[tuple[int, Any]]) -> None:
         self._heard = heard
@@ -86,7 +86,7 @@ class Heard:
 
 
 def sample(ms: float, vx: float = 0.0) -> tuple[int, Any]:
-    """Captured at ``ms``, arrived 3 ms later."""
+    """Message captured at ``ms``, arrived 3 ms later."""
     linear, angular = SimpleNamespace(x=vx, y=0.0), SimpleNamespace(z=0.0)
     message = SimpleNamespace(
         captured_ns=int(ms * MS), twist=SimpleNamespace(linear=linear, angular=angular)

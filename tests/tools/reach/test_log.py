@@ -1,4 +1,4 @@
-"""A log of a trial: what strangers read in it, and that it is the trial's alone."""
+"""Log of a trial: other readers can read it, and it depends on the trial alone."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_mcap_reader_reads_every_message(recorded: Recorded, depth: str) -> None
 
 
 def test_same_trial_gives_the_same_log(recorded: Recorded) -> None:
-    """Message by message, times included: nothing in it comes from a clock of ours."""
+    """Message by message, times included: nothing in it comes from a real clock."""
     logs = []
     for again in ("", " again"):
         _, path = recorded("taxels", again)

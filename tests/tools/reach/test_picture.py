@@ -1,4 +1,4 @@
-"""The picture of a reach shows something, and what it cannot show it says."""
+"""A picture of a reach shows the data, and says what it cannot show."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Recorded = Callable[..., tuple[int, Path]]
 
 
 def share(picture: np.ndarray, colour: str) -> float:
-    """Part of the pixels that have just this colour."""
+    """Share of the pixels that have exactly this colour."""
     wanted = np.array(colors.to_rgb(colour))
     return float(np.mean(np.abs(picture[..., :3] - wanted).max(axis=-1) < 0.02))
 
@@ -49,7 +49,8 @@ def test_picture_shows_path_contacts_target_and_curves(recorded: Recorded, depth
 
 @pytest.fixture(scope="module")
 def several(recorded: Recorded, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """As of ``reachd --serve``: two reaches 60 s apart; a second board, and arm, in the first."""
+    """Log as of ``reachd --serve``: two reaches 60 s apart; the first has a second board and
+    arm."""
     _, log = recorded("contacts")
 
     def edit(topic: str, at: int, message: Any) -> list[tuple[str, int, Any]]:
@@ -137,7 +138,7 @@ def test_labels_of_a_reach_stay_inside_the_picture_and_off_the_data(
 
 
 def test_missing_data_is_not_drawn(recorded: Recorded, tmp_path: Path) -> None:
-    """Neither a path nor bars through it, nor contacts of which the place is not known."""
+    """Neither a path nor bars through it, nor contacts whose place is unknown."""
     _, log = recorded("contacts")
     start = read_reach(log)
     begin, end = 0.4 * start.time[-1], 0.6 * start.time[-1]

@@ -1,4 +1,4 @@
-"""A stranger beside a whole rig of real processes: over TLS, over loopback TCP, at its sockets."""
+"""Stranger beside a whole rig of real processes: over TLS, over loopback TCP, at its sockets."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def reaches(rig: Rig) -> None:
-    """The operator arms, gives a goal, and the arm moves; then it is told to stop."""
+    """The operator arms, gives a goal, and the arm moves; then it is stopped."""
     goal = rig.ask("reset", {}, "world")["goal"]
     deadline = time.monotonic() + PATIENCE_S
     while True:
@@ -142,9 +142,9 @@ def reaches(rig: Rig) -> None:
 
 
 def attack(rig: Rig, stranger: zenoh.Session) -> list[Any]:
-    """Commands, limits, clear, arm, goal and tare from somebody without rights; what was answered.
+    """Send commands, limits, clear, arm, goal and tare without rights. Returns the answers.
 
-    The arm must not move a bit meanwhile, nor its limits change.
+    Meanwhile the arm must not move at all, nor its limits change.
     """
     before = rig.states[-1]
     rig.states.clear()
@@ -238,7 +238,7 @@ def test_tls_roles_have_only_their_rights_and_viewer_only_reads(
 def test_default_rigs_meet_in_separate_folders(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No flag at all; a socket's path is short, so that the folder is one of the system's."""
+    """Without any option; a socket's path is short, so the folder is one of the system's."""
     with contextlib.ExitStack() as stack:
         rigs = []
         for name in ("one", "two"):
