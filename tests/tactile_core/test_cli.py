@@ -302,3 +302,31 @@ try tactile lo; try tactile log cat --un; try tactiled --compensation r; try sim
 """
     done = subprocess.run(["bash", "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["log", "--until", "ransac", "boards"]
+
+
+@pytest.mark.skipif(shutil.which("fish") is None, reason="fish is not installed")
+def test_fish_completes_commands_options_choices_and_files(tmp_path: Path) -> None:
+    pytest.importorskip("shtab", reason="the extra `completion` is not installed")
+    (tmp_path / "completion.fish").write_text(script("fish"))
+    (tmp_path / "reach.mcap").touch()
+    lines = ("tactile lo", "tactile log cat --un", "tactiled --compensation r", "simdevice boa",
+             "armd --driver fl", "tactile plot rea")  # fmt: skip
+    program = "source completion.fish\n" + "\n".join(f"complete -C '{line}'" for line in lines)
+    done = subprocess.run(
+        ["fish", "--no-config", "-c", program],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=tmp_path,
+        env=os.environ | {"HOME": str(tmp_path)},
+    )
+    rows = [row.split("\t") for row in done.stdout.splitlines()]
+    assert [row[0] for row in rows] == [
+        "log",
+        "--until",
+        "ransac",
+        "boards",
+        "flexiv",
+        "reach.mcap",
+    ]
+    assert rows[0][1] == "inspect, repair, convert, replay and reprocess MCAP logs"

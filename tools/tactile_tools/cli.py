@@ -505,11 +505,12 @@ def _fill_foxglove(parser: Parser) -> None:
 
 def _fill_completion(parser: Parser) -> None:
     parser.description = (
-        "Prints a script for your shell that completes tactile, tactiled, reachd and simdevice. "
-        "bash: tactile completion bash >> ~/.bash_completion; zsh: put the output into a file "
-        "that ~/.zshrc sources after compinit."
+        "Prints a script for your shell that completes tactile, tactiled, reachd, armd and "
+        "simdevice. bash: tactile completion bash >> ~/.bash_completion; zsh: put the output into "
+        "a file that ~/.zshrc sources after compinit; fish: tactile completion fish > "
+        "~/.config/fish/conf.d/tactile.fish."
     )
-    parser.add_argument("shell", choices=("bash", "zsh"), help="which shell")
+    parser.add_argument("shell", choices=("bash", "zsh", "fish"), help="which shell")
     parser.set_defaults(func=later("tactile_tools.completion:run"))
 
 

@@ -24,7 +24,7 @@ def parsers() -> list[argparse.ArgumentParser]:
 
 
 def script(shell: str) -> str:
-    """The script for ``shell``, bash or zsh; `MissingExtraError` without the extra."""
+    """The script for ``shell``: bash, zsh or fish; `MissingExtraError` without the extra."""
     require("shtab", extra="completion")
     import shtab
 
@@ -33,7 +33,11 @@ def script(shell: str) -> str:
         for parser in load_all(root):
             for action in parser._actions:
                 if action.type is Path:
-                    action.complete = shtab.FILE  # type: ignore[attr-defined]
+                    action.complete = shtab.FILE  # type: ignore[attr-defined]  # shtab reads it
+                if isinstance(action, argparse._SubParsersAction):
+                    # A shell shows a line beside each command; descriptions are paragraphs.
+                    for choice in action._choices_actions:
+                        action.choices[choice.dest].description = choice.help
         texts.append(shtab.complete(root, shell=shell))
     return "\n".join(texts)
 
