@@ -1,4 +1,4 @@
-"""``tactile board-check``: does a board speak PROTOCOL.md? Pass or fail, a line for each demand."""
+"""``tactile board-check``: does a board keep to PROTOCOL.md? One line per check: pass or fail."""
 
 from __future__ import annotations
 
@@ -51,54 +51,55 @@ from tactiled.transports.serial_port import SerialTransport
 DONE, FAILED, USAGE, ENVIRONMENT = range(4)
 
 ANSWER_S = 3.0
-"""s for an answer; PROTOCOL.md asks for none by a time, and machines may be busy."""
+"""Patience for an answer, s. PROTOCOL.md sets no limit, and the machine may be busy."""
 
 REPEAT_S = 0.25
-"""s after which a command without an answer is sent again, as a host does."""
+"""A command without an answer is sent again after this time, s, as a host does."""
 
 RETURN_S = 15.0
-"""s from Reboot until a board must be there again, its USB port included."""
+"""Time from Reboot until the board must be back, its USB port included, s."""
 
 FIRST_STATUS_S = 1.5
 FLOOD = 100
 CLOCK_ERROR = 0.11
-"""Largest relative error of a usable clock."""
+"""Largest relative error of a clock that is still usable."""
 
 RATE_ERROR = 0.005
-"""Relative: how far the mean period may be off, in ticks of the board itself."""
+"""Largest relative error of the mean period, in ticks of the board itself."""
 
 LSB_NT = {7: (150, 242), 5: (250, 403)}
-"""nT a count of x and y, and of z, of an MLX90393 at resolution 0, by gain."""
+"""Nanotesla per count of an MLX90393 at resolution 0, by gain: (x and y, z). Source: its
+datasheet."""
 
 UNKNOWN_COMMAND = 0xF0
 OTHER_BOARDS_TYPE = 0x7E
 
 
 class Failed(Exception):  # noqa: N818 - names an outcome
-    """What the board did instead; the text says what was expected."""
+    """The board failed a check; the text says what it did and what was expected."""
 
 
 class Skipped(Exception):  # noqa: N818 - names an outcome
-    """Why a demand does not concern this board."""
+    """A check does not apply to this board; the text says why."""
 
 
 class Unreachable(Exception):  # noqa: N818 - names an outcome
-    """No board, or none any more; the text names the remedy."""
+    """No board answers, or it does not any more; the text names the remedy."""
 
 
 @dataclass(slots=True)
 class Heard:
-    """A message of the board, and when it came."""
+    """A message of the board and the instant of its arrival."""
 
     message: Message
     when: Instant
 
 
 class Host:
-    """One board on an open port.
+    """The host's side of one board on an open port.
 
-    ``node``: its number on a CAN bus, None on a serial line. ``fd``: CAN FD. ``bitrate``: of the
-    bus, bit/s. ``now``: the clock that ``transport`` stamps with.
+    ``node``: the board's number on a CAN bus, None on a serial line. ``fd``: CAN FD. ``bitrate``:
+    of the bus, bit/s. ``now``: the clock that ``transport`` stamps with.
     """
 
     def __init__(
@@ -124,7 +125,7 @@ class Host:
         self._transfer: dict[int, int] = {}
 
     def take_node(self, node: int) -> None:
-        """Speak to that board alone from now on."""
+        """Talk to board ``node`` alone from now on."""
         self.node = node
         self._encoder = CanEncoder(node, self.fd)
 
@@ -134,7 +135,7 @@ class Host:
         return self.transport.medium is Medium.CAN
 
     def next_request(self) -> int:
-        """A request number that no earlier command had."""
+        """Return a request number that no recent command had."""
         self._request = (self._request + 1) % 0x10000
         return self._request
 
@@ -146,7 +147,7 @@ class Host:
             self.transport.write(encode_serial(message))
 
     def send_raw(self, kind: int, payload: bytes) -> None:
-        """Send a message of type ``kind``, whatever that is, with ``payload``."""
+        """Send ``payload`` as a message of any type ``kind``, known or not."""
         board = (self.node or 0) if self.on_can else 0
         body = bytes([kind, board]) + len(payload).to_bytes(2, "little") + payload
         packet = body + crc32c(body).to_bytes(4, "little")
@@ -157,13 +158,13 @@ class Host:
             self.transport.write(cobs.encode(packet) + b"\0")
 
     def send_bytes(self, data: bytes) -> None:
-        """Put bytes on a serial line, in pieces that a port takes at once."""
+        """Write bytes to a serial line, in pieces that a port accepts at once."""
         for at in range(0, len(data), 256):
             self.transport.write(data[at : at + 256])
             self.listen(0.002)
 
     def listen(self, seconds: float, enough: Callable[[], bool] = lambda: False) -> bool:
-        """Take what comes until it is ``enough`` (true) or the time is over (false)."""
+        """Take messages until ``enough()`` (True) or until ``seconds`` are over (False)."""
         end = after(self.now(), seconds)
         while not enough():
             left = seconds_between(self.now(), end)
@@ -183,7 +184,7 @@ class Host:
         return True
 
     def _mine(self, frames: tuple[CanFrame, ...]) -> list[CanFrame]:
-        """Frames of our board: those of others on the bus are not judged."""
+        """Frames of our board; those of other boards on the bus are not judged."""
         return [
             f
             for f in frames
@@ -191,7 +192,7 @@ class Host:
         ]
 
     def nodes(self) -> dict[int, Descriptor]:
-        """Boards of a CAN bus that answer a question to all, by number."""
+        """Find the boards of a CAN bus: those that answer an Identify to all, by number."""
         found: dict[int, Descriptor] = {}
         decoder = CanDecoder()
         self.send(Identify(self.next_request()))
@@ -205,26 +206,26 @@ class Host:
         return found
 
     def of(self, kind: type[Message], first: int = 0) -> list[Heard]:
-        """Messages of type ``kind`` from number ``first`` of all that was heard."""
+        """Messages of type ``kind``, from index ``first`` of all messages on."""
         return [h for h in self.heard[first:] if isinstance(h.message, kind)]
 
     def hears(self, kind: type[Message], first: int, seconds: float) -> bool:
-        """Whether a message of type ``kind`` comes, from number ``first`` on, in ``seconds``."""
+        """Wait up to ``seconds`` for a message of type ``kind``, from index ``first`` on."""
         return self.listen(seconds, lambda: bool(self.of(kind, first)))
 
     def refusals(self) -> dict[str, int]:
-        """What the board sent that its decoder refused, by reason."""
+        """Count what the board sent and our decoder refused, by reason."""
         counts = (self._can if self.on_can else self._serial).counters
         quiet = {ACCEPTED, "empty", "foreign"}
         return {k: n for k, n in counts.items() if n and k not in quiet}
 
     def forget_refusals(self) -> None:
-        """Begin to judge what the board sends: what came before belongs to an earlier host."""
+        """Start judging what the board sends: earlier bytes were meant for an earlier host."""
         self._serial = SerialDecoder()
         self._can = CanDecoder()
 
     def reopen(self) -> None:
-        """Wait for the port that went with the reset; `Unreachable` when it stays away."""
+        """Reopen a port that vanished with the reset; `Unreachable` when it does not come back."""
         self.transport.close()
         end = after(self.now(), RETURN_S)
         while True:
@@ -241,7 +242,7 @@ class Host:
     # Questions and answers
 
     def identify(self, major: int = PROTOCOL_MAJOR) -> Descriptor:
-        """The descriptor; `Failed` when Identify is not answered."""
+        """Ask for the descriptor; `Failed` when Identify is not answered."""
         for _ in range(round(ANSWER_S / REPEAT_S)):
             mark = len(self.heard)
             self.send(Identify(self.next_request(), major))
@@ -252,7 +253,7 @@ class Host:
         raise Failed("Identify was not answered")
 
     def command(self, make: Callable[[int], HostMessage]) -> AckResult:
-        """Result of a command; `Failed` when it is not acknowledged with its request."""
+        """Send a command and return its result; `Failed` when no ack carries its request number."""
         request = self.next_request()
         message = make(request)
         mark = len(self.heard)
@@ -267,14 +268,14 @@ class Host:
         raise Failed(f"{type(message).__name__} was not acknowledged")
 
     def ack(self, request: int, first: int) -> Ack | None:
-        """The ack of ``request``, if it has come."""
+        """The ack of ``request`` from index ``first`` on, if it has come."""
         for h in self.of(Ack, first):
             if isinstance(h.message, Ack) and h.message.request == request:
                 return h.message
         return None
 
     def status(self) -> Status:
-        """The next status; `Failed` when none comes in time."""
+        """Wait for the next status; `Failed` when none comes in time."""
         mark = len(self.heard)
         if not self.listen(ANSWER_S, lambda: bool(self.of(Status, mark))):
             raise Failed(f"no status in {ANSWER_S:g} s")
@@ -283,7 +284,7 @@ class Host:
         return message
 
     def samples(self, cycles: int, patience: float) -> list[Samples]:
-        """Samples of that many further cycles; `Failed` when they do not come."""
+        """Wait for the samples of ``cycles`` further cycles; `Failed` when they do not come."""
         mark = len(self.heard)
 
         def count() -> bool:
@@ -295,7 +296,7 @@ class Host:
         return self.all_samples(mark)
 
     def all_samples(self, first: int = 0) -> list[Samples]:
-        """Samples heard from number ``first`` on."""
+        """Samples received from index ``first`` on."""
         return [h.message for h in self.heard[first:] if isinstance(h.message, Samples)]
 
 
@@ -305,16 +306,16 @@ def _identifier(kind: int, board: int) -> int:
 
 @dataclass(slots=True)
 class Board:
-    """What is known of the board under test."""
+    """What the checks know of the board under test."""
 
     host: Host
     descriptor: Descriptor
     default_mhz: int = 0
-    starts: list[int] = field(default_factory=list)  # sequences that follow no gap of the board's
+    starts: list[int] = field(default_factory=list)  # where in `Host.heard` sequences begin
 
     @property
     def patience(self) -> float:
-        """s for a dozen cycles of the slowest rate in question, and more on a busy machine."""
+        """Time for a dozen cycles of the slowest rate, and more for a busy machine, s."""
         return ANSWER_S + 12 * 1000 / max(self.default_mhz, 1000)
 
 
@@ -339,19 +340,19 @@ def _gain(
 
 
 def ok(said: AckResult, of: str) -> None:
-    """`Failed` unless a command was obeyed."""
+    """`Failed` unless the command was obeyed."""
     if said is not AckResult.OK:
         raise Failed(f"{of} was answered with {said.name}")
 
 
 def refused(said: AckResult, of: str, wanted: AckResult = AckResult.BAD_ARGUMENT) -> None:
-    """`Failed` unless a command was refused as it must be."""
+    """`Failed` unless the command was refused with ``wanted``."""
     if said is not wanted:
         raise Failed(f"{of} was answered with {said.name} instead of {wanted.name}")
 
 
-# Demands, in the order in which they are judged. Each leaves the board streaming unless it says
-# otherwise, and returns what was found.
+# The checks, in order. Each leaves the board streaming unless it says otherwise, and returns what
+# it found.
 
 
 def _describes_itself(board: Board) -> str:
@@ -391,7 +392,8 @@ def _comes_back_after_reboot(board: Board) -> str:
             raise Failed("no status tells of a reset")
     first = told()[0].message
     assert isinstance(first, Status)
-    # Between ack and reset a board may stream on; half a second before this status it was reset.
+    # Between ack and reset a board may go on streaming; half a second before this status it was
+    # surely reset.
     if any(seconds_between(h.when, told()[0].when) < 0.5 for h in host.of(Samples, mark)):
         raise Failed("it streams before Start")
     if first.reset_cause != 1:
@@ -412,7 +414,7 @@ def _uptime(heard: Heard) -> int:
 def _says_status_unasked(board: Board) -> str:
     first, _, third = (board.host.status() for _ in range(3))
     step = (third.uptime_ms - first.uptime_ms) / 2
-    if not 800 <= step <= 1200:  # a busy board may be late with one of them
+    if not 800 <= step <= 1200:  # a busy board may send one of them late
         raise Failed(f"{step:g} ms of uptime from one status to the next instead of 1000")
     return ""
 
@@ -524,7 +526,7 @@ def _answers_clock_polls(board: Board) -> str:
         held = (reply.ticks_sent - reply.ticks_received) % (1 << 32) / hz
         trip = seconds_between(asked, heard.when)
         too_long += held > trip * (1 + CLOCK_ERROR) + 2 / hz
-        if too_long > 3:  # one or two: the clock of an emulator, which makes up for lost time
+        if too_long > 3:  # one or two may be an emulator's clock catching up
             raise Failed(f"it says it held the poll for {held:.4f} s, of {trip:.4f} s in all")
         sent.append((asked, heard.when, reply))
         host.listen(0.15)
@@ -570,7 +572,7 @@ def _keeps_rates(board: Board) -> str:
 
 
 def _bus_rate_mhz(board: Board) -> int:
-    """The rate that half of a CAN bus carries: a bus that is full loses frames by itself."""
+    """Rate, mHz, that fills half of a CAN bus; a full bus loses frames of any board."""
     if not board.host.on_can:
         return 0xFFFF_FFFF
     encoder = CanEncoder(0, board.host.fd)
@@ -589,7 +591,8 @@ def _bus_rate_mhz(board: Board) -> int:
 def _judge_pace(samples: list[Samples], wanted: float, rate_mhz: int) -> None:
     """`Failed` unless a cycle takes ``wanted`` ticks on average.
 
-    A busy board may begin a cycle late, never early: the least late of either half are compared.
+    A busy board may begin a cycle late, never early, so the least late cycles of both halves are
+    compared.
     """
     first = samples[0]
     late = [
@@ -663,7 +666,7 @@ def _stops_and_goes_on(board: Board) -> str:
     before = host.samples(2, board.patience)[-1].sequence
     ok(host.command(Stop), "Stop")
     ok(host.command(Stop), "a second Stop")
-    host.listen(0.2)  # what was under way
+    host.listen(0.2)  # what was still on its way
     mark = len(host.heard)
     host.listen(max(0.3, min(3.0, 3000 / board.default_mhz)))
     if host.all_samples(mark):
@@ -747,7 +750,7 @@ def _send_rubbish(host: Host) -> int:
     for frame in frames:
         host.send_bytes(frame)
         host.listen(0.02)
-    host.send_bytes(b"\0" * 10)  # an idle line, and no error
+    host.send_bytes(b"\0" * 10)  # an idle line is not an error
     return len(frames)
 
 
@@ -874,9 +877,9 @@ CHECKS: tuple[tuple[str, Check], ...] = (
 
 
 def check(host: Host) -> Iterator[tuple[str, str, str]]:
-    """Title, verdict (``pass``, ``skip`` or ``FAIL``) and what was found, of each demand.
+    """Run all checks; yield title, verdict (``pass``, ``skip`` or ``FAIL``) and finding of each.
 
-    `Unreachable` when there is no board to judge, or none any more.
+    `Unreachable` when no board answers, or when it stops answering.
     """
     host.send(Stop(host.next_request()))
     try:
@@ -903,7 +906,7 @@ def check(host: Host) -> Iterator[tuple[str, str, str]]:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Judge one board; print a line for each demand."""
+    """Judge one board and print a line per check."""
     try:
         host = connect(options)
     except ValueError as error:

@@ -26,7 +26,7 @@ KEYS = "as in tactile/left/features, or with wildcards: tactile/*/features"
 
 
 def _watching(name: str, place: str) -> Callable[[argparse.Namespace], int]:
-    """The function "module:function" as a command: errors become one sentence and a status."""
+    """Make a command of ``place`` ("module:function"); errors become a sentence and a status."""
 
     def call(options: argparse.Namespace) -> int:
         from tactile_tools import watching

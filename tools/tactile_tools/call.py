@@ -1,4 +1,4 @@
-"""``tactile call``: ask any service of a daemon and print its reply."""
+"""``tactile call``: call any service of a daemon and print its reply."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TIMEOUT_S = 5.0
 
 
 def call(options: argparse.Namespace) -> None:
-    """Ask, and print what comes back."""
+    """Call the service and print the reply."""
     with watching.open_bus(options) as bus:
         reply = bus.call(options.key, options.request, timeout_s=options.timeout)
     print(json.dumps(reply, indent=2, ensure_ascii=False))

@@ -1,4 +1,4 @@
-"""The command line of ``tactile``: one subcommand a tool, loaded when it is used."""
+"""Command line of ``tactile``: one subcommand per tool, loaded when it is used."""
 
 from __future__ import annotations
 
@@ -109,23 +109,23 @@ COMMANDS: Final = {
 }
 
 WHATS = ("reach", "taxels", "forces", "field", "timing")
-"""What `plot` draws."""
+"""What `plot` can draw."""
 
 ROLES = ("tactiled", "reachd", "arm", "operator", "viewer")
-"""Roles of a certificate, as `tactile_core.bus.rights.CERTIFICATE_ROLES`."""
+"""Roles of a certificate, the same as `tactile_core.bus.rights.CERTIFICATE_ROLES`."""
 
 GATE_FILES = ("gate/gate.py", "gate/limits.py", "gate/motion.py")
-"""What `mutation` changes."""
+"""Files of ``reachd`` that `mutation` changes."""
 
 MAX_DAYS = 3650.0
-"""Most that a certificate may hold."""
+"""Longest validity of a certificate, days."""
 
 SOAKED = 16
-"""Most boards of `soak`."""
+"""Greatest number of boards in a `soak`."""
 
 
 def make_parser() -> Parser:
-    """Parser of the command line."""
+    """Parser of ``tactile``; the parsers of its subcommands are filled when they are used."""
     parser = Parser(
         prog="tactile",
         description="Ask and tare boards, inspect, recover and plot logs, run reaches, demos, "
@@ -137,9 +137,10 @@ def make_parser() -> Parser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one tool; its exit code is 0 only when the job was done, 2 for a bad argument."""
-    # Our matrices are small: threads of the linear algebra gain nothing on them, and on a machine
-    # busy with trials they wait for one another far longer than they work. Read at numpy's import.
+    """Run one tool. Returns its exit status: 0 only when the job was done, 2 for a bad argument."""
+    # Our matrices are small: threads of the linear algebra library gain nothing on them, and on a
+    # machine busy with trials they wait for one another far longer than they work. numpy reads this
+    # variable when it is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     return run_command(make_parser(), argv)
 
@@ -262,7 +263,7 @@ def _fill_reach(parser: Parser) -> None:
     )
     add_strategy(parser)
     add_seeds(parser)
-    # Until --seed became the trial's alone.
+    # Former option: --seed used to choose the scene, too.
     parser.add_argument("--trial-seed", type=seed, help=argparse.SUPPRESS)
     add_scene(parser)
     parser.add_argument("--set", metavar="SET", help="parameter set (default: that of the scene)")

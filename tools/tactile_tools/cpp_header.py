@@ -1,4 +1,4 @@
-"""``tactile cpp-header``: C++ structs and CDR decoder, made from the message definitions."""
+"""``tactile cpp-header``: C++ structs and a CDR decoder, made from the message definitions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from tactile_core.bus.messages import OWN_PACKAGE, SHORT_NAMES, codec
 
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
-"""Kinds of a field, as rosbags numbers them."""
+"""Kinds of a field, in the numbering of rosbags."""
 
 TYPES = {
     "bool": "bool", "byte": "std::uint8_t", "char": "std::uint8_t", "int8": "std::int8_t",
@@ -131,7 +131,7 @@ T decode(const std::uint8_t* data, std::size_t size) {
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the header."""
+    """Write the header to --out, or print it."""
     text = header()
     if options.out is None:
         print(text, end="")
@@ -148,7 +148,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def header() -> str:
-    """The whole header."""
+    """Return the text of the header."""
     done: list[str] = []
     own = [name for name in SHORT_NAMES.values() if name.startswith(OWN_PACKAGE)]
     for name in own:
@@ -157,7 +157,7 @@ def header() -> str:
 
 
 def _visit(msgtype: str, done: list[str]) -> None:
-    """Append a type after all that it is made of."""
+    """Append ``msgtype`` to ``done``, after all types that it contains."""
     if msgtype in done:
         return
     for _, (kind, arguments) in codec().fields(msgtype):
@@ -186,7 +186,7 @@ def _type(kind: int, arguments: Any) -> str:
     inner = _type(*arguments[0])
     if kind == ARRAY:
         return f"std::array<{inner}, {arguments[1]}>"
-    # A vector of bool has no bools in it.
+    # std::vector<bool> packs bits and cannot hand out references to its elements.
     return f"std::vector<{'std::uint8_t' if inner == 'bool' else inner}>"
 
 

@@ -1,4 +1,4 @@
-"""``tactile demo``: cupboard, tactiled and reachd as three processes, in real time."""
+"""``tactile demo``: a reach in real time with simulator, tactiled and reachd as three processes."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from tactile_tools.processes import busy_text, command, free_port, running, sock
 BOARD = "finger"
 
 MAGIC = b"\x89MCAP"
-ORDERLY_S = 5.0  # for zero twist and the end of a log; both take a second at most
+ORDERLY_S = 5.0  # s, for the zero twist and the end of the log; both take a second at most
 
 SEED = 35
-"""A scene in which hybrid_event needs all it has: it goes straight, burrows past objects at the
-front, stalls at a heavy disc before the target and excavates. It gets there in every run so far,
+"""A scene that shows everything hybrid_event can do: it goes straight, burrows past objects at the
+front, stalls at a heavy disc before the target and excavates. It has arrived in every run so far,
 in lockstep and in real time, also on a machine with four times the work it can do."""
 
 VIEW_PORT = 8420
 
 PAGE_S = 20.0
-"""For the live page to answer, on a busy machine."""
+"""Time for the live page to answer on a busy machine, s."""
 
 PROCESSES = {"simulated": "three processes", "ur": "four processes and a robot's own client"}
 
 UR_ADDRESS = "127.0.0.23"
-"""Ports of these robots are fixed; this loopback address is hardly ever somebody else's."""
+"""The ports of these robots are fixed; hardly anything else uses this loopback address."""
 
 UR_CONFIG = f"""\
 [robot]
@@ -54,14 +54,14 @@ origin = [0.4, -0.2, 0.3]
 inside = [0.4, -0.5, 0.3]
 left = [0.6, -0.2, 0.3]
 """
-"""A cupboard that stands to the robot's right, and a finger across its flange."""
+"""The cupboard stands to the robot's right; the finger lies across its flange."""
 
 TIME_LIMIT_S = 30.0
-"""The authors' 20 s, and what a busy machine takes: whatever is stale there holds the arm."""
+"""The authors' 20 s, and reserve for a busy machine: stale inputs hold the arm there."""
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the demo; the exit code says whether the target was reached."""
+    """Run the demo. Exit status 0: the target was reached; 1: it was not."""
     require("mujoco", extra="sim")
     require("matplotlib", "scipy", extra="plot")
     options.log, options.png = demo_files("demo", options)
@@ -73,7 +73,7 @@ def run(options: argparse.Namespace) -> int:
     from tactile_tools.plot.reach import draw_reach
 
     try:
-        # Before three processes are started in vain.
+        # Refuse a wrong strategy before any process is started.
         load_strategy(options.strategy, parameters(_set(options)), np.random.default_rng(0))
         with tempfile.TemporaryDirectory(prefix="tactile-demo-") as name:
             code = _run(options, Path(name))
@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
     except StrategyError as error:
         raise CommandError(str(error)) from error
     except BrokenPipeError:
-        raise  # whoever read our words has gone, which is the umbrella's affair
+        raise  # the reader of our output has gone; `run_command` deals with it
     except (RuntimeError, OSError, LogUnreadableError) as error:
         busy = busy_text()
         raise CommandError(f"{error}{'; ' if busy else ''}{busy}", REFUSED) from error
@@ -96,7 +96,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _ask(words: list[str]) -> str:
-    """What a command printed; `CommandError` when it refused."""
+    """Run a command and return what it printed; `CommandError` when it refused its arguments."""
     done = subprocess.run(words, check=False, capture_output=True, text=True)
     if done.returncode == 2:
         raise CommandError(done.stderr.strip().splitlines()[-1])
@@ -111,9 +111,10 @@ def _start_of(path: Path) -> bytes:
 
 
 def demo_files(stem: str, options: argparse.Namespace) -> tuple[Path, Path]:
-    """Log and picture that a demo leaves: as named, or the first free numbers; `CommandError`.
+    """Choose the log and picture to write: the named ones, or the first free numbers.
 
-    Nothing is overwritten without --force, and with it only a log.
+    `CommandError` for a file that exists, unless --force is given, and even then unless it is a
+    log.
     """
     log, png = options.log, options.png
     if log is None:
@@ -139,7 +140,7 @@ def _beside(log: Path) -> Path:
 
 
 def what_next(log: Path, png: Path) -> str:
-    """What was left, and what to do with it."""
+    """Name the files that were left, and what to do with them."""
     return (
         f"wrote {log} and {png}\n"
         f"Next: open {png}; `tactile log info {log}` says what the log holds, `tactile plot {log} "
@@ -148,7 +149,7 @@ def what_next(log: Path, png: Path) -> str:
 
 
 def _set(options: argparse.Namespace) -> str:
-    """Parameter set that belongs to the scene."""
+    """Name of the parameter set that belongs to the scene."""
     return "hardware" if options.scene == "hardware" else "authors_sim"
 
 
@@ -209,7 +210,8 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
                 *("--board", BOARD, "--seed", str(options.seed), "--log", str(options.log)),
                 *("--listen", reach, "--connect", arm, "--connect", skin),
             ],
-            # Its arm is its own: another reach on this machine is no reason to refuse this one.
+            # Its locks lie in our folder, so that another reach on this machine does not keep it
+            # out.
             env=os.environ | {"TACTILE_RUNTIME_DIR": str(folder)},
         )
         code = _ended(reaching)
@@ -226,7 +228,7 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
 
 
 def _page_port(wanted: int) -> int:
-    """``wanted``, or another where somebody has it."""
+    """Return port ``wanted``, or another one when it is in use."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -237,7 +239,7 @@ def _page_port(wanted: int) -> int:
 
 
 def _is_served(port: int, process: subprocess.Popen[bytes]) -> bool:
-    """Wait until the page answers; False when its process has ended, or it takes too long."""
+    """Wait until the page answers; False when its process ended or did not answer in time."""
     deadline = time.monotonic() + PAGE_S
     while process.poll() is None and time.monotonic() < deadline:
         with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0):
@@ -247,7 +249,10 @@ def _is_served(port: int, process: subprocess.Popen[bytes]) -> bool:
 
 
 def _ended(process: subprocess.Popen[bytes]) -> int:
-    """Exit code of a process; one that Ctrl-C has reached, too, is given time to end in order."""
+    """Wait for a process and return its exit code.
+
+    After Ctrl-C, which the process receives as well, it gets time to end in order.
+    """
     try:
         return process.wait()
     except KeyboardInterrupt:

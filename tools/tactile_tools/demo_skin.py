@@ -1,4 +1,4 @@
-"""``tactile demo-skin``: simulated boards under tactiled and a picture, without hardware."""
+"""``tactile demo-skin``: simulated boards pressed under tactiled, and a picture of it."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ hold_s = 3.0
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the demo; 0 only when a log with contacts and a picture were left."""
+    """Run the demo. Exit status 0: a log with contacts and a picture were left."""
     require("matplotlib", "scipy", extra="plot")
     options.log, options.png = demo_files("demo-skin", options)
     with tempfile.TemporaryDirectory(prefix="tactile-demo-") as folder:
@@ -127,7 +127,10 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
 
 
 def _applied(press: Path, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(times, arrays) N: normal force really applied to each array, ``seconds`` after power-on."""
+    """Normal force truly applied to each array, shape (times, arrays), N.
+
+    ``seconds``: instants after power-on.
+    """
     geometry = finger()
     indenter = load_script(press, geometry)
     force = np.zeros((len(seconds), len(geometry.arrays)))
@@ -144,7 +147,7 @@ def _applied(press: Path, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _summarise(board: BoardSeries, applied: NDArray[np.float64]) -> None:
-    """Print what was felt beside what was done."""
+    """Print the felt forces beside the applied ones."""
     felt = board.contact_force()
     plane = np.stack([np.asarray(m.plane).reshape(-1, 3, 3)[..., 0] for m in board.ambient])
     swing = float(np.ptp(plane, axis=0).max())

@@ -1,4 +1,4 @@
-"""``tactile echo``: messages of a key as JSON lines, or as the bytes they are."""
+"""``tactile echo``: print the messages of a key as JSON lines, or as raw CDR."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from tactile_tools.log.decode import Decoder, finite
 from tactile_tools.log.stream import Stream as LogStream
 
 QUEUE = 4096
-"""Messages held for a slow terminal; what does not fit is counted and told at the end."""
+"""Messages that wait for a slow terminal; those that do not fit are counted and reported at the
+end."""
 
 LENGTH = struct.Struct("<I")
-"""Before each message of ``--cdr``: its length in bytes."""
+"""Precedes each message of ``--cdr``: its length in bytes."""
 
 
 def echo(options: argparse.Namespace) -> int:
-    """Print messages until told to stop."""
+    """Print messages until stopped, until ``count`` were printed or until ``timeout`` is over."""
     decoder, schemas = Decoder(), {}
     with watching.open_bus(options) as bus:
         stream = Stream(bus.session, options.key, lambda sample: sample, queue=QUEUE)

@@ -1,4 +1,4 @@
-"""``tactile foxglove``: the running rig live in Foxglove, with the same schemas as its logs."""
+"""``tactile foxglove``: show the running rig in Foxglove, with the schemas of its logs."""
 
 from __future__ import annotations
 
@@ -27,20 +27,21 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 DEFAULT_PORT: Final = 8765
-"""Foxglove's own default: *Open connection* offers it."""
+"""Default of Foxglove, which *Open connection* offers."""
 
 HOST: Final = "127.0.0.1"
-"""The protocol has no authentication, so that nobody else's machine may connect."""
+"""This machine alone, because the protocol has no authentication."""
 
 BACKLOG: Final = 32
-"""Messages that wait for a slow viewer before the oldest go: a third of a second of one stream."""
+"""Messages that wait for a slow viewer before the oldest are dropped: a third of a second of a
+stream."""
 
 MAX_CHANNELS: Final = 256
 KEYS: Final = ("tactile/*/*", "arm/*/state", "reach/*/*", "reference/*/*", "world/*/*", TF.template)
 
 TICK_S: Final = 0.05
 QUIET_S: Final = 5.0
-"""Silence of the bus after which it is mentioned, once."""
+"""Seconds of silence after which an empty bus is mentioned, once."""
 STATUS_TIMEOUT_S: Final = 2.0
 TARE_TIMEOUT_S: Final = 120.0
 GEOMETRY_TIMEOUT_S: Final = 5.0
@@ -53,20 +54,20 @@ REACH_SERVICES: Final = {
     "goal": {"x": "number", "y": "number"},
     "reset": {},
 }
-"""Name and fields of the request of what can be asked for; `reach` services need --control, but
-for status and stop."""
+"""Services offered for boards and reaches: name, and fields of the request with their types. Those
+of a reach need --control, except `ALWAYS`."""
 
 ALWAYS: Final = ("status", "stop")
 
 RATE: Final = "rate_hz"
 READ_ONLY: Final = ("model", "serial_number", "port", "features_valid")
-"""Of a board's status, what is shown as its parameters; `RATE` can be set."""
+"""Fields of a board's status shown as parameters; only `RATE` can be set."""
 
 DONE, USAGE, REFUSED = 0, 2, 3
 
 
 def run(options: argparse.Namespace) -> int:
-    """Serve until told to stop; the exit status."""
+    """Serve viewers until stopped; returns the exit status."""
     try:
         import foxglove  # noqa: F401
     except ImportError:
@@ -112,7 +113,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 class Live:
-    """Serves what ``bus`` says; `tick` is to be called often, from one thread.
+    """Serves viewers with what is on ``bus``; call `tick` often, from one thread.
 
     OSError with the remedy when the port is in use. ``control``: offer services that move the arm
     or change a board's rate. ``counts``: messages shown and not shown, by reason.
@@ -130,7 +131,7 @@ class Live:
         self._latched: dict[str, tuple[bytes, int]] = {}  # last message by topic, and its time
         self._boards: set[str] = set()
         self._reaches: set[str] = set()
-        self._met: dict[tuple[str, str], None] = {}  # kind and name that wait to be greeted
+        self._met: dict[tuple[str, str], None] = {}  # new boards and reaches, as (kind, name)
         self._lock = threading.Lock()
         logging.getLogger("foxglove").setLevel(logging.WARNING)
         try:
@@ -153,16 +154,16 @@ class Live:
 
     @property
     def port(self) -> int:
-        """TCP port it listens at."""
+        """TCP port of the server."""
         return int(self._server.port)
 
     @property
     def app_url(self) -> str:
-        """Address that opens Foxglove in a browser, connected."""
+        """Address that opens Foxglove in a browser, already connected."""
         return str(self._server.app_url())
 
     def tick(self) -> None:
-        """Offer the services of boards and reaches that were heard for the first time."""
+        """Offer the services of boards and reaches heard for the first time."""
         for kind, name in list(self._met):
             del self._met[kind, name]
             if kind == "tactile":
@@ -188,14 +189,14 @@ class Live:
         self._server.stop()
 
     def subscribed(self, topic: str) -> None:
-        """Somebody has subscribed: send what holds, which was sent before he came."""
+        """Send a new subscriber the last message of a latched topic."""
         held, channel = self._latched.get(topic), self._channels.get(topic)
         if held is not None and channel is not None:
             data, wall_ns = held
             channel.log(data, log_time=wall_ns)
 
     def parameters(self, names: list[str]) -> list[Parameter]:
-        """Parameters called ``names``, or all: what the boards' status services say."""
+        """Parameters called ``names`` (all if empty), read from the boards' status services."""
         import foxglove
 
         found = []
@@ -218,7 +219,7 @@ class Live:
         return found
 
     def set_parameters(self, asked: list[Parameter]) -> list[Parameter]:
-        """Set rates; everything else stays as it is. Returns the values in force."""
+        """Set rates and refuse everything else; returns the values now in force."""
         for parameter in asked:
             board, _, field = parameter.name.rpartition(".")
             if field != RATE or board not in self._boards or not self._control:
@@ -261,7 +262,7 @@ class Live:
     def _channel(self, path: str, msgtype: str) -> Channel | None:
         import foxglove
 
-        with self._lock:  # two taps may hear the first messages at once
+        with self._lock:  # two taps may receive the first messages at the same time
             if path not in self._channels:
                 if len(self._channels) >= MAX_CHANNELS:
                     return None
@@ -286,7 +287,7 @@ class Live:
             try:
                 answer = call(self._bus, key, json.loads(request.payload or b"{}"), timeout)
             except (ServiceError, zenoh.ZError, ValueError) as error:
-                raise RuntimeError(str(error)) from error  # foxglove hands on the text
+                raise RuntimeError(str(error)) from error  # foxglove shows the text to the viewer
             return json.dumps(answer).encode()
 
         def schema(of: str, properties: dict[str, str]) -> foxglove.MessageSchema:
@@ -310,7 +311,7 @@ class Live:
 
 
 class _Listener:
-    """What viewers do; called in threads of the server. Nothing may leave it as an exception."""
+    """Callbacks for what viewers do, called in the server's threads. None may raise."""
 
     def __init__(self, live: Live) -> None:
         self._live = live
@@ -344,16 +345,16 @@ class _Listener:
         """Viewers publish nothing."""
 
     def on_parameters_subscribe(self, names: list[str]) -> None:
-        """They are told when asked for."""
+        """Not supported: parameters are sent when they are asked for."""
 
     def on_parameters_unsubscribe(self, names: list[str]) -> None:
         """Nothing to do."""
 
     def on_connection_graph_subscribe(self) -> None:
-        """There is none."""
+        """Not supported."""
 
     def on_connection_graph_unsubscribe(self) -> None:
-        """There is none."""
+        """Not supported."""
 
     def on_playback_control_request(self, request: Any) -> None:
-        """What is live cannot be wound back."""
+        """Not supported: live data cannot be rewound."""

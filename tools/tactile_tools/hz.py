@@ -1,4 +1,4 @@
-"""``tactile hz``: how often messages come, how evenly, and how many were lost on the way."""
+"""``tactile hz``: rate and evenness of messages, and how many were lost on the way."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from tactile_reach.client import Stream, stamp_of
 from tactile_tools import watching
 
 QUEUE = 65_536
-"""Messages between two looks; a look takes a fraction of a millisecond."""
+"""Messages that may wait between two reads of the stream; one read takes under a millisecond."""
 
 KEYS = 256
-"""Keys that one line is printed of; those of a wildcard that come later are counted together."""
+"""Keys with a line of their own; further keys of a wildcard are counted together as "others"."""
 
 
 @dataclass(slots=True)
@@ -29,7 +29,7 @@ class _Key:
     lost: int = 0
 
     def take(self, sample: zenoh.Sample, at: float) -> None:
-        """Count one message that came ``at``, s."""
+        """Count a message that arrived at monotonic time ``at``, s."""
         self.count += 1
         self.size += len(sample.payload)
         if self.last is not None:
@@ -42,7 +42,7 @@ class _Key:
             self.sequence = stamp[0]
 
     def line(self, elapsed: float) -> str:
-        """What the last ``elapsed`` s were like; they are then forgotten."""
+        """Describe the last ``elapsed`` s, then begin counting anew."""
         text = f"{self.count / elapsed:8.1f} Hz  {self.size / elapsed / 1e3:8.1f} kB/s"
         if self.periods:
             usual, longest = statistics.median(self.periods), max(self.periods)
@@ -55,7 +55,7 @@ class _Key:
 
 
 def hz(options: argparse.Namespace) -> int:
-    """Print rates until told to stop."""
+    """Print rates once a second until stopped."""
     keys: dict[str, _Key] = {}
     with watching.open_bus(options) as bus:
         stream = Stream(bus.session, options.key, lambda s: (s, time.monotonic()), queue=QUEUE)

@@ -1,4 +1,4 @@
-"""``tactile list``: what is published on the bus, who publishes it, and what can be asked."""
+"""``tactile list``: what is published on the bus, and which services can be called."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from tactile_reach.client import NotThereError, type_of
 from tactile_tools import watching
 
 LISTEN_S = 1.5
-"""Long enough for what comes once a second."""
+"""Long enough to hear what is published once a second."""
 
 KEYS = 4096
-"""Keys told apart."""
+"""Greatest number of keys that are told apart."""
 
 SERVICES = {
     "tactile": ("status", "tare", "set_rate", "record", "recalibrate", "geometry"),
     "arm": ("status", "limits", "clear", "claim", "release"),
     "reach": ("status", "goal", "arm", "stop", "reset", "clear"),
 }
-"""What can be asked of whom, by the kind of the name."""
+"""Services of each kind of participant."""
 
 
 def list_bus(options: argparse.Namespace) -> None:
-    """Print keys and services; `NotThereError` when there is nothing."""
+    """Print keys and services; `NotThereError` when nothing is on the bus."""
     counts: Counter[str] = Counter()
     types: dict[str, str] = {}
 

@@ -28,7 +28,7 @@ def add_log_files(parser: Adding) -> None:
 
 
 def add_scene(parser: Adding) -> None:
-    """Add --scene, one scene or a set of them by name."""
+    """Add --scene: a scene, or a set of scenes by name."""
     parser.add_argument(
         "--scene",
         default="authors_sim",
@@ -39,7 +39,7 @@ def add_scene(parser: Adding) -> None:
 
 
 def add_strategy(parser: Adding) -> None:
-    """Add --strategy, one."""
+    """Add --strategy."""
     parser.add_argument(
         "--strategy",
         default=DEFAULT_STRATEGY,
@@ -49,7 +49,7 @@ def add_strategy(parser: Adding) -> None:
 
 
 def add_engine(parser: Adding) -> None:
-    """Add --engine, one."""
+    """Add --engine."""
     parser.add_argument(
         "--engine",
         choices=ENGINES,
@@ -59,7 +59,7 @@ def add_engine(parser: Adding) -> None:
 
 
 def add_depth(parser: Adding) -> None:
-    """Add --depth, one."""
+    """Add --depth."""
     parser.add_argument(
         "--depth",
         choices=("contacts", "taxels"),
@@ -77,6 +77,6 @@ def add_jobs(parser: Adding) -> None:
 
 
 def add_report(parser: Parser) -> None:
-    """Add --out for a report as JSON, which --json FILE once was."""
+    """Add --out for a report as JSON; its former name is --json."""
     parser.former(json="out")
     add_out(parser, "write the result to this file, as JSON", force="")

@@ -1,4 +1,4 @@
-"""Starting our own commands from a tool, and ending them in order."""
+"""Start our own commands from a tool, and end them in order."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-PORT_WAIT_S = 60.0  # a loaded machine needs some seconds to import numpy twice
+PORT_WAIT_S = 60.0  # s: a loaded machine needs some seconds to import numpy twice
 
 
 def busy_text() -> str:
-    """That this machine is busy, if so: more processes want to run than it has cores."""
+    """Return a sentence if the machine is busy (load above 1.5 times its cores), else ""."""
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
     if load < 1.5 * cores:
         return ""
@@ -25,22 +25,22 @@ def busy_text() -> str:
 
 
 def free_port() -> int:
-    """Return a TCP port of this machine that is free now, so that a running tactiled is left be."""
+    """Return a TCP port of this machine that is free now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def socket_at(folder: Path, name: str) -> str:
-    """Endpoint of a unix socket in ``folder``, so that a rig of our own leaves others be.
+    """Endpoint of a unix socket in ``folder``, so that our own rig does not meet other rigs.
 
-    The folder must be one that others cannot enter, as `tempfile` makes them, with a short path.
+    The folder must have a short path and be closed to other users, as those of `tempfile` are.
     """
     return f"unixsock-stream/{folder.absolute() / name}.sock"
 
 
 def command(name: str) -> str:
-    """Path of one of our commands, from the environment this one runs in."""
+    """Path of one of our commands beside the Python that runs; RuntimeError without it."""
     beside = Path(sys.executable).with_name(name)
     found = str(beside) if beside.exists() else shutil.which(name)
     if found is None:
@@ -50,7 +50,7 @@ def command(name: str) -> str:
 
 @contextlib.contextmanager
 def running(words: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a command in the background and end it in order when the block is left."""
+    """Run a command in the background, its output in ``log``; SIGTERM ends it after the block."""
     with log.open("wb") as output:
         process = subprocess.Popen(words, stdout=output, stderr=subprocess.STDOUT)
     try:
@@ -66,7 +66,7 @@ def running(words: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def wait_for(path: Path, process: subprocess.Popen[bytes], log: Path) -> None:
-    """Wait until ``path`` exists; RuntimeError with the program's own words when it ends first."""
+    """Wait until ``path`` exists. RuntimeError with the program's output when it ends or hangs."""
     deadline = time.monotonic() + PORT_WAIT_S
     while not path.exists():
         if process.poll() is not None or time.monotonic() > deadline:

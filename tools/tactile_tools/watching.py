@@ -1,4 +1,4 @@
-"""Keys, errors and the bus for ``tactile list``, ``echo``, ``hz`` and ``call``."""
+"""Keys, errors and bus session of ``tactile list``, ``echo``, ``hz`` and ``call``."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from tactile_reach.client import Bus
 DONE, FAILED, USAGE, REFUSED = range(4)
 
 QUIET_S = 3.0
-"""Without a message after which a command says that it waits."""
+"""Seconds without a message after which a command says that it is waiting."""
 
 
 def key_of(text: str) -> str:
-    """A key expression; a leading slash, as topics in logs have it, is left out."""
+    """Parse a key expression; slashes at its ends, as topics in logs have them, are dropped."""
     import zenoh
 
     try:
@@ -30,12 +30,12 @@ def key_of(text: str) -> str:
 
 
 def open_bus(options: argparse.Namespace) -> Bus:
-    """The bus as the flags ask for; `tactile_reach.TactileError` when it cannot be joined."""
+    """Join the bus as the options say; `tactile_reach.TactileError` when it cannot be joined."""
     return Bus(bus_config(options, BusTable(), "tool"))
 
 
 def run(name: str, work: Callable[[argparse.Namespace], int | None]) -> Callable[..., int]:
-    """``work`` as a command ``tactile name``: errors become one sentence and an exit status."""
+    """Make ``work`` the command ``tactile name``: an error becomes a sentence and exit status 3."""
 
     def command(options: argparse.Namespace) -> int:
         try:
@@ -48,7 +48,7 @@ def run(name: str, work: Callable[[argparse.Namespace], int | None]) -> Callable
 
 
 def say_quiet(name: str, key: str) -> None:
-    """Tell a user who waits that nothing comes."""
+    """Tell a waiting user that nothing has come yet."""
     print(
         f"tactile {name}: nothing on {key} yet; `tactile list` shows what is published",
         file=sys.stderr,
