@@ -1,1 +1,1 @@
-"""``tactile log``: one module a subcommand, over what all of them share."""
+"""``tactile log``: one module per subcommand, and the modules that they share."""

@@ -1,4 +1,4 @@
-"""Arguments that several log tools take, and what they mean."""
+"""Arguments that several log tools share, and their meaning."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tactile_tools.log.stream import Wanted, first_ns, matcher, require_topics
 from tactile_tools.log.terminal import ToolError
 
 END_NS = (1 << 64) - 1
-"""Later than anything: log times are unsigned 64-bit numbers."""
+"""Later than every log time: log times are unsigned 64-bit numbers."""
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What of which logs. ``start_ns``: log time that relative times are counted from."""
+    """Selected messages of selected logs. ``start_ns``: log time at which relative times begin."""
 
     logs: list[Series]
     wanted: Wanted | None
@@ -29,7 +29,7 @@ class Selection:
 
 
 def select(options: argparse.Namespace) -> Selection:
-    """What the options of `add_files` and `add_selection` mean; ToolError, LogError."""
+    """Make a selection of the options of `add_files` and `add_selection`; ToolError, LogError."""
     logs = find_series(options.files)
     require_topics(options.topic, logs)
     start = first_ns(logs)
@@ -46,7 +46,7 @@ def select(options: argparse.Namespace) -> Selection:
 
 
 def moment(flag: str, text: str, start_ns: int) -> int:
-    """Log time in ns that ``text`` stands for; ToolError when it is none."""
+    """Log time, ns, that ``text`` stands for; ToolError naming ``flag`` when it is not a time."""
     try:
         seconds = float(text)
     except ValueError:
@@ -66,7 +66,7 @@ def moment(flag: str, text: str, start_ns: int) -> int:
 
 
 def check_output(out: Path, force: bool, sources: Sequence[Series] = ()) -> Path:
-    """``out``, to be written; ToolError when it is there already or is one of the sources."""
+    """Return ``out``; ToolError when it exists without ``force``, or is one of the sources."""
     if any(out.resolve() == path.resolve() for log in sources for path in log.paths):
         raise ToolError(f"{out} is what is read: name another with --out")
     if out.is_dir():

@@ -1,4 +1,4 @@
-"""``tactile log cat``: the messages of a log as lines."""
+"""``tactile log cat``: print the messages of a log, one per line."""
 
 from __future__ import annotations
 
@@ -15,11 +15,14 @@ from tactile_tools.log.stream import Reading, Record, read_merged
 from tactile_tools.log.terminal import FAULTY, clock_text, complain, json_text, shown
 
 SHOWN = 6
-"""Elements of an array shown to people; --json has them all."""
+"""Elements of an array that are printed; --json prints all."""
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print; 0 when everything was printed, 1 when messages were lost or could not be decoded."""
+    """Print messages.
+
+    Returns 0 if all were printed, 1 if some were lost or could not be decoded.
+    """
     chosen = select(options)
     decoder, reading = Decoder(), Reading()
     out = sys.stdout
@@ -69,7 +72,7 @@ def _print_line(out: TextIO, item: Record, fields: Any, start_ns: int, absolute:
 
 
 def _text(value: Any) -> str:
-    """A value for people: six digits, long arrays cut."""
+    """Format a value for reading: six digits, long arrays cut."""
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, dict):

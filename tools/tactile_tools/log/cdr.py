@@ -1,8 +1,8 @@
-"""Messages with wide strings, which rosbags does not read: CDR taken apart field by field.
+"""Decode messages with wide strings, which rosbags does not read, field by field.
 
-A wide string is written in three ways: as many letters as the number before it says, of four bytes
-(DDS implementations with the old encoding) or of two, or as many bytes as it says (the new one).
-Nothing in a message tells which; only one of them comes out even at its end.
+Writers encode wide strings in three ways. The number in front counts letters of four bytes or of
+two bytes (DDS implementations with the old encoding), or it counts bytes (the new encoding).
+Nothing in a message says which; only the right one ends exactly where the message ends.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ NUMBERS = {
 MAX_NESTED = 64
 
 PADDING = 7
-"""Bytes that a writer may leave at the end, for the next message to be aligned."""
+"""Bytes that a writer may leave at the end, to align the next message."""
 
 Fields = dict[str, Any]
 
 
 class CdrError(ValueError):
-    """The bytes are no such message."""
+    """The bytes are not a message of this type."""
 
 
 class WideDecoder:
-    """Decodes messages of one type; remembers which way of writing wide strings was right."""
+    """Decodes messages of one type; remembers which encoding of wide strings was right."""
 
     def __init__(self, fields: Fields, msgtype: str) -> None:
         self._fields = fields
@@ -44,9 +44,10 @@ class WideDecoder:
         self._ways = [_quads, _bytes, _pairs]
 
     def __call__(self, data: bytes) -> Any:
-        """The message in ``data``; `CdrError` when it is none."""
+        """Decode the message in ``data``; `CdrError` when it is not one."""
         trouble: Exception | None = None
-        # Bytes left out for alignment are nearly always 0: others tell that a turn was wrong.
+        # Bytes skipped for alignment are nearly always 0; others suggest a wrong encoding, so
+        # encodings that skip only zeros are tried first.
         for strict, way in ((strict, way) for strict in (True, False) for way in self._ways):
             try:
                 found = _Cursor(data, self._fields, way, strict).message(self._msgtype)
@@ -60,7 +61,7 @@ class WideDecoder:
 
 
 class _Cursor:
-    """Takes values off the bytes of one message."""
+    """Reads values from the bytes of one message."""
 
     def __init__(
         self, data: bytes, fields: Fields, wide: Callable[[_Cursor, int], str], strict: bool
@@ -75,7 +76,7 @@ class _Cursor:
         self._strict = strict
 
     def message(self, msgtype: str) -> Any:
-        """All of the message."""
+        """Read the whole message."""
         found = self._struct(msgtype, 0)
         left = self.data[self.at :]
         if len(left) > PADDING or any(left):
@@ -83,21 +84,21 @@ class _Cursor:
         return found
 
     def take(self, size: int) -> bytes:
-        """The next bytes."""
+        """Return the next ``size`` bytes."""
         if size > len(self.data) - self.at:
             raise CdrError("it is shorter than its fields")
         self.at += size
         return self.data[self.at - size : self.at]
 
     def align(self, size: int) -> None:
-        """Go to the next multiple of ``size``."""
+        """Skip to the next multiple of ``size``."""
         skipped = -self.at % size
         if self._strict and any(self.data[self.at : self.at + skipped]):
             raise CdrError("there is something between its fields")
         self.at += skipped
 
     def length(self) -> int:
-        """A number of elements."""
+        """Read the number of elements of a sequence."""
         self.align(4)
         (count,) = struct.unpack(f"{self.order}I", self.take(4))
         return int(count)
@@ -141,17 +142,17 @@ class _Cursor:
 
 
 def _quads(cursor: _Cursor, count: int) -> str:
-    """Letters of four bytes."""
+    """``count`` letters of four bytes."""
     raw = cursor.take(4 * count)
     return raw.decode("utf-32-le" if cursor.order == "<" else "utf-32-be").removesuffix("\0")
 
 
 def _pairs(cursor: _Cursor, count: int) -> str:
-    """Letters of two bytes, ``count`` of them."""
+    """``count`` letters of two bytes."""
     return _bytes(cursor, 2 * count)
 
 
 def _bytes(cursor: _Cursor, count: int) -> str:
-    """Letters of two bytes, ``count`` bytes of them."""
+    """``count`` bytes of letters of two bytes."""
     raw = cursor.take(count)
     return raw.decode("utf-16-le" if cursor.order == "<" else "utf-16-be").removesuffix("\0")

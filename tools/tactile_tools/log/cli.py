@@ -1,4 +1,4 @@
-"""The command line of ``tactile log``."""
+"""Command line of ``tactile log``."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ COMMANDS = {
 FORMATS = ("csv", "parquet", "npz", "lerobot")
 
 MAX_FPS = 1000
-"""Frames a second of a LeRobot data set at most."""
+"""Greatest frame rate of a LeRobot data set, Hz."""
 
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kMG]i?)?B?", re.IGNORECASE)
 _POWERS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "ki": 1 << 10, "mi": 1 << 20, "gi": 1 << 30}
@@ -62,7 +62,7 @@ def fill(parser: Parser) -> None:
 
 
 def _work(name: str) -> Callable[[argparse.Namespace], int]:
-    """``run`` of the module ``name``; what a log or the output does not allow is one sentence."""
+    """Make ``run`` of module ``name`` a command; errors of logs and outputs become one sentence."""
     work = later(f"tactile_tools.log.{name}:run")
 
     def run(options: argparse.Namespace) -> int:
@@ -74,10 +74,10 @@ def _work(name: str) -> Callable[[argparse.Namespace], int]:
         except LogError as error:
             return fail(error)
         except BrokenPipeError:
-            raise  # whoever read our output has gone; `tactile` ends quietly
+            raise  # the reader of our output has gone; `run_command` ends quietly
         except OSError as error:
-            # The output itself: what a tool writes to files it answers for. Nothing more can be
-            # said there, nor may the interpreter try when it ends.
+            # The output itself failed: tools handle errors of the files they write. Nothing more
+            # can be printed, and the interpreter must not try when it exits.
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
             raise CommandError(
                 f"cannot write the output: {error.strerror or error}", REFUSED
@@ -87,7 +87,7 @@ def _work(name: str) -> Callable[[argparse.Namespace], int]:
 
 
 def size_bytes(text: str) -> int:
-    """Parser of a size in bytes, such as 500MB, 1.5GiB or 4096."""
+    """Parse a size in bytes, such as 500MB, 1.5GiB or 4096."""
     match = _SIZE.fullmatch(text.strip())
     if match is not None:
         size = float(match[1]) * _POWERS[(match[2] or "").lower()]

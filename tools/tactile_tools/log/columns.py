@@ -1,6 +1,7 @@
-"""Messages as columns: nested fields flattened, times as nanoseconds, notes from the definitions.
+"""Messages as columns: nested fields flattened, times in nanoseconds, notes from the definitions.
 
-A column holds numbers, texts, a list of numbers or of texts a row, or the rows of a nested table.
+Each row of a column holds a number, a text, a list of numbers, a list of texts, or the rows of a
+nested table.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ TIME_NOTE = "ns since the Unix epoch"
 
 @dataclass(slots=True)
 class Column:
-    """One column. ``get``: its value in a message; ``fields``: of each row, for ``rows``.
+    """One column. ``get``: reads its value from a message. ``fields``: columns of a nested table.
 
-    ``length``: of a list that always has as many elements, else None.
+    ``length``: elements of a list of fixed length, else None.
     """
 
     name: str
@@ -45,7 +46,7 @@ class Column:
 
 
 def plan(stream: Stream, reader: Reader) -> list[Column]:
-    """Columns of a stream's messages, in the order of their definition."""
+    """Make the columns of a stream's messages, in the order of their definition."""
     if not reader.fields:
         import json
 
@@ -57,7 +58,10 @@ def plan(stream: Stream, reader: Reader) -> list[Column]:
 def _columns(
     fields: dict[str, Any], msgtype: str, path: str, prefix: str, notes: dict[tuple[str, str], str]
 ) -> list[Column]:
-    """``path``: attributes from the message to this part; ``prefix``: of the columns' names."""
+    """Columns of a part of a message.
+
+    ``path``: attributes that lead from the message to this part. ``prefix``: of the columns' names.
+    """
     out: list[Column] = []
     for name, (kind, arguments) in fields[msgtype][1]:
         here = f"{path}.{name}" if path else name
@@ -126,7 +130,7 @@ def _table(
 
 
 def comments(stream: Stream) -> dict[tuple[str, str], str]:
-    """What the definition says of its fields, by type and field: units stand there."""
+    """Comments of the definition by type and field; they hold the units."""
     found: dict[tuple[str, str], str] = {}
     msgtype = stream.msgtype
     for line in stream.definition.decode("utf-8", "replace").splitlines():
@@ -139,14 +143,14 @@ def comments(stream: Stream) -> dict[tuple[str, str], str]:
 
 
 MAX_STEM = 100
-"""Letters of a topic in the name of its file; the rest is told apart by a hash of it."""
+"""Letters of a topic in a file's name; a hash distinguishes longer ones."""
 
 RESERVED = re.compile(r"con|prn|aux|nul|com\d|lpt\d", re.IGNORECASE)
-"""Names that some systems keep for devices."""
+"""Names that some systems reserve for devices."""
 
 
 class FileNames:
-    """File names of streams, told apart where two have the same topic, also in small letters."""
+    """File names of streams, distinct where topics are equal or differ only in capitals."""
 
     def __init__(self, suffix: str) -> None:
         self.names: dict[Stream, str] = {}
@@ -155,7 +159,7 @@ class FileNames:
         self._next: dict[str, int] = {}
 
     def add(self, stream: Stream) -> str:
-        """A new name for ``stream``."""
+        """Return a new name for ``stream``."""
         stem = re.sub(r"[^A-Za-z0-9-]+", "_", stream.topic).strip("_") or "topic"
         if len(stem) > MAX_STEM:
             digest = hashlib.blake2b(stream.topic.encode("utf-8", "replace"), digest_size=4)

@@ -1,4 +1,4 @@
-"""Messages by the definitions that stand in the log itself, so that any ROS 2 log is read."""
+"""Decode messages by the definitions in the log itself, so that any ROS 2 log can be read."""
 
 from __future__ import annotations
 
@@ -27,12 +27,13 @@ __all__ = ["ARRAY", "BASE", "NAME", "SEQUENCE", "Decoder", "Reader", "finite", "
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 MAX_DEFINITION = 1 << 20
-"""Bytes of a definition that is parsed: the largest of ROS's own, with all it needs, has 20 kB."""
+"""Longest definition that is parsed, bytes; the largest of ROS itself, with all it needs, has 20
+kB."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reader:
-    """How one stream is decoded. ``fields``: definitions by type name, empty for JSON."""
+    """How to decode one stream. ``fields``: definitions by type name, empty for JSON."""
 
     decode: Callable[[bytes], Any]
     fields: dict[str, Any]
@@ -40,13 +41,13 @@ class Reader:
 
 
 class Decoder:
-    """Decodes the messages of any stream; keeps one reader a stream."""
+    """Decodes the messages of any stream; keeps a reader for each."""
 
     def __init__(self) -> None:
         self._readers: dict[Stream, Reader | str] = {}
 
     def reader(self, stream: Stream) -> Reader:
-        """How ``stream`` is decoded; `DecodeError` says why it is not."""
+        """Return the reader of ``stream``; `DecodeError` says why it cannot be decoded."""
         found = self._readers.get(stream)
         if found is None:
             try:
@@ -62,7 +63,10 @@ class Decoder:
         return found
 
     def decode(self, stream: Stream, data: bytes) -> Any:
-        """The message in ``data``; `DecodeError` when it is none or its type cannot be read."""
+        """Decode ``data``.
+
+        `DecodeError` when it is not such a message or its type is unreadable.
+        """
         reader = self.reader(stream)
         try:
             return reader.decode(data)
@@ -70,41 +74,42 @@ class Decoder:
             SerdeError, ValueError, struct.error, LookupError, OverflowError, RecursionError
         ) as error:  # fmt: skip
             if len(data) <= 4 and _is_empty(reader):
-                return SimpleNamespace(**{DUMMY: 0})  # as some writers leave it out
+                return SimpleNamespace(**{DUMMY: 0})  # some writers send nothing
             raise DecodeError(f"{stream.msgtype} of {len(data)} bytes: {error}") from error
 
     def plain(self, stream: Stream, data: bytes) -> Any:
-        """The message as dictionaries, lists, numbers and texts."""
+        """Decode ``data`` to dictionaries, lists, numbers and texts."""
         message = self.decode(stream, data)
         reader = self.reader(stream)
         return plain(message, reader.fields, reader.msgtype) if reader.fields else message
 
 
 SUBTYPE = re.compile(r"\b([A-Za-z]\w*)/(?:srv|action)/([A-Za-z]\w*)")
-"""Types of services and actions: rosbags knows those of messages alone."""
+"""Types of services and actions; rosbags knows only those of messages."""
 
 WIDE_BOUND = re.compile(r"\bwstring<=\d+")
 
 DELIMITER = re.compile(r"^=+\s*\n(?:MSG|SRV): *(\S+)\s*$", re.MULTILINE)
 
 PARTS = re.compile(r"^---[ \t]*$", re.MULTILINE)
-"""Between request and response in the definition of a service."""
+"""Separates request and response in the definition of a service."""
 
 SERVICE = re.compile(r"(.*)_(Event|Request|Response)")
 
 EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 
 FEW = 32
-"""Messages of a type that are decoded without code of its own: as long as that takes to make."""
+"""Messages of a type decoded field by field before code for the type is made: that takes as long as
+making the code does."""
 
 MAX_DEPTH = 32
-"""How deep types may lie within one another; ROS's own go to six."""
+"""Deepest nesting of types; those of ROS reach six."""
 
 MAX_STORES = 16
-"""Type stores kept for further types; definitions of one name that differ need one each."""
+"""Type stores kept for further types. Different definitions of one name need one store each."""
 
 DUMMY = "structure_needs_at_least_one_member"
-"""What ROS puts into a message without fields."""
+"""Field that ROS gives a message without fields."""
 
 
 @lru_cache(maxsize=1024)
@@ -135,7 +140,7 @@ def _make_reader(
 
 @lru_cache(maxsize=1024)
 def _typed_reader(msgtype: str, schema_encoding: str, definition: bytes) -> Reader:
-    """Reader of a type; `DecodeError` says what is wrong with its definition."""
+    """Make the reader of a type; `DecodeError` says what is wrong with its definition."""
     try:
         types = _types(definition.decode(), msgtype, schema_encoding)
         fields = {**get_typestore(Stores.EMPTY).fielddefs, **types}
@@ -160,9 +165,9 @@ def _typed_reader(msgtype: str, schema_encoding: str, definition: bytes) -> Read
 
 
 class _Decode:
-    """Decodes messages of a type: the first few field by field, more by code made for the type.
+    """Decodes messages of a type: the first few field by field, then by code made for the type.
 
-    To make it takes some ms, and logs may have thousands of types with a message each.
+    Making the code takes some ms, and a log may have thousands of types with a message each.
     """
 
     def __init__(self, fields: dict[str, Any], name: str) -> None:
@@ -173,7 +178,7 @@ class _Decode:
         self._store: Any = None
 
     def __call__(self, data: bytes) -> Any:
-        """The message in ``data``; errors as rosbags raises them."""
+        """Decode ``data``; raises what rosbags raises."""
         if self._store is None:
             self._count += 1
             if self._count <= FEW:
@@ -190,9 +195,10 @@ _stores: list[tuple[Any, dict[str, Any]]] = []
 
 
 def _store_for(fields: dict[str, Any]) -> Any:
-    """A type store with these definitions: one that has others too, if none is different there.
+    """Return a type store with these definitions, perhaps with further ones that do not conflict.
 
-    To make code for a type takes some ms, and logs have thousands that share most of their parts.
+    Making code for a type takes some ms, and a log may have thousands of types that share most of
+    their parts.
     """
     fit = (s for s in _stores if all(s[1].get(n, each) == each for n, each in fields.items()))
     store, known = next(fit, (None, {}))
@@ -210,7 +216,7 @@ def _store_for(fields: dict[str, Any]) -> Any:
 
 
 def _types(text: str, msgtype: str, schema_encoding: str) -> dict[str, Any]:
-    """Types of a definition by name, all called ``package/msg/Name``."""
+    """Types of a definition by name, all in the form ``package/msg/Name``."""
     if schema_encoding == "ros2idl":
         found = {_short(name): fields for name, fields in get_types_from_idl(text).items()}
         return found | _event(_short(msgtype), found)
@@ -232,7 +238,7 @@ def _types(text: str, msgtype: str, schema_encoding: str) -> dict[str, Any]:
 
 
 def _sections(own: str, name: str, others: str) -> dict[str, Any]:
-    """Types of a definition and of all it brings with it, each parsed once however often it is."""
+    """Types of a definition and of those appended to it; each distinct section is parsed once."""
     types: dict[str, Any] = {}
     heads = list(DELIMITER.finditer(others))
     ends = [*(head.start() for head in heads[1:]), len(others)]
@@ -259,7 +265,10 @@ def _event(name: str, types: dict[str, Any]) -> dict[str, Any]:
 
 
 def _prepare(types: dict[str, Any]) -> bool:
-    """Give messages without fields what ROS gives them; whether there is any wide string."""
+    """Complete definitions for rosbags: fill empty messages, shorten names, mark wide strings.
+
+    Returns whether there is any wide string.
+    """
     wide = False
 
     def mend(kind: Any, arguments: Any) -> tuple[Any, Any]:
@@ -280,19 +289,19 @@ def _prepare(types: dict[str, Any]) -> bool:
 
 
 def _short(msgtype: str) -> str:
-    """``package/srv/Name`` and the like as ``package/msg/Name``, which all are called here."""
+    """Return ``package/srv/Name`` and the like as ``package/msg/Name``, the form used here."""
     return SUBTYPE.sub(r"\1/msg/\2", msgtype)
 
 
 def _names(msgtype: str) -> tuple[str, ...]:
-    """What a type may be called: ``pkg/Name`` is ``pkg/msg/Name`` for rosbags."""
+    """Names that a type may have: rosbags calls ``pkg/Name`` ``pkg/msg/Name``."""
     name = _short(msgtype)
     package, _, last = name.rpartition("/")
     return name, f"{package}/msg/{last}"
 
 
 def _undefined(msgtype: str, fields: dict[str, Any]) -> list[str]:
-    """Types that are used and defined nowhere."""
+    """Types that are used and not defined."""
     missing: list[str] = []
     todo, seen = [msgtype], set()
     while todo:
@@ -317,8 +326,8 @@ def _is_empty(reader: Reader) -> bool:
 
 
 def _check_depth(msgtype: str, fields: dict[str, Any]) -> None:
-    """`DecodeError` for types that contain themselves, or others too many times over."""
-    depths: dict[str, int] = {}  # 0 while a type is being looked into
+    """`DecodeError` for types that contain themselves or nest too deeply."""
+    depths: dict[str, int] = {}  # 0 while the parts of a type are being examined
     todo = [msgtype]
     while todo:
         name = todo[-1]
@@ -344,7 +353,7 @@ def _inner(kind: int, arguments: Any) -> str:
 
 
 def plain(message: Any, fields: dict[str, Any], msgtype: str) -> Any:
-    """Dictionaries, lists, numbers and texts of a message; times as whole nanoseconds."""
+    """Return a message as dictionaries, lists, numbers and texts; times as whole nanoseconds."""
     if msgtype in TIMES:
         return int(message.sec) * 1_000_000_000 + int(message.nanosec)
     return {
@@ -365,7 +374,7 @@ def _plain_field(value: Any, fields: dict[str, Any], kind: int, arguments: Any) 
 
 
 def finite(value: Any) -> Any:
-    """The same without NaN and infinities, which JSON has not: they become null."""
+    """Replace NaN and infinities, which JSON lacks, by None."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):

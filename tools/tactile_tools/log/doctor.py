@@ -1,4 +1,4 @@
-"""``tactile log doctor``: what is wrong with a log, what can be had of it, and what repairs it."""
+"""``tactile log doctor``: faults of a log, what can be recovered, and how to repair it."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ from tactile_tools.log.terminal import (
 )
 
 PROFILES = ("ros2", "ros1", "")
-"""What MCAP names as profiles; only messages of the first are decoded."""
+"""Profiles that MCAP names; only messages of the first are decoded."""
 
 AT_START = frozenset({"backlog", "discarded_bytes", "unidentified"})
-"""Drops that come with joining a stream under way: in every log, and no fault."""
+"""Drops that come with joining a running stream: they are in every log, and not faults."""
 
 LONGEST = 2000
-"""Letters of a finding shown to people; --json has all."""
+"""Letters of a finding that are printed; --json prints all."""
 
 OUR_LIBRARY = re.compile(r"tactile-reach (\d+(?:\.\d+)*)")
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that is wrong, or (not a ``fault``) only worth knowing. ``remedy``: what helps."""
+    """A fault, or with ``fault`` False something worth knowing. ``remedy``: what to do about it."""
 
     code: str
     fault: bool
@@ -55,7 +55,7 @@ class Finding:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Examine; 0 when no log has a fault, 1 when one has."""
+    """Examine logs. Returns 0 if none has a fault, 1 if one has."""
     rows, sick = [], False
     for number, series in enumerate(find_series(options.files)):
         with progress("examining") as report:
@@ -75,14 +75,14 @@ def run(options: argparse.Namespace) -> int:
 
 
 class _Watch:
-    """Whether messages of every channel can be decoded: is shown the first of each."""
+    """Tries to decode the first message of every channel."""
 
     def __init__(self) -> None:
         self.troubles: dict[str, str] = {}
         self._decoder = Decoder()
 
     def take(self, channel: ChannelRecord, schema: SchemaRecord | None, message: Message) -> None:
-        """Look at a message."""
+        """Try to decode a message; keep the error."""
         stream: Stream = stream_of(channel, schema)
         try:
             self._decoder.decode(stream, message.data)
@@ -91,13 +91,13 @@ class _Watch:
 
 
 def examine(found: LogInfo, series: Series, watch: _Watch) -> list[Finding]:
-    """Everything there is to say, the gravest first."""
+    """Return all findings, faults first."""
     findings = [*_file_findings(found, series), *_content_findings(found, watch)]
     return sorted(findings, key=lambda finding: not finding.fault)
 
 
 def _file_findings(found: LogInfo, series: Series) -> list[Finding]:
-    """What is wrong with the files themselves."""
+    """Findings about the files themselves."""
     out = []
     names = " ".join(shlex.quote(str(path)) for path in series.paths)
     repair = f"tactile log recover {names}"
@@ -143,7 +143,7 @@ def _file_findings(found: LogInfo, series: Series) -> list[Finding]:
 
 
 def _content_findings(found: LogInfo, watch: _Watch) -> list[Finding]:
-    """What is wrong with what the files hold."""
+    """Findings about what the files hold."""
     out = []
     gone = "what was not written cannot be had again"
     if not found.channels:
@@ -229,7 +229,7 @@ def _content_findings(found: LogInfo, watch: _Watch) -> list[Finding]:
 
 
 def _being_written(path: Path) -> bool:
-    """Whether a recorder holds the lock of a file."""
+    """Return whether a recorder holds the lock of a file."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:

@@ -1,4 +1,4 @@
-"""``tactile log export``: the messages of a log as tables for other programs."""
+"""``tactile log export``: write the messages of a log as tables for other programs."""
 
 from __future__ import annotations
 
@@ -38,12 +38,15 @@ FORMATS = ("csv", "parquet", "npz", "lerobot")
 MAX_FILES = 65_536
 
 CONTENTS = "columns.json"
-"""Says what the columns of every file are, with units as the definitions tell them; a folder that
-has it was made by this tool, and may be overwritten with --force."""
+"""File that describes the columns of every table, with units from the definitions. It marks a
+folder as made by this tool, which --force may overwrite."""
 
 
 def run(options: argparse.Namespace) -> int:
-    """Export; 0 when every message was written, 1 when some were lost or could not be decoded."""
+    """Export.
+
+    Returns 0 if every message was written, 1 if some were lost or could not be decoded.
+    """
     if options.format == "lerobot":
         return _lerobot(options)
     if options.format != "npz":
@@ -87,7 +90,7 @@ def _lerobot(options: argparse.Namespace) -> int:
 
 
 def _is_no_raw(left_out: set[str], topic: str) -> bool:
-    """Whether a topic is anything but the bytes of a board, which are noted in ``left_out``."""
+    """Return whether a topic is to be exported; topics of boards' raw bytes go to ``left_out``."""
     found = find_topic(topic)
     if found is None or found[0] != RAW:
         return True
@@ -96,7 +99,7 @@ def _is_no_raw(left_out: set[str], topic: str) -> bool:
 
 
 def _allow_files() -> None:
-    """Have the system let us open as many files as it would: one a topic."""
+    """Raise our limit of open files as far as the system allows: there is one file per topic."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_FILES)
     if soft != resource.RLIM_INFINITY and soft < most:
@@ -118,7 +121,7 @@ def _check_folder(out: Path, force: bool) -> None:
 
 
 class _Export:
-    """Tables by stream; made with the first message of each."""
+    """Tables by stream, each made with the first message of the stream."""
 
     def __init__(self, folder: Path, kind: str, start_ns: int, decoder: Decoder) -> None:
         self.folder = folder
@@ -138,7 +141,7 @@ class _Export:
 
     @property
     def names(self) -> dict[Stream, str]:
-        """Names of the files."""
+        """File names by stream."""
         return self._files.names
 
     def take(self, record: Record) -> None:
@@ -159,13 +162,13 @@ class _Export:
                 each.relieve()
 
     def columns(self, stream: Stream) -> list[Column]:
-        """Columns of a stream."""
+        """Columns of the table of a stream."""
         from tactile_tools.log.columns import plan
 
         return plan(stream, self.decoder.reader(stream))
 
     def close(self) -> None:
-        """Write all that is left, and what the columns are."""
+        """Finish all tables, and write the description of their columns."""
         contents = []
         for stream, table in self.tables.items():
             columns = table.close()
@@ -212,7 +215,7 @@ def _export(chosen: Selection, kind: str, folder: Path) -> _Export:
 
 
 def _measure(chosen: Selection, result: _Export, report: Any) -> None:
-    """How long lists get: CSV needs to know its columns before the first row."""
+    """Find the longest list of each column: CSV needs its columns before the first row."""
     lists: dict[Stream, list[Column]] = {}
     for _, item in read_merged(chosen.logs, Reading(), report, chosen.wanted, chosen.window):
         if not isinstance(item, Record):

@@ -1,4 +1,4 @@
-"""``tactile log info``: what a log holds."""
+"""``tactile log info``: say what a log holds."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from tactile_tools.log.terminal import (
 )
 
 SHOWN = 10
-"""Gaps, silences and damaged places listed for people; --json has them all."""
+"""Gaps, silences and damaged places that are printed; --json prints all."""
 
 TEXT_SHOWN = 400
-"""Letters of a table's text shown to people; --json has all."""
+"""Letters of a text in a table that are printed; --json prints all."""
 
 FEW = 200
-"""Channels up to which they are shown as a table fit to the window; laying one out takes long."""
+"""With more channels than these they are printed without a table: laying one out takes long."""
 
 
 def run(options: argparse.Namespace) -> int:
-    """Show logs; 0 when they could be read, whole or not."""
+    """Print what logs hold. Returns 0 if they could be read, complete or not."""
     rows = []
     for number, series in enumerate(find_series(options.files)):
         quick = _quick(series) if options.quick else None
@@ -92,7 +92,7 @@ def _show(found: LogInfo, series: Series) -> None:
 
 
 def _show_channels(console: Console, found: LogInfo) -> None:
-    """One line a channel; aligned by hand where there are very many."""
+    """Print one line per channel; without alignment where there are very many."""
     rows = [
         (
             shown(channel.topic, TEXT_SHOWN),
@@ -129,7 +129,7 @@ def _show_attachments(console: Console, attached: list[AttachmentInfo], count: i
 
 @dataclass(slots=True)
 class QuickInfo:
-    """What summaries say of a log. ``channels``: topic, type and count of messages of each."""
+    """What the summaries say of a log. ``channels``: topic, type and number of messages of each."""
 
     path: str
     files: int
@@ -143,7 +143,7 @@ class QuickInfo:
 
 
 def _quick(series: Series) -> QuickInfo | None:
-    """What the summaries of a log's files say; None, told, where one does not say it all."""
+    """Read the summaries of a log's files; None, with a note, if one is missing or incomplete."""
     found = QuickInfo(str(series.paths[0]), len(series.paths))
     counts: dict[tuple[str, str], int] = {}
     for path in series.paths:
@@ -206,7 +206,7 @@ def _show_quick(found: QuickInfo, series: Series) -> None:
 
 
 def show_losses(console: Console, found: LogInfo) -> None:
-    """Gaps, silences, drops and damage, each with its place."""
+    """Print gaps, silences, drops and damage, each with its place."""
     for gap in found.gaps[:SHOWN]:
         span = f"{clock_text(gap.first_ns)} for {seconds_text(gap.last_ns - gap.first_ns)}"
         console.print(f"gap: {gap.reason}, {gap.messages} messages, {span} {gap.detail}".rstrip())
@@ -233,7 +233,7 @@ def show_losses(console: Console, found: LogInfo) -> None:
 
 
 def show_damages(console: Console, damages: list[Damage], count: int) -> None:
-    """Damaged places, the first of them one by one."""
+    """Print damaged places, the first ones singly."""
     for damage in damages[:SHOWN]:
         lost = "an unknown number of" if damage.messages is None else str(damage.messages)
         console.print(
@@ -249,7 +249,7 @@ def _more(console: Console, what: str, count: int) -> None:
 
 
 def as_json(found: LogInfo) -> dict[str, Any]:
-    """Everything, for machines."""
+    """Return everything for --json."""
     values = dataclasses.asdict(found)
     values["path"] = str(found.path)
     for channel, row in zip(found.channels, values["channels"], strict=True):

@@ -1,8 +1,8 @@
-"""Logs as a LeRobot data set (format v3.0): one log an episode, all streams on one clock.
+"""Logs as a LeRobot data set (format v3.0): one episode per log, all streams on one clock.
 
-Layout: ``meta/info.json`` (features), ``meta/stats.json``, ``meta/tasks.parquet``,
-``meta/episodes/*/*.parquet``, ``data/*/*.parquet``. A frame holds what was known at its instant:
-the newest message of each stream that had been logged by then, as a policy would have seen it.
+Files: ``meta/info.json`` (features), ``meta/stats.json``, ``meta/tasks.parquet``,
+``meta/episodes/*/*.parquet``, ``data/*/*.parquet``. A frame holds what was known at its time: the
+newest message of each stream that had been logged by then, as a policy would have seen it.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ DEFAULT_TASK: Final = "reach into the cupboard"
 QUANTILES: Final = (0.01, 0.10, 0.50, 0.90, 0.99)
 
 STALE_S: Final = FEATURES.stale_after or 0.2
-"""Age from which touch is marked as not valid."""
+"""Age from which touch is marked as not valid, s."""
 
 CONTACT: Final = (
     "valid", "normal_force", "peak_force", "tip_force", "peak_x", "peak_y",
@@ -81,9 +81,10 @@ _TAKEN: Final = (FEATURES, FORCES, GEOMETRY, ARM_STATE, COMMAND, REACH_STATE)
 
 
 def run(logs: Sequence[Series], out: Path, *, fps: int, task: str, force: bool) -> int:
-    """Export ``logs`` to the folder ``out``; 1 where some messages could not be read.
+    """Export ``logs`` to folder ``out``. Returns 1 if some messages could not be read, else 0.
 
-    ToolError when there is nothing to export, the logs hold different streams, or ``out`` is there.
+    ToolError when there is nothing to export, when the logs hold different streams, or when ``out``
+    exists.
     """
     _check_folder(out, force)
     part = out.with_name(f".{out.name}.{os.getpid()}.part")
@@ -129,7 +130,7 @@ def _check_folder(out: Path, force: bool) -> None:
 
 @dataclass(slots=True)
 class _Episode:
-    """Frames of one log. ``names`` of the elements of each feature; ``rows``: (n, elements)."""
+    """Frames of one log. ``names``: of the elements, by feature. ``rows``: arrays (n, elements)."""
 
     names: dict[str, list[str]]
     rows: dict[str, Float32]
@@ -139,14 +140,14 @@ class _Episode:
 
 @dataclass(slots=True)
 class _Newest:
-    """Newest message of each stream, and when it was logged."""
+    """The newest message of each stream, and when it was logged."""
 
     messages: dict[tuple[Topic, str], Any] = field(default_factory=dict)
     log_ns: dict[tuple[Topic, str], int] = field(default_factory=dict)
 
 
 def _read(series: Series, reading: Reading, fps: int) -> _Episode:
-    """Frames of a log: from when every stream has begun until touch ends."""
+    """Read the frames of a log, from when every stream has begun until touch ends."""
     streams = _streams(series)
     boards = [name for topic, name in streams if topic in (FEATURES, FORCES)]
     if not boards:
@@ -165,7 +166,7 @@ def _read(series: Series, reading: Reading, fps: int) -> _Episode:
                 continue
             if tick_ns is None and all(key in newest.messages for key in needed):
                 tick_ns = item.log_ns
-            # What is logged at a tick itself belongs to the next one, so it is not taken in yet.
+            # What is logged exactly at a tick belongs to the next frame, so it is not taken in yet.
             while tick_ns is not None and found[0] in (FEATURES, FORCES) and tick_ns <= item.log_ns:
                 at_ns = tick_ns + round(number * NS_PER_S / fps)
                 if at_ns > item.log_ns:
@@ -219,7 +220,7 @@ def _streams(series: Series) -> list[tuple[Topic, str]]:
 def _frame(
     streams: Sequence[tuple[Topic, str]], newest: _Newest, at_ns: int
 ) -> dict[str, list[float]]:
-    """What was known at ``at_ns``."""
+    """Elements of each feature as known at ``at_ns``."""
     frame: dict[str, list[float]] = {}
     for key in streams:
         made = _FEATURES.get(key[0])
@@ -247,7 +248,7 @@ def _names(streams: Sequence[tuple[Topic, str]], newest: _Newest) -> dict[str, l
 
 
 def _taxels(forces: Any, geometry: Any) -> Iterator[str]:
-    """``array.taxel.axis`` of each number of a ``TaxelForces``."""
+    """Yield ``array.taxel.axis`` for each number of a ``TaxelForces``."""
     counts = [int(n) for n in forces.array_taxels]
     called = list(getattr(geometry, "array_name", ()))
     for index, count in enumerate(counts):
@@ -282,7 +283,7 @@ def _arm(message: Any, age_s: float) -> list[float]:
 
 def _command(message: Any, age_s: float) -> list[float]:
     if age_s > message.expiry:
-        return [0.0, 0.0, 0.0]  # by then the arm does not follow it any more
+        return [0.0, 0.0, 0.0]  # the command has expired: the arm does not follow it any more
     return [message.twist.linear.x, message.twist.linear.y, message.twist.angular.z]
 
 
@@ -301,7 +302,7 @@ _FEATURES: Final[dict[Topic, tuple[str, Callable[[Any, float], list[float]], tup
 
 
 class _Writer:
-    """The files of a data set; `add` an episode at a time, then `close`."""
+    """Writes a data set: `add` each episode, then `close`."""
 
     def __init__(self, folder: Path, fps: int, task: str) -> None:
         self.episodes = 0
@@ -319,7 +320,7 @@ class _Writer:
         self._stats: list[dict[str, dict[str, NDArray[np.float64]]]] = []
 
     def add(self, name: str, episode: _Episode) -> None:
-        """Write one episode; ToolError when its streams are not those of the others."""
+        """Write one episode; ToolError when its streams differ from those of the others."""
         if not self.names:
             self.names, self._first = episode.names, name
         elif episode.names != self.names:
@@ -356,7 +357,7 @@ class _Writer:
         self.not_finite += episode.not_finite
 
     def close(self) -> None:
-        """Write what describes the data."""
+        """Write the files that describe the data."""
         if self._parquet is not None:
             self._parquet.close()
         meta = self._folder / "meta"
@@ -409,14 +410,14 @@ class _Writer:
 
 
 def _arrow(values: NDArray[Any]) -> pa.Array:
-    """A column: numbers, or lists of fixed length."""
+    """Make a column: numbers, or lists of fixed length."""
     if values.ndim == 1:
         return pa.array(values)
     return pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
 
 
 def _tasks(task: str) -> pa.Table:
-    """Tasks as pandas writes a frame that has them for its index."""
+    """Make the table of tasks, as pandas writes a frame indexed by task."""
     index = "__index_level_0__"
     table = pa.table({"task_index": pa.array([0], pa.int64()), index: pa.array([task])})
     about = {
@@ -433,7 +434,7 @@ def _tasks(task: str) -> pa.Table:
 
 
 def _statistics(values: NDArray[Any]) -> dict[str, NDArray[np.float64]]:
-    """Of one episode, by element: (elements,) each, ``count`` (1,)."""
+    """Statistics of one episode by element: arrays (elements,), and ``count`` (1,)."""
     table = values.reshape(len(values), -1).astype(np.float64)
     found = {
         "min": table.min(axis=0),
@@ -450,7 +451,7 @@ def _statistics(values: NDArray[Any]) -> dict[str, NDArray[np.float64]]:
 def _together(
     stats: Sequence[dict[str, NDArray[np.float64]]],
 ) -> dict[str, NDArray[np.float64]]:
-    """Of several episodes; quantiles are means of theirs, weighted by length, as LeRobot has it."""
+    """Combine the statistics of episodes. Quantiles are averaged by length, as LeRobot does it."""
     weight = np.array([s["count"][0] for s in stats], np.float64)
     weight /= weight.sum()
     means = np.array([s["mean"] for s in stats])
@@ -472,7 +473,7 @@ def _together(
 def _difference(
     first: str, has: dict[str, list[str]], second: str, other: dict[str, list[str]]
 ) -> str:
-    """Why two logs cannot be episodes of one data set."""
+    """Say why two logs cannot be episodes of one data set."""
     for key in sorted({*has, *other}):
         ours, theirs = has.get(key, []), other.get(key, [])
         if ours != theirs:

@@ -1,4 +1,4 @@
-"""``tactile log merge``: several logs into one, in the order of time."""
+"""``tactile log merge``: merge several logs into one, in the order of time."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from tactile_tools.log.terminal import ToolError, complain, plain_console
 from tactile_tools.log.writing import LogOutput
 
 COPY_WITHIN_NS = 10 * NS_PER_S
-"""By how much the log times of a message and its copy may differ: what one daemon heard of another
-it logs within milliseconds, a busy one within seconds."""
+"""Greatest difference between the log times of a message and its copy. A daemon logs what another
+one says within milliseconds, a busy one within seconds."""
 
 REMEMBERED = 200_000
-"""Messages in which a copy is looked for, if there are as many within that time."""
+"""Greatest number of messages among which a copy is looked for."""
 
 SHOWN = 20
-"""Topics of which the copies are told; the rest in one sum."""
+"""Topics whose copies are reported one by one; the rest are reported as a sum."""
 
 CLOCKS_APART_NS = NS_PER_S // 20
 
@@ -47,7 +47,7 @@ SOFTWARE, OFFSET = "software", "clock_offset_ns"
 
 
 def run(options: argparse.Namespace) -> int:
-    """Merge; 0 when the new log was written."""
+    """Merge logs. Returns 0 if the new log was written."""
     logs = find_series(options.files)
     check_output(options.out, options.force, logs)
     shifts = _shifts(logs, options.align)
@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
 
 @dataclass(slots=True)
 class Survey:
-    """What a first pass finds of a log. ``counted``: streams whose messages have numbers."""
+    """Findings of the first pass over a log. ``counted``: streams whose messages are numbered."""
 
     streams: dict[Stream, Stream] = field(default_factory=dict)
     counted: set[Stream] = field(default_factory=set)
@@ -111,7 +111,7 @@ def _merged(
     progress: Any,
     folder: Path,
 ) -> Iterator[tuple[int, Item]]:
-    """Everything of the logs with the number of the log, messages in the order of time."""
+    """Yield everything in the logs with the index of the log, messages in the order of time."""
     total = sum(series.size for series in logs)
     done = [0] * len(logs)
 
@@ -139,7 +139,7 @@ def _merged(
 
 
 def _shifts(logs: list[Series], align: bool) -> list[int]:
-    """ns to add to the times of each log, so that the same moment has the same time in all."""
+    """Nanoseconds to add to the times of each log, so that all logs share one clock."""
     offsets: list[int | None] = []
     for series in logs:
         found: int | None = None
@@ -166,21 +166,24 @@ def _shifts(logs: list[Series], align: bool) -> list[int]:
 
 
 class Copies:
-    """Tells messages that another log had already, of the streams that several have.
+    """Recognises messages that another log has already written, in streams that several logs share.
 
-    A copy has the same bytes and the same stamp of its sender, and was logged about as late. Where
-    the sender's stamp is not known (0), it must have the same log time. What one log has twice is
-    no copy. ``copies``: how many there were, by topic.
+    A copy has the same bytes and the same stamp of its sender, and was logged at about the same
+    time. Where the sender's stamp is unknown (0), the log time must be the same. What one log holds
+    twice is not a copy. ``copies``: number of copies by topic.
     """
 
     def __init__(self, shared: set[Stream]) -> None:
         self.copies: Counter[str] = Counter()
         self._shared = shared
-        self._seen: dict[tuple[Stream, bytes], list[int]] = {}  # how often in the result, each log
+        self._seen: dict[tuple[Stream, bytes], list[int]] = {}  # number written, then by log
         self._order: deque[tuple[int, tuple[Stream, bytes]]] = deque()
 
     def is_copy(self, number: int, record: Record, shift: int = 0) -> bool:
-        """Whether log ``number``, whose times were moved by ``shift``, repeats another; counted."""
+        """Return whether a message of log ``number`` repeats one of another log, and count it.
+
+        ``shift``: ns that were added to the times of this log.
+        """
         stream = record.stream
         if stream not in self._shared:
             return False
@@ -203,16 +206,16 @@ class Copies:
         return False
 
     def _forget(self, now_ns: int) -> None:
-        """Drop what is too long ago to be met again."""
+        """Drop messages that are too old to be repeated."""
         order = self._order
         while order and (order[0][0] < now_ns - COPY_WITHIN_NS or len(order) > REMEMBERED):
             del self._seen[order.popleft()[1]]
 
 
 class Tables:
-    """Metadata and attachments of several logs in one: told apart by the log where they differ.
+    """Metadata and attachments of several logs: those that differ get the name of their log.
 
-    What a log has twice stays twice; what another has just so is not added.
+    What one log holds twice stays twice; what another log holds in the same form is not added.
     """
 
     def __init__(self, logs: list[Series], output: LogOutput) -> None:
@@ -222,7 +225,7 @@ class Tables:
         self._counts: dict[tuple[str, bytes], list[int]] = {}
 
     def take(self, number: int, item: MetadataRecord | Attachment) -> None:
-        """Write one over, unless another log had it."""
+        """Copy an item to the output, unless another log had it."""
         if isinstance(item, MetadataRecord):
             if item.name == FILE:
                 return
@@ -248,7 +251,7 @@ class Tables:
         return True
 
     def _is_own(self, number: int, item: MetadataRecord | Attachment) -> bool:
-        """Whether no other log had a table or an attachment of that name first."""
+        """Return whether this log is the first to have an item of that name."""
         return self._owners.setdefault((type(item), item.name), number) == number
 
     def _stem(self, number: int) -> str:

@@ -1,5 +1,8 @@
-"""NumPy archives of messages. Columns grow in files of their own and are packed at the end, so that
-memory does not depend on how long a log is."""
+"""NumPy archives of messages.
+
+Columns grow in files of their own and are packed at the end, so that memory does not depend on the
+length of a log.
+"""
 
 from __future__ import annotations
 
@@ -20,13 +23,13 @@ from tactile_tools.log.stream import Record
 from tactile_tools.log.tables import NOTES, OWN, Budget
 
 MAX_TEXT_BYTES = 256 << 20
-"""Bytes of a column of texts as NumPy keeps them, all as long as the longest; beyond that they
-are kept as UTF-8 with offsets."""
+"""Largest column of texts in NumPy's own form, in which all are as long as the longest, bytes.
+Larger ones are kept as UTF-8 with offsets."""
 
 PIECE = 1 << 20
 
 HELD = 1 << 16
-"""Bytes of a column that wait in memory."""
+"""Bytes of a column that are held in memory."""
 
 
 class _Growing:
@@ -46,14 +49,14 @@ class _Growing:
         self.add_bytes(data.tobytes())
 
     def add_bytes(self, data: bytes) -> None:
-        """Append the bytes of numbers that are counted elsewhere."""
+        """Append bytes; `add` of another array keeps their lengths."""
         self._held += data
         self._budget.held += len(data)
         if len(self._held) >= HELD:
             self.flush()
 
     def flush(self) -> None:
-        """Have the file hold everything."""
+        """Write all held bytes to the file."""
         with self.path.open("ab") as file:
             file.write(self._held)
         self._budget.held -= len(self._held)
@@ -61,7 +64,10 @@ class _Growing:
 
 
 class NpzTable:
-    """One archive. Lists of one length make a matrix; others stand flat beside their offsets."""
+    """One archive.
+
+    Lists of equal length make a matrix; others are stored flat beside their offsets.
+    """
 
     def __init__(
         self, path: Path, columns: list[Column], start_ns: int, scratch: Path, budget: Budget
@@ -74,12 +80,12 @@ class NpzTable:
         self._budget = budget
         scratch.mkdir()
         self._growing: dict[str, _Growing] = {}
-        self._lengths: dict[str, tuple[int, bool]] = {}  # of the first list, and whether all agree
+        self._lengths: dict[str, tuple[int, bool]] = {}  # of the first list; whether all agree
         self._longest: dict[str, int] = {}
         self._notes: dict[str, str] = dict(NOTES)
 
     def add(self, record: Record, message: Any) -> None:
-        """One more row."""
+        """Add a row."""
         self.rows += 1
         self._numbers(OWN[0], np.float64, (record.log_ns - self._start_ns) / 1e9)
         for name, value in zip(OWN[1:3], (record.log_ns, record.publish_ns), strict=True):
@@ -89,12 +95,12 @@ class NpzTable:
             self._add(column, column.name, message)
 
     def relieve(self) -> None:
-        """Write what waits in memory."""
+        """Write all held rows to the files."""
         for growing in self._growing.values():
             growing.flush()
 
     def close(self) -> list[dict[str, str]]:
-        """Pack the archive; returns what its arrays are."""
+        """Pack the archive. Returns a description of its arrays."""
         self.relieve()
         told = []
         with zipfile.ZipFile(

@@ -1,8 +1,7 @@
-"""Messages of a log in the order of time, however far back its times go. Bounded memory.
+"""Sort the messages of a log by time, however far back its times go, in bounded memory.
 
-A first pass notes how early the messages after each stretch of the log still are. In the second a
-message is handed out as soon as none can come that is earlier; those that wait go to a file when
-they become too many.
+The first pass notes the earliest time after each stretch of the log. In the second pass a message
+is handed out once no earlier one can follow; when too many wait, they go to a file.
 """
 
 from __future__ import annotations
@@ -19,32 +18,35 @@ from tactile_tools.log.stream import Item, Record, Stream
 
 STRETCH_MESSAGES = 256
 STRETCH_BYTES = 1 << 20
-"""A stretch of a log ends after so many messages or bytes."""
+"""A stretch of a log ends after this many messages or bytes."""
 
 HELD_BYTES = 16 << 20
-"""Bytes of messages that wait in memory; beyond that they go to a file."""
+"""Bytes of waiting messages held in memory; more go to a file."""
 
 MAX_RUNS = 32
-"""Such files, each of messages in order; when there are more they are made one."""
+"""Greatest number of such files, each sorted; when there are more they are merged into one."""
 
 OVERHEAD = 200
-"""Bytes that a message takes in memory beside its own."""
+"""Bytes that a message takes in memory besides its own."""
 
-HEAD = struct.Struct("<QQQIII")  # log and publish time, count, stream, sequence, size
+HEAD = struct.Struct("<QQQIII")  # log time, publish time, count, stream, sequence, size
 
 
 class Stretches:
-    """Cuts a log into stretches, in both passes alike; `low` is what the first one finds."""
+    """Divides a log into stretches, the same way in both passes; the first pass fills `low`.
+
+    ``low``: for each stretch, the earliest log time after it, ns.
+    """
 
     def __init__(self) -> None:
         self.low: array[int] = array("Q")
         self.first_ns = 0
-        """Log time of the earliest message of all, once the first pass is over; 0 for none."""
+        """Earliest log time of all, ns, once the first pass is over; 0 if there are no messages."""
         self._messages = self._bytes = 0
         self._least = (1 << 64) - 1
 
     def ends(self, record: Record) -> bool:
-        """Take a message; whether a stretch ends with it."""
+        """Count a message; return whether a stretch ends with it."""
         self._messages += 1
         self._bytes += len(record.data)
         if self._messages < STRETCH_MESSAGES and self._bytes < STRETCH_BYTES:
@@ -53,14 +55,14 @@ class Stretches:
         return True
 
     def survey(self, record: Record) -> None:
-        """Take a message in the first pass."""
+        """Take a message of the first pass."""
         self._least = min(self._least, record.log_ns)
         if self.ends(record):
             self.low.append(self._least)
             self._least = (1 << 64) - 1
 
     def finish(self) -> None:
-        """End the first pass: from each stretch on, how early the messages after it are."""
+        """End the first pass: turn the minima of stretches into minima of all that follows."""
         least, low = self._least, self.low
         for k in range(len(low) - 1, -1, -1):
             low[k], least = least, min(least, low[k])
@@ -69,7 +71,7 @@ class Stretches:
 
 
 class _Waiting(NamedTuple):
-    """A message that waits; ``run``: the file it came from, whose next one takes its place."""
+    """A waiting message. ``run``: number of the file that it came from, or -1."""
 
     log_ns: int
     number: int
@@ -78,7 +80,7 @@ class _Waiting(NamedTuple):
 
 
 class InOrder:
-    """Sorts one log. ``folder``: where files of waiting messages go."""
+    """Sorts one log. ``folder``: where files of waiting messages are made."""
 
     def __init__(self, stretches: Stretches, folder: Path) -> None:
         self._stretches = stretches
@@ -91,7 +93,7 @@ class InOrder:
         self._made = 0
 
     def sort(self, items: Iterable[Item]) -> Iterator[Item]:
-        """The same items, messages in the order of time; others as soon as they come."""
+        """Yield the items, messages sorted by time, others as soon as they come."""
         count = stretch = 0
         for item in items:
             if not isinstance(item, Record):
@@ -126,7 +128,7 @@ class InOrder:
             yield first.record
 
     def _spill(self) -> None:
-        """Put what waits in memory into a file, in order; the heap keeps the first of each file."""
+        """Move waiting messages to a sorted file; the heap keeps the first message of each file."""
         mine = sorted(waiting for waiting in self._heap if waiting.run < 0)
         self._heap = [waiting for waiting in self._heap if waiting.run >= 0]
         self._held = 0

@@ -1,4 +1,4 @@
-"""``tactile log recover``: a whole log out of one that was cut off or damaged."""
+"""``tactile log recover``: make a complete log of one that was cut off or damaged."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tactile_tools.log.terminal import (
 
 
 def run(options: argparse.Namespace) -> int:
-    """Recover logs; 0 when each was written."""
+    """Recover logs. Returns 0 if each was written."""
     sources = [path for series in find_series(options.files) for path in series.paths]
     if options.out is not None and len(sources) > 1:
         raise ToolError(f"--out names one file, but {len(sources)} are to be recovered")

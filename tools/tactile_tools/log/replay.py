@@ -1,4 +1,4 @@
-"""``tactile log replay``: a log on the bus again, under keys of its own."""
+"""``tactile log replay``: publish a log on the bus again, under keys of its own."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ if TYPE_CHECKING:
     from tactile_core.bus.streams import Publisher
 
 PREFIX = "replay"
-"""First part of every key: nobody who controls anything listens there."""
+"""First part of every key; nothing that controls an arm listens there."""
 
 LATE_NS = NS_PER_S // 10
-"""So much behind, a replay is told to be late at the end."""
+"""A replay that was later than this is reported at the end."""
 
 SETTLE = 0.3
-"""s for links to others to come about before the first message."""
+"""Time for links to others to come about before the first message, s."""
 
 
 def run(options: argparse.Namespace) -> int:
-    """Replay; 0 at the end, or when it was stopped by a signal."""
+    """Replay. Returns 0 at the end, or when a signal stopped it."""
     from tactile_core.bus.session import BusError, close_session, open_session
 
     chosen = select(options)
@@ -79,7 +79,7 @@ def _tell(player: Player, rounds: int, *, stopped: bool) -> None:
 
 @contextmanager
 def _stopped_by_signals(stopping: threading.Event) -> Iterator[None]:
-    """Have Ctrl-C and SIGTERM end the replay in order; a second one ends it at once."""
+    """Let Ctrl-C and SIGTERM end the replay in order; a second one ends it at once."""
 
     def stop(number: int, _: FrameType | None) -> None:
         stopping.set()
@@ -97,7 +97,7 @@ def _stopped_by_signals(stopping: threading.Event) -> Iterator[None]:
 
 
 class Player:
-    """Publishes messages when they are due. ``worst_ns``: latest that any of them was."""
+    """Publishes messages when they are due. ``worst_ns``: greatest delay of a message."""
 
     def __init__(
         self,
@@ -120,7 +120,7 @@ class Player:
         self._streams: dict[Stream, Publisher | None] = {}
 
     def play(self, report: Any) -> None:
-        """Once through."""
+        """Play the log once."""
         self.reading = Reading()
         chosen = self._chosen
         first: int | None = None
@@ -148,7 +148,7 @@ class Player:
                 self.refused[item.stream.topic] = str(error)
 
     def close(self) -> None:
-        """Take the streams back."""
+        """Close the publishers."""
         for publisher in self._publishers.values():
             publisher.close()
 

@@ -1,4 +1,4 @@
-"""``tactile log reprocess``: the pipeline again over the raw bytes of a log."""
+"""``tactile log reprocess``: run the pipeline again on the raw bytes of a log."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tactile_tools.log.stream import read_series
 from tactile_tools.log.terminal import ToolError, plain_console
 from tactile_tools.log.writing import LogOutput
 
-if TYPE_CHECKING:  # the daemon's rooms take a while to import: only where they are needed
+if TYPE_CHECKING:  # the daemon's modules take a while to import, so they are imported where needed
     from tactile_core.calibration import BoardCalibration
     from tactile_tools.log.reprocessing import Known, Reprocessing
     from tactiled.sensing.settings import PipelineSettings
@@ -24,7 +24,10 @@ METHODS = ("off", "ransac", "consensus")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Reprocess; 0 when the new log was written, 1 when nothing could be made of the raw bytes."""
+    """Reprocess.
+
+    Returns 0 if the new log was written, 1 if nothing came of the raw bytes.
+    """
     from tactile_tools.log.reprocessing import Reprocessing, survey
     from tactiled.rerun import RecordedError
 
@@ -35,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
     source = series.paths[0]
     out = options.out or source.with_name(f"{source.stem}_reprocessed.mcap")
     check_output(out, options.force, logs)
-    logging.disable(logging.INFO)  # what the boards said is in the log already
+    logging.disable(logging.INFO)  # the messages of the boards are in the log already
     with progress("looking through") as report:
         known = survey(series, report)
     given = [_load(path) for path in options.calibration or ()]
@@ -65,7 +68,7 @@ def _load(path: Path) -> BoardCalibration:
 
 
 def _check_serials(given: list[BoardCalibration], known: Known, series: Series) -> None:
-    """Refuse a calibration of a board that is not in the log."""
+    """ToolError for a calibration of a board that is not in the log."""
     for calibration in given:
         if known.serials and calibration.serial_number not in known.serials:
             raise ToolError(
@@ -75,7 +78,7 @@ def _check_serials(given: list[BoardCalibration], known: Known, series: Series) 
 
 
 def _settings(options: argparse.Namespace, known: Known) -> PipelineSettings:
-    """Those of the log, but for what was given."""
+    """Settings of the log, with those that were given in their place."""
     from tactile_core.config import ConfigError, load_toml
     from tactiled.settings import ConfigFile, pipeline_settings
 

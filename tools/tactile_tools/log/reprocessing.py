@@ -1,4 +1,4 @@
-"""What ``tactile log reprocess`` does: a log's raw bytes through the daemon's own pipelines."""
+"""Run a log's raw bytes through the daemon's own pipelines, for ``tactile log reprocess``."""
 
 from __future__ import annotations
 
@@ -47,32 +47,32 @@ from tactiled.sensing.settings import PipelineSettings
 from tactiled.transports.recorded_log import from_raw
 
 MADE = (FEATURES, FORCES, FIELD, AMBIENT, CONTACTS, GEOMETRY)
-"""Topics that are made anew; all others are carried over as they are."""
+"""Topics that are computed anew; all others are copied."""
 
 COMPARED = (FEATURES, FORCES, FIELD, AMBIENT, CONTACTS)
-"""Of these it is told how many came out the same; a geometry is stamped when it is sent."""
+"""Topics whose messages are compared with the old ones; a geometry is stamped when it is sent."""
 
 PENDING = 65_536
-"""Messages of a topic of which old and new wait for one another: ten minutes of one board."""
+"""Old and new messages of a topic that wait for their counterparts: ten minutes of one board."""
 
 
 @dataclass(slots=True)
 class Known:
-    """What a first pass over a log finds. ``versions``: calibrations by hash, oldest first."""
+    """Findings of the first pass over a log. ``versions``: calibrations by hash, oldest first."""
 
     ports: dict[str, RecordedPort] = field(default_factory=dict)
     settings: PipelineSettings = field(default_factory=PipelineSettings)
     has_settings: bool = False
     versions: dict[str, BoardCalibration] = field(default_factory=dict)
-    first: dict[str, BoardCalibration] = field(default_factory=dict)  # by name of the board
-    states: dict[str, RecordedState] = field(default_factory=dict)  # by name of the board
+    first: dict[str, BoardCalibration] = field(default_factory=dict)  # by board name
+    states: dict[str, RecordedState] = field(default_factory=dict)  # by board name
     serials: set[str] = field(default_factory=set)
     raw: set[str] = field(default_factory=set)
     journals: set[str] = field(default_factory=set)
 
 
 def survey(series: Series, report: Progress | None = None) -> Known:
-    """Settings, ports and calibrations of a log; ToolError when there are no raw bytes in it."""
+    """Read settings, ports and calibrations of a log; ToolError when it has no raw bytes."""
     known, reading = Known(), Reading()
     try:
         for item in read_series(series, reading, report, lambda _: False):
@@ -112,7 +112,7 @@ def survey(series: Series, report: Progress | None = None) -> Known:
 
 
 class Sink:
-    """What the pipelines say, straight into the new log, on the time of the old one."""
+    """Receives what the pipelines publish and writes it to the new log, on the old log's time."""
 
     def __init__(self) -> None:
         self.wall = WallClock(0)
@@ -125,15 +125,15 @@ class Sink:
         self._streams: dict[tuple[Topic, str], Stream] = {}
 
     def set(self, now: Instant) -> None:
-        """It is ``now``."""
+        """Set the present time of the rerun."""
         self._now = now
 
     def now(self) -> Instant:
-        """Instant of what is being worked off."""
+        """Present time of the rerun."""
         return self._now
 
     def send(self, topic: Topic, name: str, message: Any, stamp_ns: int) -> None:
-        """Into the new log."""
+        """Write a message to the new log."""
         if self.output is None or topic not in MADE:
             return
         data = codec().encode(topic, message)
@@ -149,7 +149,7 @@ class Sink:
             self.compare.new(stream.topic, data)
 
     def announce(self, name: str, level: int, text: str, at: Instant | None = None) -> None:
-        """Keep warnings, for people."""
+        """Keep warnings for the user."""
         del at
         if level >= logging.WARNING:
             self.warnings[f"{name}: {text}"] = None
@@ -157,7 +157,7 @@ class Sink:
     def firmware_text(
         self, name: str, level: int, speaker: str, text: str, at: Instant | None = None
     ) -> None:
-        """It is in the log already."""
+        """Ignored: the text is in the log already."""
 
 
 def _stream(topic: Topic, name: str) -> Stream:
@@ -168,7 +168,10 @@ def _stream(topic: Topic, name: str) -> Stream:
 
 
 class Comparison:
-    """How many messages of the old log came out the same to the bit, by topic. Bounded memory."""
+    """Counts, by topic, the messages of the old log that came out bit for bit the same.
+
+    Memory is bounded.
+    """
 
     def __init__(self) -> None:
         self.same: dict[str, int] = {}
@@ -177,12 +180,12 @@ class Comparison:
         self._waiting: dict[tuple[str, bool], OrderedDict[bytes, None]] = {}
 
     def old(self, topic: str, data: bytes) -> None:
-        """A message of the old log."""
+        """Take a message of the old log."""
         self.before[topic] = self.before.get(topic, 0) + 1
         self._meet(topic, data, True)
 
     def new(self, topic: str, data: bytes) -> None:
-        """A message of the new one."""
+        """Take a message of the new log."""
         self.after[topic] = self.after.get(topic, 0) + 1
         self._meet(topic, data, False)
 
@@ -200,7 +203,7 @@ class Comparison:
 
 
 class Reprocessing:
-    """One pass: raw bytes through the pipelines, the rest carried over."""
+    """The second pass: raw bytes go through the pipelines, everything else is copied."""
 
     def __init__(
         self, known: Known, settings: PipelineSettings, given: list[BoardCalibration]
@@ -236,7 +239,7 @@ class Reprocessing:
         self._topics: dict[Stream, tuple[Topic, str] | None] = {}
 
     def take(self, item: Record | MetadataRecord | Attachment, output: LogOutput) -> None:
-        """Work off one item of the old log."""
+        """Process one item of the old log."""
         self.sink.output = output
         if isinstance(item, MetadataRecord):
             self._metadata(item, output)
@@ -247,7 +250,7 @@ class Reprocessing:
             self._record(item, output)
 
     def finish(self, output: LogOutput) -> None:
-        """Work off what is held back, and keep the calibrations that were used."""
+        """Process what is held back, and attach the given calibrations that were used."""
         for rerun in self.reruns.values():
             rerun.end()
             for station in rerun.stations:
@@ -259,7 +262,7 @@ class Reprocessing:
                     output.attach(Attachment.of(name, "application/toml", now, now, data))
 
     def check(self, series: Series) -> None:
-        """`ToolError`, exit code 1, when nothing came of the raw bytes of a port."""
+        """`ToolError` with exit status 1 when the raw bytes of a port yielded nothing."""
         for name, rerun in self.reruns.items():
             boards = {
                 found[1]
@@ -276,7 +279,7 @@ class Reprocessing:
                 )
 
     def summary(self, series: Series, given: list[BoardCalibration]) -> dict[str, str]:
-        """What the new log says of how it was made."""
+        """Table of the new log that says how it was made."""
         return {
             "source": ", ".join(path.name for path in series.paths),
             "calibrations": ", ".join(c.hash for c in given),
@@ -285,7 +288,7 @@ class Reprocessing:
 
     @property
     def exact(self) -> bool:
-        """Whether the journal told all there is to know."""
+        """Whether the journals were complete, so that the timing is as recorded."""
         return all(rerun.exact for rerun in self.reruns.values())
 
     def _is_replaced(self, item: Attachment) -> bool:
@@ -314,11 +317,11 @@ class Reprocessing:
             self._feed(found[0], found[1], item)
 
     def _is_of_ours(self, board: str) -> bool:
-        """Whether a board's messages will be made anew."""
+        """Return whether the messages of a board are computed anew."""
         return any(self._belongs(board, name) for name in self.reruns)
 
     def _belongs(self, board: str, name: str) -> bool:
-        """Whether a board is one of port ``name``: on a bus its name has a number behind."""
+        """Return whether a board is at port ``name``; on a bus a number follows the port's name."""
         nodes = self._known.ports.get(name, RecordedPort(name)).nodes or {}
         return board == name or board.startswith(f"{name}-") or board in nodes.values()
 

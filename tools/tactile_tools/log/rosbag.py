@@ -1,4 +1,4 @@
-"""``tactile log rosbag``: what ``ros2 bag`` wants beside the files: ``metadata.yaml``."""
+"""``tactile log rosbag``: write the ``metadata.yaml`` that ``ros2 bag`` wants beside the files."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from tactile_tools.log.terminal import (
 METADATA = "metadata.yaml"
 
 VERSION = 5
-"""Of the file: the newest whose fields every ROS 2 since Galactic reads the same way."""
+"""Version of the file: the newest whose fields every ROS 2 since Galactic reads the same way."""
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write; 0 when the folder can be taken by ros2 bag."""
+    """Write the folder. Returns 0 if ros2 bag can read it."""
     logs = find_series(options.files)
     if len(logs) != 1:
         raise ToolError(f"{len(logs)} logs given: a bag is one; merge them first")
@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _bring(series: Series, folder: Path) -> list[Path]:
-    """The files of a log in a new folder, all of them whole."""
+    """Put the files of a log into a new folder, each of them complete."""
     paths = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -104,7 +104,7 @@ def _bring(series: Series, folder: Path) -> list[Path]:
 
 
 def _check_stamps(path: Path, found: LogInfo) -> None:
-    """Refuse times that ROS 2 has no numbers for."""
+    """ToolError for times that ROS 2 cannot represent."""
     beyond = [channel for channel in found.channels if channel.impossible]
     if beyond:
         raise ToolError(
@@ -122,21 +122,21 @@ def _link(path: Path, target: Path) -> None:
 
 @dataclass(slots=True)
 class _Bag:
-    """What the metadata tell: of each file name, start and end; of each topic type and count."""
+    """Contents of the metadata: files with start and end, topics with type and count."""
 
     files: list[tuple[str, int, int, int]] = field(default_factory=list)
     topics: dict[tuple[str, str], int] = field(default_factory=dict)
     encodings: dict[tuple[str, str], str] = field(default_factory=dict)
     qos: dict[tuple[str, str], str] = field(default_factory=dict)
-    unsaid: dict[str, None] = field(default_factory=dict)  # latched topics whose file says nothing
+    unsaid: dict[str, None] = field(default_factory=dict)  # latched topics not described as such
 
     @property
     def messages(self) -> int:
-        """Of all files."""
+        """Number of messages in all files."""
         return sum(count for *_, count in self.files)
 
     def add(self, path: Path, found: LogInfo, streams: Iterable[Stream]) -> None:
-        """Take one file, which has ``streams``."""
+        """Add one file, which has ``streams``."""
         start, end = found.span_ns or (0, 0)
         self.files.append((path.name, start, end, found.messages))
         for channel in found.channels:
@@ -147,13 +147,14 @@ class _Bag:
             self.encodings[key] = stream.encoding
             qos = _qos(stream.topic, stream.metadata)
             if qos and not dict(stream.metadata).get(QOS):
-                # Readers that compare the two would pass over a topic that differs here alone.
+                # Readers that compare file and metadata would skip a topic whose QoS differed here
+                # alone.
                 self.unsaid[stream.topic] = None
                 qos = ""
             self.qos[key] = self.qos.get(key) or qos
 
     def yaml(self) -> str:
-        """Text of ``metadata.yaml``; texts are quoted as JSON, which YAML takes."""
+        """Return the text of ``metadata.yaml``; texts are quoted as in JSON, which YAML accepts."""
         full = [file for file in self.files if file[3]] or self.files
         start, end = min(file[1] for file in full), max(file[2] for file in full)
         lines = [
@@ -188,7 +189,7 @@ class _Bag:
 
 
 NAMED = ("history", "reliability", "durability", "liveliness")
-"""Policies that were numbers once and have names since ROS 2 Jazzy."""
+"""Policies that were numbers before ROS 2 Jazzy and are names since."""
 
 DEFAULT: Any = {
     "history": "keep_last",
@@ -201,11 +202,11 @@ DEFAULT: Any = {
     "liveliness_lease_duration": {"sec": 0, "nsec": 0},
     "avoid_ros_namespace_conventions": False,
 }
-"""What holds where a profile does not say it: ROS 2's default."""
+"""Defaults of ROS 2, for what a profile leaves out."""
 
 
 def _with_qos(channel: ChannelRecord) -> dict[str, str]:
-    """Metadata of a channel with the QoS that stands beside the files: readers compare the two."""
+    """Metadata of a channel with the QoS of ``metadata.yaml``: readers compare the two."""
     qos = _qos(channel.topic, channel.metadata.items())
     if not qos and QOS not in channel.metadata:
         return channel.metadata
@@ -213,7 +214,7 @@ def _with_qos(channel: ChannelRecord) -> dict[str, str]:
 
 
 def _qos(topic: str, pairs: Iterable[tuple[str, str]]) -> str:
-    """QoS of a topic's publishers, as version 5 has it: YAML within a text, numbers for names."""
+    """QoS of a topic's publishers as in version 5: YAML within a text, numbers for names."""
     metadata = dict(pairs)
     text = metadata.get(QOS, "")
     try:
@@ -221,16 +222,16 @@ def _qos(topic: str, pairs: Iterable[tuple[str, str]]) -> str:
         profiles = parse_qos([DEFAULT | each for each in recorded])
         numbers = all(isinstance(each.get(key), int) for each in recorded for key in NAMED)
         if recorded and numbers and all(each.keys() >= DEFAULT.keys() for each in recorded):
-            return text  # just so
+            return text  # unchanged
     except (ReaderError, YAMLError, LookupError, TypeError, ValueError, AttributeError):
-        profiles = []  # what nobody can read ros2 bag cannot either, and would not play
+        profiles = []  # ros2 bag could not read it either, and would not play the topic
     if not profiles and is_latched(topic, metadata):
         return LATCHED_QOS
     return dump_qos_v8(profiles) if profiles else ""
 
 
 def _streams(path: Path) -> list[Stream]:
-    """All streams of a file, which need not all be in its summary."""
+    """All streams of a file; its summary need not name all of them."""
     reading = Reading()
     for _ in read_series(Series((path,)), reading, None, lambda _: False):
         pass

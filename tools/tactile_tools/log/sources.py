@@ -1,4 +1,4 @@
-"""Which files the user means: files, folders, or a log cut into several by the name they share."""
+"""Find the logs that the user means: files, folders, or the name that files of one log share."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FILE = "file"
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """Files of one log, in their order. ``identity``: of the set, empty where none is told."""
+    """Files of one log, in order. ``identity``: of the set, empty if unknown."""
 
     paths: tuple[Path, ...]
     identity: str = ""
@@ -25,13 +25,13 @@ class Series:
 
     @property
     def name(self) -> str:
-        """As people call it."""
+        """Name of the log for the user."""
         more = f" and {len(self.paths) - 1} more" if len(self.paths) > 1 else ""
         return f"{self.paths[0]}{more}"
 
     @property
     def size(self) -> int:
-        """Bytes of all files."""
+        """Size of all files, bytes."""
         return sum(path.stat().st_size for path in self.paths)
 
 
@@ -43,9 +43,9 @@ class _Place:
 
 
 def find_series(given: Sequence[Path]) -> list[Series]:
-    """Logs that the arguments name; files of one log are put together in their order.
+    """Find the logs that the arguments name; files of one log are put together in order.
 
-    `ToolError` for a folder without logs, `LogError` for a file that is none.
+    `ToolError` for a folder without logs, `LogError` for a file that is not a log.
     """
     places: list[_Place] = []
     for argument in given:
@@ -65,7 +65,7 @@ def find_series(given: Sequence[Path]) -> list[Series]:
         seen.add(real)
         mates = sets.setdefault(place.identity, [])
         if not place.identity or any(mate.number == place.number for mate in mates):
-            # Nothing tells what it belongs to, or it is another copy, as one that was recovered.
+            # The set is unknown, or this is another copy, such as a recovered one.
             alone.append(Series((place.path,), place.identity, place.number))
         else:
             mates.append(place)
@@ -79,7 +79,7 @@ def find_series(given: Sequence[Path]) -> list[Series]:
 
 
 def given_order(given: Sequence[Path], series: Series) -> tuple[int, str]:
-    """Sorts logs as their arguments were given, those of one argument by name."""
+    """Sort key of logs: the order of the arguments, then the names."""
     path = series.paths[0]
     for index, argument in enumerate(given):
         if path == argument or path.parent == argument:
@@ -104,7 +104,7 @@ def _folder(folder: Path) -> list[_Place]:
 
 
 def _by_name(argument: Path) -> list[Path]:
-    """Files of the log called ``argument``, which is no file itself."""
+    """Files of the log called ``argument``, which is not a file itself."""
     stem = argument.name.removesuffix(".mcap")
     pattern = re.compile(re.escape(stem) + r"(_\d{4,})?\.mcap")
     try:
@@ -120,7 +120,7 @@ def _by_name(argument: Path) -> list[Path]:
 
 
 def _place(path: Path) -> _Place:
-    """Which file of which set; without either where the file does not say."""
+    """Read which file of which set this is; empty if the file does not say."""
     with LogReader(path) as reader:
         for event in reader.events():
             if isinstance(event, Block):
@@ -133,7 +133,7 @@ def _place(path: Path) -> _Place:
 
 
 def siblings(series: Series) -> list[Path]:
-    """Other files beside these that belong to the same log, for a hint."""
+    """Other files of the same log beside these, for a hint."""
     if not series.identity:
         return []
     path = series.paths[0]

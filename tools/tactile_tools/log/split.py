@@ -1,4 +1,4 @@
-"""``tactile log split``: one log into several files, by time or size."""
+"""``tactile log split``: split a log into several files, by time or size."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from tactile_tools.log.terminal import ToolError, bytes_text, cannot_write, plai
 from tactile_tools.log.writing import LogOutput
 
 REPEATED_BYTES = 1 << 20
-"""Attachments up to that size are in every part, so that each can be used alone; calibrations and
-configurations have kilobytes."""
+"""Attachments up to this size are repeated in every part, so that each part can be used alone;
+calibrations and configurations have kilobytes."""
 
 MAX_PARTS = 9999
 
 
 def run(options: argparse.Namespace) -> int:
-    """Split; 0 when every part was written."""
+    """Split a log. Returns 0 if every part was written."""
     logs = find_series(options.files)
     if len(logs) != 1:
         raise ToolError(f"{len(logs)} logs given: split them one by one, or merge them first")
@@ -75,7 +75,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 class Parts:
-    """The files of a split; the next begins with what holds. A context manager."""
+    """Files of a split; each later file begins with what still holds. A context manager."""
 
     def __init__(self, place: Any, profile: str) -> None:
         self.made: list[tuple[Path, int]] = []
@@ -90,7 +90,7 @@ class Parts:
         self._output = self._open()
 
     def __enter__(self) -> Parts:
-        """Ready."""
+        """Return the object itself."""
         return self
 
     def __exit__(
@@ -99,7 +99,7 @@ class Parts:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Finish the last file; nothing is left of it after an error."""
+        """Finish the last file; after an error, delete it."""
         self._end(kind, error, trace)
 
     @property
@@ -126,7 +126,7 @@ class Parts:
                 self._staying[item.stream] = item
 
     def cut(self, log_ns: int) -> None:
-        """Go on in a new file, which begins at ``log_ns``; not when nothing is in this one."""
+        """Continue in a new file, which begins at ``log_ns``, unless the present one is empty."""
         if not self._output.messages:
             return
         self._end(None, None, None)

@@ -1,6 +1,6 @@
-"""Logs as one stream of messages: several files as one, several logs in the order of time.
+"""Logs as one stream of messages: several files as one log, several logs in the order of time.
 
-Constant memory: one chunk a log, whatever their length.
+Memory is constant: one chunk per log, however long.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from tactile_tools.log.sources import FILE, Series
 from tactile_tools.log.terminal import ToolError, shown
 
 NAMED = 20
-"""Topics named when one that was asked for is not there."""
+"""Topics that an error names when the wanted one is missing."""
 
 
 class Stream:
-    """What a channel carries, the same for every file that says the same of it. Immutable.
+    """Content of a channel; equal for all files that describe it alike. Immutable.
 
-    ``metadata``: of the channel, as pairs in order.
+    ``metadata``: of the channel, as sorted pairs.
     """
 
     __slots__ = (
@@ -80,7 +80,7 @@ class Stream:
 
 
 class Record(NamedTuple):
-    """One message; stamps in wall-clock ns."""
+    """A message; stamps in wall-clock ns."""
 
     stream: Stream
     sequence: int
@@ -90,7 +90,7 @@ class Record(NamedTuple):
 
 
 class Attachment(NamedTuple):
-    """A file within the log; ``pieces``: makes its ``size`` bytes, while the log is being read."""
+    """A file within the log. ``pieces``: yields its ``size`` bytes while the log is being read."""
 
     name: str
     media_type: str
@@ -100,11 +100,11 @@ class Attachment(NamedTuple):
     pieces: Callable[[], Iterable[bytes]]
 
     def read(self) -> bytes:
-        """All of it, for what is known to be small."""
+        """Return all bytes, for an attachment known to be small."""
         return b"".join(self.pieces())
 
     def digest(self) -> bytes:
-        """Stands for name, type and contents."""
+        """Hash of name, type and contents."""
         digest = hashlib.blake2b(f"{self.name}\0{self.media_type}\0".encode(), digest_size=16)
         for piece in self.pieces():
             digest.update(piece)
@@ -112,21 +112,22 @@ class Attachment(NamedTuple):
 
     @classmethod
     def of(cls, name: str, media_type: str, log_ns: int, create_ns: int, data: bytes) -> Attachment:
-        """One whose bytes are at hand."""
+        """Make an attachment of ``data``."""
         return cls(name, media_type, log_ns, create_ns, len(data), lambda: (data,))
 
 
 Item = Record | MetadataRecord | Attachment
 
 Wanted = Callable[[str], bool]
-"""Tells by its topic whether a stream is wanted."""
+"""Returns whether the stream of a topic is wanted."""
 
 
 @dataclass(slots=True)
 class Reading:
-    """What became of reading: whether every byte was readable, and the writer of the first file.
+    """State and findings of reading: damage, losses, and the writer of the first file.
 
-    ``messages_lost``: as far as they can be counted; ``lost_unknown``: places where they cannot.
+    ``messages_lost``: messages lost, as far as they can be counted. ``lost_unknown``: places with
+    an unknown number of lost messages.
     """
 
     damages: int = 0
@@ -139,16 +140,16 @@ class Reading:
     seen: dict[Stream, Stream] = field(default_factory=dict)
 
     def intern(self, stream: Stream) -> Stream:
-        """The one object that stands for all equal streams; noted as seen."""
+        """Return the one object for all equal streams, and note it as seen."""
         return self.seen.setdefault(stream, stream)
 
     @property
     def lossy(self) -> bool:
-        """Whether messages of the files could not be handed out."""
+        """Whether some messages of the files could not be returned."""
         return bool(self.messages_lost or self.lost_unknown or self.orphans)
 
     def remark(self) -> str:
-        """What to say of logs that are not whole; empty for whole ones."""
+        """Describe what is wrong with the files; empty if nothing is."""
         parts = []
         if self.unclosed:
             parts.append(f"{self.unclosed} not closed")
@@ -170,9 +171,9 @@ def read_series(
     wanted: Wanted | None = None,
     window: tuple[int, int] | None = None,
 ) -> Iterator[Item]:
-    """Everything of one log, its files one after another. ``window``: log times in ns, inclusive.
+    """Yield everything in one log, file by file. ``window``: log times in ns, both inclusive.
 
-    What a later file repeats at its start is left out: tables, attachments, and messages that hold.
+    Tables, attachments and latched messages that a later file repeats at its start are left out.
     """
     total = sum(path.stat().st_size for path in series.paths)
     done = 0
@@ -194,12 +195,12 @@ def _part(progress: Progress | None, before: int, total: int) -> Progress | None
 
 @dataclass(slots=True)
 class _Held:
-    """What the files of a log so far hold that a later one may repeat."""
+    """Contents of the files read so far that a later file may repeat."""
 
     repeats: Repeats = field(default_factory=Repeats)
     extras: Extras = field(default_factory=Extras)
-    series: bool = False  # there are several files, of one log
-    later: bool = False  # this is not the first of them
+    series: bool = False  # several files of one log
+    later: bool = False  # not the first file
 
 
 def _read_file(
@@ -211,7 +212,7 @@ def _read_file(
     held: _Held,
 ) -> Iterator[Item]:
     streams: dict[int, tuple[Stream, bool] | None] = {}
-    unwanted: set[int] = set()  # channels
+    unwanted: set[int] = set()  # channel numbers
     with LogReader(path, progress, window=window) as reader:
         for event in reader.events():
             if isinstance(event, Block):
@@ -246,7 +247,7 @@ def _read_file(
                     yield event
             else:
                 attachment = _attachment(reader, event)
-                # It is read for that: only where there can be another.
+                # The attachment is read for its digest, so only where it can be a repetition.
                 repeat = held.series and held.extras.is_repeat(attachment.digest())
                 if not (repeat and held.later):
                     yield attachment
@@ -278,7 +279,7 @@ def _stream(number: int, reader: LogReader) -> Stream | None:
 
 
 def stream_of(channel: ChannelRecord, schema: SchemaRecord | None) -> Stream:
-    """The stream of a channel; without a type where its schema is lost."""
+    """Make the stream of a channel; its type is empty if the schema is lost."""
     return Stream(
         topic=channel.topic,
         msgtype=schema.name if schema else "",
@@ -296,9 +297,10 @@ def read_merged(
     wanted: Wanted | None = None,
     window: tuple[int, int] | None = None,
 ) -> Iterator[tuple[int, Item]]:
-    """Everything of several logs with the number of the log, messages in the order of time.
+    """Yield everything in several logs with the index of the log, messages in the order of time.
 
-    Within a log the order is its own; metadata and attachments come with the message after them.
+    Each log keeps its own order; metadata and attachments come just before the message that follows
+    them.
     """
     if len(logs) == 1:
         for item in read_series(logs[0], reading, progress, wanted, window):
@@ -320,7 +322,7 @@ def read_merged(
             if not isinstance(item, Record):
                 waiting.append(item)
                 continue
-            time = max(time, item.log_ns)  # the order of a log is kept even where its times go back
+            time = max(time, item.log_ns)  # a log's own order is kept even where its times go back
             for each in (*waiting, item):
                 yield time, number, count, each
                 count += 1
@@ -334,7 +336,7 @@ def read_merged(
 
 
 def first_ns(logs: Sequence[Series]) -> int:
-    """Log time of the first message of the logs, to which relative times are meant; 0 for none."""
+    """Log time of the first message, at which relative times begin; 0 if there is none."""
     found = []
     for series in logs:
         for path in series.paths:
@@ -355,19 +357,22 @@ def first_ns(logs: Sequence[Series]) -> int:
 
 
 def common_profile(logs: Sequence[Series]) -> str:
-    """The profile of all files of the logs; empty where they differ."""
+    """Profile of all files; empty where they differ."""
     found = set()
     for series in logs:
         for path in series.paths:
             with LogReader(path) as reader:
                 for _ in reader.events():
-                    break  # the header comes before everything else
+                    break  # the header comes first
                 found.add(reader.profile)
     return found.pop() if len(found) == 1 else ""
 
 
 def matcher(patterns: Sequence[str] | None) -> Wanted | None:
-    """Tells topics that match any of the patterns, the leading slash left out or not; None: all."""
+    """Make a function that matches topics with any pattern, leading slash optional.
+
+    None, for no patterns, matches all.
+    """
     if not patterns:
         return None
     plain = [pattern.lstrip("/") for pattern in patterns]
@@ -375,7 +380,7 @@ def matcher(patterns: Sequence[str] | None) -> Wanted | None:
 
 
 def require_topics(patterns: Sequence[str] | None, logs: Sequence[Series]) -> None:
-    """`ToolError` for a pattern that no topic of the logs matches; names those there are."""
+    """`ToolError` for a pattern that matches no topic; it names the topics there are."""
     if not patterns:
         return
     topics = sorted(all_topics(logs))
@@ -389,7 +394,10 @@ def require_topics(patterns: Sequence[str] | None, logs: Sequence[Series]) -> No
 
 
 def all_topics(logs: Sequence[Series]) -> set[str]:
-    """Topics of the logs; a whole pass over files that were not closed, else their summaries."""
+    """Topics of the logs.
+
+    They come from the summaries, or from a whole pass over files that were not closed.
+    """
     topics: set[str] = set()
     for series in logs:
         for path in series.paths:

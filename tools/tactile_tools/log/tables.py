@@ -1,4 +1,4 @@
-"""Tables of messages: CSV and Parquet, a batch of rows at a time."""
+"""Tables of messages as CSV and Parquet, written in batches of rows."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-# Arrow's own pool keeps what it was given: 20 to 40 MB more for batches as small as these. It is
-# chosen when Arrow is first imported.
+# Arrow's own pool keeps what it was given: 20 to 40 MB more for batches as small as these. The pool
+# is chosen when Arrow is first imported.
 os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
 
 import pyarrow as pa
@@ -22,16 +22,16 @@ from tactile_tools.log.decode import finite
 from tactile_tools.log.stream import Record, Stream
 
 BATCH = 1024
-"""Rows written at once: some MB of the widest topic (80 taxels); a Parquet row group has ten."""
+"""Rows per batch: some MB of the widest topic (80 taxels). A Parquet row group has ten batches."""
 
 BATCH_BYTES = 2 << 20
 """Encoded bytes after which a batch is written in any case: as objects they take ten times that."""
 
 HELD_BYTES = 48 << 20
-"""Encoded bytes of the messages that wait in all tables together."""
+"""Encoded bytes of the messages held by all tables together."""
 
 MESSAGE_BYTES = 500
-"""What a message is counted beside its bytes."""
+"""Bytes counted for a message besides its own."""
 
 GROUP = 10
 GROUP_BYTES = 1 << 20
@@ -49,7 +49,7 @@ NOTES = {
 
 
 class Budget:
-    """What all tables of an export hold together; when it is spent, all are to write."""
+    """Memory of all tables of an export; when it is spent, all tables write."""
 
     def __init__(self, limit: int = HELD_BYTES) -> None:
         self.held = 0
@@ -57,27 +57,27 @@ class Budget:
 
     @property
     def spent(self) -> bool:
-        """Whether more is held than may be."""
+        """Whether the tables hold more than the limit."""
         return self.held > self._limit
 
 
 class Table(Protocol):
-    """A table being written; ``rows`` so far."""
+    """A table being written. ``rows``: number of rows so far."""
 
     rows: int
 
     def add(self, record: Record, message: Any) -> None:
-        """One more row."""
+        """Add a row."""
 
     def relieve(self) -> None:
-        """Write what waits in memory."""
+        """Write all held rows."""
 
     def close(self) -> list[dict[str, str]]:
-        """Write what is left; returns what its columns are."""
+        """Write the held rows and finish. Returns a description of the columns."""
 
 
 class ArrowTable:
-    """A CSV or Parquet file. ``widths``: of lists, which are spread over columns in CSV."""
+    """A CSV or Parquet file. ``widths``: of lists, each of which becomes several columns in CSV."""
 
     def __init__(
         self,
@@ -106,7 +106,7 @@ class ArrowTable:
         self._schema: pa.Schema | None = None
 
     def add(self, record: Record, message: Any) -> None:
-        """One more row."""
+        """Add a row."""
         self._records.append((record.log_ns, record.publish_ns, record.sequence))
         self._messages.append(message)
         size = len(record.data) + MESSAGE_BYTES
@@ -117,13 +117,13 @@ class ArrowTable:
             self._flush()
 
     def relieve(self) -> None:
-        """Write what waits in memory."""
+        """Write all held rows."""
         if self._messages:
             self._flush()
         self._write_group()
 
     def close(self) -> list[dict[str, str]]:
-        """Write what is left; returns what its columns are."""
+        """Write the held rows and finish. Returns a description of the columns."""
         if self._messages or self._schema is None:
             self._flush()
         self._write_group()
@@ -175,7 +175,7 @@ class ArrowTable:
         log = np.array([each[0] for each in self._records], np.uint64)
         sent = np.array([each[1] for each in self._records], np.uint64)
         sequence = np.array([each[2] for each in self._records], np.uint32)
-        start = self._start_ns  # may be later than a message, which unsigned numbers do not tell
+        start = self._start_ns  # may be later than a message: no unsigned numbers here
         seconds = np.array([(each[0] - start) / 1e9 for each in self._records])
         return list(self._own), [pa.array(each) for each in (seconds, log, sent, sequence)]
 
@@ -200,7 +200,7 @@ class ArrowTable:
         return [(column.name, pa.ListArray.from_arrays(_offsets(values), struct))]
 
     def _spread(self, column: Column, values: list[Any]) -> list[tuple[str, pa.Array]]:
-        """Lists over columns, tables as JSON in one."""
+        """Make a column for each element of a list; nested tables become one column of JSON."""
         assert self._widths is not None
         if column.kind == "rows":
             return [(column.name, pa.array([_json(column, each) for each in values], pa.string()))]
@@ -233,7 +233,7 @@ class ArrowTable:
 
 
 def _stem(name: str, notes: dict[str, str]) -> str:
-    """Name of the column that ``name`` was spread from."""
+    """Name of the column whose list element ``name`` is."""
     return name if name in notes else name.rpartition(".")[0]
 
 
@@ -242,7 +242,7 @@ def _offsets(values: list[Any]) -> pa.Array:
 
 
 def _nested(column: Column, rows: list[Any]) -> pa.Array:
-    """One field of all rows of a nested table; what is nested once more as JSON."""
+    """One field of all rows of a nested table; what is nested again becomes JSON."""
     values = [column.get(row) for row in rows]
     if column.kind == "number":
         return pa.array(np.array(values, column.dtype))

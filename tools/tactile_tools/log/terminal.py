@@ -1,4 +1,4 @@
-"""What the log tools say: errors with their exit codes, progress, times and sizes."""
+"""Output of the log tools: errors with exit status, progress, times and sizes."""
 
 from __future__ import annotations
 
@@ -18,23 +18,24 @@ from tactile_core.log.records import LogError
 from tactile_core.types import NS_PER_S
 
 FAULTY, BAD_ARGUMENT, REFUSED = 1, 2, 3
-"""Exit codes: the log has faults; an argument cannot be used; the system does not let us."""
+"""Exit status: the log has faults; an argument cannot be used; the system refused."""
 
 UNITS = ("B", "kB", "MB", "GB", "TB")
 
 PLAIN_WIDTH = 160
-"""Columns of a table that goes into a pipe or a file."""
+"""Width of a table that goes to a pipe or a file."""
 
 
 class ToolError(CommandError):
-    """What the user asked of a log cannot be done."""
+    """The tool cannot do what the user asked of a log."""
 
 
 def shown(text: object, limit: int | None = None) -> str:
-    """A text that may come from anybody, safe to be printed on one line.
+    """Make a text from an untrusted source safe to print on one line.
 
-    Control and format characters (which move the cursor, change colours or turn the direction of
-    writing) become escapes such as ``\\x1b``. ``limit``: letters after which it is cut, told.
+    Control and format characters (which move the cursor, change colours or reverse the direction of
+    writing) become escapes such as ``\x1b``. ``limit``: letters after which the text is cut, with a
+    mark.
     """
     text = str(text)
     rest = 0 if limit is None else len(text) - limit
@@ -53,7 +54,7 @@ NOT_IN_JSON = re.compile("[\x7f-\uffff]|[\U00010000-\U0010ffff]")
 
 
 def json_text(value: Any, **options: Any) -> str:
-    """JSON with letters as they are, but none that a terminal takes for a command."""
+    """JSON with letters kept as they are, except those that a terminal takes for a command."""
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, **options)
     if text.isascii() and "\x7f" not in text:
         return text
@@ -61,13 +62,13 @@ def json_text(value: Any, **options: Any) -> str:
 
 
 def complain(text: str, code: int = BAD_ARGUMENT) -> int:
-    """Say what is wrong; returns the exit code."""
+    """Print what is wrong to stderr; returns the exit status."""
     print(f"tactile log: {shown(text)}", file=sys.stderr)
     return code
 
 
 def fail(error: LogError) -> int:
-    """Message and exit code for a file that cannot be read."""
+    """Print the error of a file that cannot be read; returns the exit status."""
     cause = error.__cause__
     if isinstance(cause, FileNotFoundError):
         return complain(f"{error}; name a file that exists")
@@ -77,7 +78,7 @@ def fail(error: LogError) -> int:
 
 
 def cannot_write(what: object, error: OSError) -> ToolError:
-    """`ToolError` for an output that the system refuses, with the remedy."""
+    """Make a `ToolError` for an output that the system refuses, with the remedy."""
     if error.errno == errno.EMFILE:
         remedy = "take fewer topics at a time with --topic"
         return ToolError(f"cannot write {what}: {error.strerror}; {remedy}", REFUSED)
@@ -87,22 +88,22 @@ def cannot_write(what: object, error: OSError) -> ToolError:
 
 
 class PlainConsole(Console):
-    """Prints texts on one line each, as they are: no markup, no emoji, escapes made visible."""
+    """Prints each text on one line without markup or emoji, escapes made visible."""
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print; a text may hold whatever a log does."""
+        """Print; texts may come from a log."""
         safe = (Text(shown(each)) if isinstance(each, str) else each for each in objects)
         super().print(*safe, **options)
 
 
 def plain_console() -> Console:
-    """Standard output; wide where it is not a terminal, and texts of a log safe to be seen."""
+    """Console on standard output: wide unless it is a terminal, and safe for texts of a log."""
     width = None if sys.stdout.isatty() else PLAIN_WIDTH
     return PlainConsole(width=width, soft_wrap=True, highlight=False, markup=False, emoji=False)
 
 
 def clock_text(wall_ns: int) -> str:
-    """UTC time with milliseconds; plain nanoseconds where no calendar goes that far."""
+    """UTC time with milliseconds; plain nanoseconds beyond the range of the calendar."""
     try:
         moment = datetime.fromtimestamp(wall_ns / NS_PER_S, UTC)
     except (OverflowError, ValueError, OSError):
@@ -111,12 +112,12 @@ def clock_text(wall_ns: int) -> str:
 
 
 def seconds_text(ns: int) -> str:
-    """Duration."""
+    """Format a duration."""
     return f"{ns / NS_PER_S:.3f} s"
 
 
 def bytes_text(count: int) -> str:
-    """Size, in powers of 1000."""
+    """Format a size, in powers of 1000."""
     if count < 1000:
         return f"{count} B"
     power = min(int(math.log10(count) / 3), 4)

@@ -1,4 +1,4 @@
-"""A new log out of messages of others: channels and types numbered anew, whole or not at all."""
+"""Write a new log of messages from others: channels and types are renumbered; all or nothing."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from tactile_tools.log.stream import Attachment, Record, Stream
 from tactile_tools.log.terminal import cannot_write
 
 CHUNK_BYTES = 1 << 20
-"""As the recorder's."""
+"""The same as the recorder's."""
 
 
 class LogOutput:
-    """Writes ``path``, which appears when all of it is there; a context manager.
+    """Writes ``path``, which appears when it is complete; a context manager.
 
-    `ToolError` with the remedy where the system refuses, and nothing is left behind.
+    `ToolError` with the remedy where the system refuses; nothing is left behind.
     """
 
     def __init__(self, path: Path, profile: str = "ros2") -> None:
@@ -43,7 +43,7 @@ class LogOutput:
             raise cannot_write(path, error) from error
 
     def __enter__(self) -> LogOutput:
-        """Ready to be written to."""
+        """Open the temporary file."""
         return self
 
     def __exit__(
@@ -52,7 +52,7 @@ class LogOutput:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Finish the file and put it in its place, or take away what there is of it."""
+        """Finish the file and rename it to its place; after an error, delete it."""
         if error is not None:
             self._file.abandon()
             self._drop()
@@ -69,11 +69,11 @@ class LogOutput:
 
     @property
     def size(self) -> int:
-        """Bytes so far, those in hand before compression."""
+        """Size so far with bytes that wait to be compressed."""
         return self._file.size + len(self._chunk.data)
 
     def write(self, record: Record, *, renumber: bool = False) -> None:
-        """Add a message; ``renumber``: with the next number of its stream instead of its own."""
+        """Add a message. ``renumber``: give it the next number of its stream instead of its own."""
         number = self._streams.get(record.stream)
         if number is None:
             number = self._define(record.stream)
@@ -87,16 +87,16 @@ class LogOutput:
             self._flush()
 
     def declare(self, stream: Stream) -> None:
-        """Have the log name a stream, whether or not messages follow."""
+        """Add a stream, whether or not messages follow."""
         if stream not in self._streams:
             self._define(stream)
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Add a table of texts."""
+        """Add a metadata table."""
         self._file.add_metadata(name, values)
 
     def attach(self, item: Attachment) -> None:
-        """Add a file within the file, a piece at a time."""
+        """Attach a file, piece by piece."""
         self._flush()
         self._file.copy_attachment(
             item.name, item.media_type, item.size, item.pieces(), item.log_ns, item.create_ns
