@@ -1,1 +1,1 @@
-"""``tactile calibrate``: models of a board's own force, fitted to recordings and judged."""
+"""``tactile calibrate``: fit and judge force models of a board from recordings."""

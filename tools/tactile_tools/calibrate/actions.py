@@ -1,4 +1,4 @@
-"""What the subcommands of ``tactile calibrate`` do; exit codes 2 and 3 are decided here."""
+"""Subcommands of ``tactile calibrate``; exit status 2 and 3 are decided here."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 
 
 class ActionError(CommandError):
-    """Why a command cannot go on."""
+    """A command cannot go on; the text names the remedy."""
 
 
 def guarded(
     run: Callable[[argparse.Namespace], None],
 ) -> Callable[[argparse.Namespace], int]:
-    """``run`` as a command: what was refused is a `CommandError`."""
+    """Make ``run`` a command: its errors become a `CommandError`."""
 
     def command(options: argparse.Namespace) -> int:
         from tactile_tools.calibrate.recording import RecordingError
@@ -60,7 +60,7 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def _require(options: argparse.Namespace) -> None:
-    """Refuse what needs the extra ``calibrate`` where it is not installed."""
+    """Check that the extra ``calibrate`` is installed where it is needed."""
     require("scipy", "sklearn", extra="calibrate")
     if options.report is not None:
         require("matplotlib", extra="calibrate", what="--report")
@@ -178,12 +178,12 @@ def _report(folder: Path, split: str, judged: Sequence[Judged]) -> None:
 
 @contextmanager
 def _watching() -> Iterator[Callable[[str], None]]:
-    """A status line on standard error that says what is being tried."""
+    """Show on standard error, in a status line, what is being tried."""
     from sklearn.exceptions import ConvergenceWarning
 
     console = Console(stderr=True)
     with warnings.catch_warnings(), console.status("reading") as status:
-        warnings.simplefilter("ignore", ConvergenceWarning)  # iterations are bounded on purpose
+        warnings.simplefilter("ignore", ConvergenceWarning)  # they are few on purpose
         yield lambda text: status.update(f"trying {text}")
 
 

@@ -1,4 +1,4 @@
-"""From fitted models to the calibration of a board."""
+"""Make the calibration of a board from fitted models."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tactile_tools.calibrate.results import DEFINITIONS
 
 
 def group(recordings: Sequence[Recording]) -> list[list[Recording]]:
-    """Recordings with the same targets together, in the order they were given."""
+    """Group recordings with the same targets, in the given order."""
     groups: dict[tuple[str, ...], list[Recording]] = {}
     for recording in recordings:
         groups.setdefault(recording.targets, []).append(recording)
@@ -27,7 +27,10 @@ def group(recordings: Sequence[Recording]) -> list[list[Recording]]:
 def fitted(
     recordings: Sequence[Recording], progress: Progress = quiet
 ) -> tuple[NetModel, Choice, list[Judged]]:
-    """Model of one group with its error figures, and how it was judged."""
+    """Fit the model of one group.
+
+    Returns it with its error figures, its choice and its judgement.
+    """
     choice = choose(recordings, progress=progress)
     model = fit(recordings, choice)
     judged = tail20(recordings, progress=lambda text: progress(f"tail20: {text}"))
@@ -56,7 +59,7 @@ def board(
     serial_number: str,
     now: datetime | None = None,
 ) -> BoardCalibration:
-    """Calibration of the board: ``base``'s places and matrices, scaled to the load; and ``nets``.
+    """Calibration of the board: places and matrices of ``base``, scaled to the load, and ``nets``.
 
     The rest field is that at the start of the last recording.
     """
@@ -86,9 +89,10 @@ def board(
 
 
 def share_scale(base: BoardCalibration, recordings: Sequence[Recording]) -> float:
-    """What to multiply the matrices of ``base`` by so that they sum to the measured normal force.
+    """Factor on the matrices of ``base`` that makes their sum the measured normal force.
 
-    One where no recording has one: the matrices then share out what the models say all the same.
+    One if no recording has a normal force: the matrices then divide what the models say among the
+    taxels.
     """
     sums, loads = [], []
     for recording in recordings:

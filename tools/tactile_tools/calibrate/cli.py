@@ -1,4 +1,4 @@
-"""The command line of ``tactile calibrate``."""
+"""Command line of ``tactile calibrate``."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def _record(parser: Parser) -> None:
 
 
 def _not_a_kind(text: str) -> str:
-    """A board's name: --board took a kind until it came to be a name in every command."""
+    """Refuse a kind of board: --board took one before it came to mean a name in every command."""
     if text in KINDS or ":" in text:
         raise argparse.ArgumentTypeError(
             f"{shown(text)} is a kind of board, not a name: give it with --kind"

@@ -1,9 +1,9 @@
-"""Reader of a folder with a CSV pair, as the eFlesh characterisation rig writes it.
+"""Read a folder with a CSV pair, as the eFlesh characterisation rig writes it.
 
-``sensor.csv[.gz]``: time s, then x, y, z µT of each magnetometer in chip axes.
-``states.csv[.gz]``: time s, probe x, y, z mm, and, where there is a load cell, gram-force, of
-which -1 is no reading. ``sensor_post_baselines.csv[.gz]``: the same frames over the rest field
-that the rig took again between touches; used for recordings of single touches alone.
+``sensor.csv[.gz]``: time, s; then x, y, z of each magnetometer, µT, in chip axes.
+``states.csv[.gz]``: time, s; probe x, y, z, mm; and, where there is a load cell, gram-force, with
+-1 for no reading. ``sensor_post_baselines.csv[.gz]``: the same frames over the rest field that the
+rig took again between touches; used only for recordings of single touches.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from tactile_tools.calibrate.recording import Recording, RecordingError, check, 
 NEWTON_PER_GRAM_FORCE = 9.80665e-3
 NO_READING = -1.0
 MAX_BYTES = 512 << 20
-"""Of one file, unpacked: ten hours of four boards; more is a mistake."""
+"""Largest file, unpacked, bytes: ten hours of four boards. More is a mistake."""
 TARGETS = ("normal", "shear")
-LATEST_S = 4.1e9  # the year 2099: a later time is in ms, or garbage
+LATEST_S = 4.1e9  # the year 2099; a later time is in ms or wrong
 
 
 def is_pair(path: Path) -> bool:
-    """Whether ``path`` is a folder that might hold a CSV pair."""
+    """Return whether ``path`` is a folder that might hold a CSV pair."""
     return path.is_dir()
 
 
 def read_pair(path: Path, target: str | None = None) -> Recording:
-    """Recording in the folder ``path``; `RecordingError` names file, line and remedy.
+    """Read the recording in folder ``path``; `RecordingError` names file, line and remedy.
 
-    ``target``: what its load cell measured, one of `TARGETS`; None: the folder's name says it
-    (``shear…``), normal force otherwise.
+    ``target``: what the load cell measured, one of `TARGETS`. None: shear if the folder is called
+    ``shear…``, else normal force.
     """
     sensor = _read(path, "sensor")
     states = _read(path, "states")
@@ -87,7 +87,7 @@ def read_pair(path: Path, target: str | None = None) -> Recording:
 
 
 def to_taxel_axes(field: FloatArray, geometry: SkinGeometry) -> FloatArray:
-    """(m, 3n) µT with the yaw of each chip undone."""
+    """Rotate a field (m, 3n) µT from chip axes to taxel axes, undoing the yaw of each chip."""
     yaw = np.concatenate([a.chip_yaw for a in geometry.arrays])
     out = field.reshape(len(field), -1, 3).copy()
     x, y = out[..., 0].copy(), out[..., 1].copy()
@@ -117,7 +117,7 @@ def _find(path: Path, stem: str) -> Path | None:
 
 
 def _read(path: Path, stem: str) -> FloatArray:
-    """Numbers of one CSV file, (rows, columns)."""
+    """Read the numbers of one CSV file, (rows, columns)."""
     file = _find(path, stem)
     if file is None:
         raise RecordingError(f"{path}: holds no {stem}.csv or {stem}.csv.gz; name a recording")

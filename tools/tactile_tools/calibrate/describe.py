@@ -1,4 +1,4 @@
-"""A calibration file in words."""
+"""Describe a calibration file in words."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tactile_core.calibration.force_model import TARGET_UNITS
 
 
 def as_dict(calibration: BoardCalibration) -> dict[str, Any]:
-    """What a calibration says of itself, without its matrices."""
+    """Contents of a calibration, without its matrices."""
     return {
         "serial_number": calibration.serial_number,
         "model": calibration.model,
@@ -41,7 +41,7 @@ def as_dict(calibration: BoardCalibration) -> dict[str, Any]:
 
 
 def as_text(calibration: BoardCalibration) -> str:
-    """The same in lines."""
+    """Contents of a calibration as lines of text."""
     d = as_dict(calibration)
     arrays = ", ".join(f"{a['name']} ({a['taxels']} taxels)" for a in d["arrays"])
     lines = [

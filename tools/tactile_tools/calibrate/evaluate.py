@@ -1,4 +1,4 @@
-"""Judging models on samples they were not fitted to."""
+"""Judge models on samples that they were not fitted to."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from tactiled.sensing.forces import batch_features, readout
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """One model on the samples of one recording that it was not fitted to.
+    """Predictions of one model for samples of a recording that it was not fitted to.
 
-    ``time_s`` (k,), ``measured`` and ``predicted`` (k, targets); ``tested`` (k,) marks what the
-    errors are taken over. ``fitted_on``: what the model was fitted to; ``choice``: what
+    ``time_s`` (k,), ``measured`` and ``predicted`` (k, targets); ``tested`` (k,) marks the samples
+    that errors are computed over. ``fitted_on``: what the model was fitted to. ``choice``: what
     cross-validation chose on that.
     """
 
@@ -38,20 +38,20 @@ class Judged:
 
     @property
     def errors(self) -> FloatArray:
-        """(tested, targets)."""
+        """Predicted minus measured, (tested, targets)."""
         return (self.predicted - self.measured)[self.tested]
 
     @property
     def rmse(self) -> FloatArray:
-        """(targets,)."""
+        """Root mean square error, (targets,)."""
         value: FloatArray = np.sqrt((self.errors**2).mean(axis=0))
         return value
 
 
 def predict(model: NetModel, recording: Recording, label_clock: bool = True) -> FloatArray:
-    """(k, targets) for every label of ``recording``, causal, tared at its beginning.
+    """Predict every label of ``recording`` causally, tared at its beginning: (k, targets).
 
-    ``label_clock``: at the instant each label was true, not at its stamp less the mean lag.
+    ``label_clock``: predict at the instant each label was true, not at its stamp less the mean lag.
     """
     features = batch_features(model.features, recording.time_s, recording.change_ut())
     late = (
@@ -66,7 +66,7 @@ def tail20(
     recipes: Sequence[Recipe] | None = None,
     progress: Progress = quiet,
 ) -> list[Judged]:
-    """Each recording by itself: chosen and fitted on its first 80 %, tested on its last 20 %."""
+    """Judge each recording by itself: choose and fit on its first 80 %, test on its last 20 %."""
     out = []
     for recording in recordings:
         head = recording.until(TAIL_SHARE)
@@ -82,7 +82,7 @@ def leave_one_out(
     recipes: Sequence[Recipe] | None = None,
     progress: Progress = quiet,
 ) -> list[Judged]:
-    """Each recording whole, by a model chosen and fitted on all the others."""
+    """Judge each recording by a model chosen and fitted on all the others."""
     out = []
     for recording in recordings:
         others = [other for other in recordings if other is not recording]

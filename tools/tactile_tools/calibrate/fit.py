@@ -1,4 +1,4 @@
-"""Choosing a model by cross-validation, and fitting it."""
+"""Choose a model by cross-validation, and fit it."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from tactile_tools.calibrate.splits import GAP_S, block_edges, block_masks
 Bool = NDArray[np.bool_]
 
 DELAYS_S = tuple(round(0.05 * i, 2) for i in range(-2, 9))
-"""s, by how much labels may lag behind the field: a load cell that averages for 0.2 s lags by
-0.1 s; a negative one means that the board is read late."""
+"""Delays of labels behind the field that are tried, s. A load cell that averages over 0.2 s lags by
+0.1 s; a negative delay means that the board is read late."""
 
 Progress = Callable[[str], None]
 
@@ -42,7 +42,7 @@ class Score:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What cross-validation chose. ``delays``: (delay s, error) as they were tried."""
+    """What cross-validation chose. ``delays``: the tried ones, as (delay s, error)."""
 
     recipe: Recipe
     penalty: float
@@ -52,11 +52,11 @@ class Choice:
 
 
 def quiet(_: str) -> None:
-    """Progress that nobody watches."""
+    """Report no progress."""
 
 
 def require_alike(recordings: Sequence[Recording]) -> None:
-    """Refuse, with `RecordingError`, recordings that no one model could be fitted to."""
+    """`RecordingError` for recordings that one model could not be fitted to together."""
     first = recordings[0]
     for other in recordings[1:]:
         if other.taxels != first.taxels:
@@ -72,7 +72,7 @@ def require_alike(recordings: Sequence[Recording]) -> None:
 
 
 def recipes_for(recordings: Sequence[Recording]) -> tuple[Recipe, ...]:
-    """The kinds of model to try."""
+    """Kinds of model to try."""
     return FORCE_RECIPES if recordings[0].forces else PLACE_RECIPES
 
 
@@ -81,7 +81,7 @@ def choose(
     recipes: Sequence[Recipe] | None = None,
     progress: Progress = quiet,
 ) -> Choice:
-    """Delay, recipe and penalty with the least cross-validated error on ``recordings``."""
+    """Choose delay, recipe and penalty with the least cross-validated error on ``recordings``."""
     recipes = recipes_for(recordings) if recipes is None else tuple(recipes)
     delays: list[tuple[float, FloatArray]] = []
     delay = 0.0
@@ -116,11 +116,11 @@ def choose(
 
 
 def simplest(errors: Sequence[FloatArray]) -> int:
-    """First of candidates, simplest first, whose fold errors are as good as the best's.
+    """Index of the first candidate, simplest first, whose errors by fold are as good as the best.
 
     As good: worse by no more than one standard error of the difference, fold by fold (Breiman's
-    rule). What blocks of one recording cannot tell apart, another recording will: there the
-    stricter one wins.
+    rule). Candidates that blocks of one recording cannot distinguish may differ on another
+    recording, where the stricter one does better.
     """
     best = min(errors, key=lambda e: float(e.mean()))
     for i, each in enumerate(errors):
@@ -133,10 +133,11 @@ def simplest(errors: Sequence[FloatArray]) -> int:
 def cross_validate(
     rows: Rows, recordings: Sequence[Recording], recipe: Recipe, penalty: float
 ) -> FloatArray:
-    """(folds,) root mean square error of each, in the targets' unit.
+    """Root mean square error of each fold, (folds,), in the targets' unit.
 
-    Candidates are judged by the mean of these, not by the root of the mean square: one fold with
-    the first press of a fresh skin, which no other fold tells of, would choose for all the others.
+    Candidates are judged by the mean of these, not by the root of the mean square: otherwise one
+    fold with the first press of a fresh skin, which no other fold has, would decide for all the
+    others.
     """
     errors = []
     for fit, test in folds(rows, recordings):
@@ -149,7 +150,7 @@ def cross_validate(
 
 
 def folds(rows: Rows, recordings: Sequence[Recording]) -> Iterator[tuple[Bool, Bool]]:
-    """Rows to fit on and to test on: blocks of time of every recording, and whole recordings.
+    """Yield rows to fit on and rows to test on: blocks of time of each recording, whole recordings.
 
     `RecordingError` for a recording so short that nothing is left beside one of its blocks.
     """
@@ -169,7 +170,7 @@ def folds(rows: Rows, recordings: Sequence[Recording]) -> Iterator[tuple[Bool, B
 
 
 def too_short(recording: Recording) -> RecordingError:
-    """What to say of a recording with too little in it to choose a model by."""
+    """Make the error for a recording that has too little in it to choose a model by."""
     time = recording.label_time_s
     return RecordingError(
         f"{recording.path} has labels over {time[-1] - time[0]:.0f} s; to choose a model, a fifth "
@@ -179,7 +180,7 @@ def too_short(recording: Recording) -> RecordingError:
 
 
 def fit(recordings: Sequence[Recording], choice: Choice) -> NetModel:
-    """Model of ``choice``, fitted to all of ``recordings``."""
+    """Fit the model of ``choice`` to all of ``recordings``."""
     recipe = choice.recipe
     features = feature_map(recipe, recordings)
     rows = align(copies(features, recordings, recipe.restarts), recordings, choice.delay_s)

@@ -1,9 +1,10 @@
-"""When labels were true: a reference read more slowly than it measures skips a reading in a beat.
+"""Find when labels were true: a reference read more slowly than it measures skips readings.
 
 A load cell that measures every T s and is read every R s, R a little more than T, hands over its
-readings later and later until one is skipped; then it is up to date again. The lag is a sawtooth
-of one reading with the period of the beat, T R / (R - T), and shows as a jump in the label at every
-tooth. It is found from labels and their times alone, never from the field or a model.
+readings later and later until one is skipped; then it is up to date again. The lag is a sawtooth of
+the height of one reading and the period of the beat, T R / (R - T), and shows as a jump in the
+label at every tooth. It is found from labels and their times alone, never from the field or a
+model.
 """
 
 from __future__ import annotations
@@ -16,26 +17,27 @@ from numpy.typing import NDArray
 from tactile_core.arrays import FloatArray
 
 NEIGHBOURS = 3
-"""Steps to each side whose median is the slope that a jump stands out from."""
+"""Steps on each side whose median is the slope that a jump stands out from."""
 STEEP_SHARE = 0.25
-"""Only where the label changes by more than this share of its fastest can a jump be told."""
+"""Jumps can be seen only where the label changes by more than this share of its fastest change."""
 JUMP_SHARE = (0.6, 1.5)
 """A jump adds between these shares of an ordinary step: one reading was skipped, not two."""
 BEAT_STEPS = (8.0, 400.0)
-"""Beats sought, in readings: a shorter one is no beat, of a longer one no recording shows two."""
+"""Beats that are looked for, in readings: below, it would not be a beat; above, no recording shows
+two."""
 MIN_JUMPS = 15
 MIN_CONCENTRATION = 0.85
-"""Mean resultant length R of the jumps' phases: n jumps at random reach it at one beat with
+"""Least mean resultant length R of the jumps' phases: n random jumps reach it at one beat with
 probability exp(-n R²), so at any of a few hundred beats once in two hundred recordings."""
 TOOTH_SEARCH = 4
-"""Readings to each side of a tooth's expected place among which it is looked for."""
+"""Readings on each side of a tooth's expected place among which it is looked for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelClock:
-    """What was found. ``lag_s``: (k,) s of each label, from 0 to ``reading_s``; ``beat_s``: s.
+    """Lag of labels. ``lag_s`` (k,): of each label, s, 0 to ``reading_s``; ``beat_s``: period, s.
 
-    ``concentration``: 0 to 1, how well the jumps keep the beat.
+    ``concentration``: how well the jumps keep to the beat, 0 to 1.
     """
 
     beat_s: float
@@ -46,7 +48,10 @@ class LabelClock:
 
 
 def find_clock(time_s: FloatArray, label: FloatArray) -> LabelClock | None:
-    """Sawtooth lag of ``label`` (k,) read at ``time_s`` (k,); None where there is no beat."""
+    """Find the sawtooth lag of ``label`` (k,), read at ``time_s`` (k,).
+
+    None where there is no beat.
+    """
     step = np.diff(time_s)
     period = float(np.median(step))
     slope = np.diff(label) / step
@@ -64,7 +69,7 @@ def find_clock(time_s: FloatArray, label: FloatArray) -> LabelClock | None:
         return None
     span = time_s[-1] - time_s[0]
     low, high = BEAT_STEPS[0] * period, min(BEAT_STEPS[1] * period, span / 2)
-    # frequencies closer than a tenth of what the recording can tell apart
+    # frequencies closer than a tenth of what the recording can resolve
     beats = 1.0 / np.arange(1.0 / high, 1.0 / low, 0.1 / span)
     phasor = np.exp(2j * np.pi * at[:, None] / beats).mean(axis=0)
     best = int(np.abs(phasor).argmax())
@@ -77,14 +82,15 @@ def find_clock(time_s: FloatArray, label: FloatArray) -> LabelClock | None:
     tooth = _teeth(time_s, label, beat, first)
     begin = np.array([first + beat * np.floor((time_s[0] - first) / beat), *time_s[tooth]])
     number = np.searchsorted(tooth, np.arange(len(time_s)), side="right")
-    # the tooth's number, not where it was seen, says how late a reading is: teeth keep the beat
+    # The number of the tooth gives the lag of a reading, not the place where the tooth was seen:
+    # teeth keep the beat.
     count = np.round((begin[number] - first) / beat)
     lag = (time_s - first - count * beat) * (reading / beat)
     return LabelClock(beat, reading, len(at), concentration, np.clip(lag, 0.0, reading))
 
 
 def _teeth(time_s: FloatArray, label: FloatArray, beat: float, first: float) -> NDArray[np.intp]:
-    """Index of the first label after each tooth: the steepest step near where it is expected."""
+    """Index of the first label after each tooth: the steepest step near the expected place."""
     numbers = np.arange(
         np.ceil((time_s[0] - first) / beat + 1e-9), np.ceil((time_s[-1] - first) / beat)
     )

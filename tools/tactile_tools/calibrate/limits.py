@@ -1,6 +1,6 @@
-"""What limits the error on a recording: evidence taken from its data, model by model of the cause.
+"""What limits the error on a recording: evidence from its data, cause by cause.
 
-Each figure is what would be left with a perfect model of the skin, in the unit of the label.
+Each figure is the error that a perfect model of the skin would leave, in the unit of the label.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from tactile_tools.calibrate.recording import TARE_S, UNTOUCHED_SHARE
 from tactiled.sensing.forces import batch_features, readout
 
 STEADY = 5
-"""Labels of a short run through which a straight line is laid; a press is straight for a second."""
+"""Labels of a short run that a straight line is fitted to; a press is straight for a second."""
 
 
 def limits(judged: Judged) -> dict[str, float]:
-    """Evidence by name; keys end in what it is measured in."""
+    """Evidence by name; each key ends in its unit."""
     recording = judged.recording
     if not recording.forces:
         return _place_limits(judged)
@@ -30,7 +30,7 @@ def limits(judged: Judged) -> dict[str, float]:
     values = np.unique(label)
     rate = np.gradient(label, time)
     period = float(np.median(np.diff(recording.time_s)))
-    # a reading stands for some instant of the frame it came with: uniform over one frame
+    # A reading was true at some instant of the frame it came with: uniform over one frame.
     jitter = period / np.sqrt(12)
     error = np.linalg.norm(judged.predicted - judged.measured, axis=1)
     out = {
@@ -52,7 +52,7 @@ def limits(judged: Judged) -> dict[str, float]:
 
 
 def field_noise(judged: Judged) -> float:
-    """How much the prediction varies from frame to frame while nothing moves, rms."""
+    """Rms change of the prediction from frame to frame while nothing moves."""
     recording, model = judged.recording, judged.model
     still = recording.time_s <= recording.time_s[0] + TARE_S
     noise = np.diff(recording.field_ut[still], axis=0).std(axis=0) / np.sqrt(2)
@@ -79,7 +79,10 @@ def _place_limits(judged: Judged) -> dict[str, float]:
 
 
 def _roughness(time: FloatArray, label: FloatArray) -> FloatArray:
-    """(k,) distance of each label from a line through its neighbours, scaled to that of one."""
+    """Distance of each label from a line through its neighbours, (k,).
+
+    It is scaled to the deviation of a single label.
+    """
     out = np.zeros_like(label)
     half = STEADY // 2
     for i in range(half, len(label) - half):
@@ -93,7 +96,10 @@ def _roughness(time: FloatArray, label: FloatArray) -> FloatArray:
 
 
 def _first_press(judged: Judged) -> NDArray[np.bool_] | None:
-    """Labels up to the end of the recording's first press; None where that is not tested."""
+    """Labels up to the end of the recording's first press, as a mask.
+
+    None where that is not tested.
+    """
     label = judged.recording.load()
     busy = label > UNTOUCHED_SHARE * label.max()
     ends = np.flatnonzero(busy[:-1] & ~busy[1:])

@@ -22,20 +22,20 @@ from tactile_core.types import WallClock, monotonic_now
 from tactile_tools.calibrate.wizard import Stamps, TareRefusedError, WizardError
 
 FIRST_FRAME_S = 10.0
-"""s for tactiled to be found on the bus, identify the board and send a first frame; where it is
-there, `SLOW_S` more for a slow board."""
+"""Time for tactiled to be found on the bus, to identify the board and to send a first frame, s; if
+tactiled is there, `SLOW_S` more for a slow board."""
 TARE_S = 120.0
-"""s for a tare of the slowest boards."""
+"""Time for a tare of the slowest boards, s."""
 SLOW_S = 30.0
-"""s that a recording may take longer than asked for, until a slow board has sent enough."""
+"""Time that a recording may take longer than asked for, until a slow board has sent enough, s."""
 LOOK_S = 0.05
 REFUSED = "tare refused"
-"""Beginning of what tactiled says of a tare that it did not take."""
+"""How tactiled begins its answer to a tare that it refused."""
 STATUS_S = 3.0
 
 
 class LiveBoard:
-    """Board ``name`` on the bus; writes every frame to ``recorder`` from the moment it is made."""
+    """Board ``name`` on the bus; every frame goes to ``recorder`` from the moment this is made."""
 
     def __init__(self, session: zenoh.Session, recorder: Recorder, name: str) -> None:
         self._session, self._recorder, self._name = session, recorder, name
@@ -48,7 +48,7 @@ class LiveBoard:
         self._tap = Tap(session, FIELD.key(name), self._take_field)
 
     def wait(self, ended: Callable[[], bool] = lambda: False) -> None:
-        """Until frames come; `WizardError` when none do, or their sender has ``ended``."""
+        """Wait for frames; `WizardError` when none come, or when their sender has ``ended``."""
         if self._hears(FIRST_FRAME_S, ended):
             return
         there = not ended() and self._name in list_alive(self._session)
@@ -66,9 +66,11 @@ class LiveBoard:
         return heard
 
     def calibration(self, given: Path | None) -> BoardCalibration:
-        """What tactiled runs this board with: in ``given``, the file it names, or typical figures.
+        """Load the calibration that tactiled uses for this board.
 
-        `WizardError` when that is another board's; `CalibrationError` when the file is bad.
+        It is read from ``given``, else from the file that tactiled names; typical figures where it
+        uses no file. `WizardError` when ``given`` is another one; `CalibrationError` when the file
+        is bad.
         """
         try:
             status = call(self._session, service_key(self._name, "status"), timeout=STATUS_S)
@@ -88,12 +90,12 @@ class LiveBoard:
         return calibration
 
     def attach(self, calibration: BoardCalibration) -> None:
-        """Embed it in the log, for `fit` to find."""
+        """Embed the calibration in the log, where `fit` finds it."""
         text = saves(calibration).encode()
         self._recorder.attach(f"{self._name}{SUFFIX}", "application/toml", text)
 
     def tare(self, force: bool = False) -> str:
-        """Tare by tactiled's own service."""
+        """Tare through tactiled's service."""
         key = service_key(self._name, "tare")
         try:
             report = call(self._session, key, {"force": force}, timeout=TARE_S)
@@ -103,7 +105,7 @@ class LiveBoard:
         return f"  {report['message']}"
 
     def collect(self, seconds: float, least: int) -> Stamps:
-        """Frames captured in the next ``seconds`` s, or in longer until they are ``least``."""
+        """Wait for the frames of the next ``seconds`` s, or longer until there are ``least``."""
         start = time.monotonic()
         begin = self._wall.wall_ns(monotonic_now())
         time.sleep(seconds)
@@ -119,7 +121,7 @@ class LiveBoard:
         return found
 
     def label(self, stamps: Stamps, force: float) -> None:
-        """Write what was on the skin when these frames were captured; a `Sink`."""
+        """Write the force on the skin when these frames were captured; a `Sink`."""
         encode = codec().encode
         for stamp in stamps:
             message = MSG.WrenchStamped(
@@ -130,7 +132,7 @@ class LiveBoard:
             self._recorder.write(REFERENCE, self._name, data, stamp, stamp)
 
     def close(self) -> None:
-        """Hear no more."""
+        """Stop listening."""
         self._tap.close()
 
     def _typical(self, model: str, serial_number: str) -> BoardCalibration:
@@ -153,7 +155,7 @@ class LiveBoard:
         try:
             message = codec().decode(FIELD, sample.data)
         except DecodeError:
-            return  # not of a tactiled of this version; too few frames are reported as such
+            return  # another version of tactiled; too few frames are reported elsewhere
         stamp = stamp_ns(message.header.stamp)
         self._frame = str(message.header.frame_id)
         self._taxels = int(message.array_taxels.sum())
@@ -164,7 +166,7 @@ class LiveBoard:
 
 
 def refuse_existing(out: Path) -> str | None:
-    """Why ``out`` cannot be a new log; None when it can."""
+    """Say why ``out`` cannot be a new log; None when it can."""
     if out.suffix != ".mcap":
         return f"--out {out}; allowed: a name that ends in .mcap"
     if out.exists():

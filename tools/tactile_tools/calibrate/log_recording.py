@@ -1,8 +1,8 @@
-"""Reader of a log (MCAP) that holds a board's field and what a reference said of the force on it.
+"""Read a recording from a log (MCAP) with a board's field and a reference force.
 
 Field: ``tactile/<name>/field``, µT over the rest field at the time, in taxel axes. Reference:
 ``reference/<name>/wrench``, see `tactile_core.bus.topics.REFERENCE`; a row with a value that is not
-finite is no reading.
+finite counts as no reading.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from tactile_tools.calibrate.recording import (
 )
 
 MAX_FRAMES = 2_000_000
-"""Over five hours at 100 Hz; more of one log is a mistake and would fill the memory."""
+"""Over five hours at 100 Hz; more in one log is a mistake and would fill the memory."""
 SHEAR_SHARE = 0.02
 """Shear that never reaches this share of the largest force was not measured, or is noise."""
 MAX_MASKED = 0.2
-"""Share of frames with an unhealthy taxel beyond which a recording is refused."""
+"""A recording with a larger share of frames with an unhealthy taxel is refused."""
 
 
 @dataclass(slots=True)
@@ -51,7 +51,10 @@ class _Board:
 
 
 def read_log(path: Path, name: str | None = None) -> Recording:
-    """Recording of board ``name`` (None: the only one with a reference) in the log ``path``."""
+    """Read the recording of board ``name`` in log ``path``.
+
+    None: of the only one with a reference.
+    """
     try:
         boards, attached = _collect(path)
     except (LogError, DecodeError) as error:
@@ -148,7 +151,7 @@ def _take_field(board: _Board, message: Any, path: Path) -> None:
         return
     stamp = stamp_ns(message.header.stamp)
     if stamp in board.field_ns[-1:]:
-        return  # older logs gave frames that were read together one stamp: no other is known
+        return  # older logs stamp frames that were read together alike
     if len(board.field_ns) >= MAX_FRAMES:
         raise RecordingError(f"{path}: over {MAX_FRAMES} frames; `tactile log split` it")
     board.field_ns.append(stamp)
@@ -156,17 +159,17 @@ def _take_field(board: _Board, message: Any, path: Path) -> None:
 
 
 def _drop_early(board: _Board) -> None:
-    """Forget the frames before the first reading: the rest field may have been another then."""
+    """Drop the frames before the first reading: the rest field may have been another then."""
     first = min(board.reference_ns)
     keep = next((i for i, at in enumerate(board.field_ns) if at >= first), len(board.field_ns))
     del board.field_ns[:keep], board.field_ut[:keep]
 
 
 def _drop_repeated(board: _Board) -> None:
-    """Forget a frame or a reading that is stamped like the one before it.
+    """Drop a frame or a reading that has the stamp of the one before it.
 
-    Of boards without a clock of their own, the daemon estimates when a frame was captured and
-    never lets its stamps run back: they stand still until the estimate has caught up.
+    For boards without a clock the daemon estimates when a frame was captured, and never lets its
+    stamps run back: they stand still until the estimate has caught up.
     """
     for stamps, values in ((board.field_ns, board.field_ut), (board.reference_ns, board.force)):
         same = [i for i in range(1, len(stamps)) if stamps[i] == stamps[i - 1]]
@@ -192,7 +195,7 @@ def _which(path: Path, boards: dict[str, _Board], name: str | None) -> str:
 
 
 def _targets(force: FloatArray) -> tuple[str, ...]:
-    """Normal force always; shear where it was measured."""
+    """Names of the measured targets: always normal force, and shear where it was measured."""
     least = SHEAR_SHARE * np.abs(force).max()
     shear = np.abs(force[:, :2]).max(axis=0) > least
     return ("normal", *(n for n, there in zip(("shear_x", "shear_y"), shear, strict=True) if there))

@@ -1,4 +1,4 @@
-"""What turns features into forces: scikit-learn pipelines, and the same as plain numbers."""
+"""Turn features into forces: scikit-learn pipelines, and the same as plain numbers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SEED = 0
 
 
 def pipeline(recipe: Recipe, penalty: float, rows: int) -> Pipeline:
-    """Unfitted readout for ``rows`` rows; every random draw in it has a fixed seed."""
+    """Make the unfitted readout for ``rows`` rows; every random draw in it has a fixed seed."""
     if recipe.readout == "ridge":
         return make_pipeline(StandardScaler(), Ridge(penalty))
     if recipe.readout == "rbf":

@@ -1,4 +1,4 @@
-"""The kinds of model that are tried: what features they have, what reads these out."""
+"""Kinds of model that are tried: their features and readouts."""
 
 from __future__ import annotations
 
@@ -13,30 +13,33 @@ from tactile_core.calibration.force_model import FeatureMap, RestTracker
 from tactile_tools.calibrate.recording import Recording
 
 NEAR_SHARE = 0.08
-"""The rest is followed while the field is within this share of the strongest presses: twice the
-4 % by which rest fields creep in the eFlesh recordings."""
+"""The rest field is followed while the field is within this share of the strongest presses: twice
+the 4 % by which rest fields creep in the eFlesh recordings."""
 STILL_SHARE = 0.012
 """... and stays within this share of its one-second mean: the field of a released skin creeps by
-0.2 % of the strongest press in a second, a press that begins changes by that in 50 ms."""
+0.2 % of the strongest press in a second; a press that begins changes by that in 50 ms."""
 STILL_SIGMAS = 3.0
 """... or within this many times the noise of one frame, whichever is more."""
 REST_TAU_S = 1.0
-"""s with which the rest is followed."""
+"""Time constant with which the rest field is followed, s."""
 STRONG_PERCENTILE = 95
 
 CREEP_TAUS_S = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-"""s, half a decade apart from the filter of a load cell to the length of a recording: rubber and
-printed lattices creep with the logarithm of time, so no single constant would do."""
+"""Time constants of creep, s, half a decade apart from the filter of a load cell to the length of a
+recording: rubber and printed lattices creep with the logarithm of time, so no single constant would
+do."""
 PLAY_RADII = (0.1, 0.3, 0.6, 1.0)
-"""Half widths of the play operators, in rms of the component: a press spans about 3."""
+"""Half widths of the play operators, in rms of the component; a press spans about 3."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """Fields as in `NetModel`. ``components``: principal ones of the field's change, 0 for all
-    channels as they are. ``tracked``: the rest is followed. ``restarts``: the fit also sees each
-    recording begun anew at each of its pauses, as a fresh tare would. ``units``: of the readout.
-    ``penalties``: tried in the cross-validation (ridge, on features scaled to unit variance).
+    """One kind of model; further fields as in `NetModel`.
+
+    ``components``: principal ones of the field's change, 0 for all channels as they are.
+    ``tracked``: the rest field is followed. ``restarts``: the fit also sees each recording begun
+    anew at each of its pauses, as after a fresh tare. ``units``: of the readout. ``penalties``:
+    tried in cross-validation (ridge, on features scaled to unit variance).
     """
 
     name: str
@@ -56,7 +59,7 @@ class Recipe:
 
     @property
     def knows_history(self) -> bool:
-        """Whether what was before changes what it says now."""
+        """Whether the prediction depends on the past."""
         return self.tracked or bool(self.taus_s or self.radii)
 
 
@@ -70,7 +73,7 @@ _HISTORY = Recipe(
     lag_degree=2,
     tracked=True,
     restarts=True,
-    penalties=(3.0, 10.0),  # blocks of one recording ask for less, the next recording for this
+    penalties=(3.0, 10.0),  # blocks of one recording call for less, another recording for this
 )
 
 FORCE_RECIPES = (
@@ -79,7 +82,7 @@ FORCE_RECIPES = (
     _HISTORY,
     replace(_HISTORY, name="creep+play", radii=PLAY_RADII, lag_degree=1, lagged=2),
 )
-"""For recordings of force over time; the first two know no history and are what to beat."""
+"""For recordings of force over time; the first two ignore history and are the ones to beat."""
 
 PLACE_RECIPES = (
     Recipe("linear", components=0, penalties=(0.01, 1.0)),
@@ -93,11 +96,12 @@ PLACE_RECIPES = (
         penalties=(1e-3, 1e-2),
     ),
 )
-"""For recordings of single touches: where, by the pattern of the field rather than its strength."""
+"""For recordings of single touches: place, from the pattern of the field rather than its
+strength."""
 
 
 def feature_map(recipe: Recipe, recordings: Sequence[Recording]) -> FeatureMap:
-    """Features that ``recipe`` asks for, scaled to what ``recordings`` hold."""
+    """Make the features that ``recipe`` asks for, scaled to what ``recordings`` hold."""
     changes = [r.change_ut() for r in recordings]
     change = np.concatenate(changes)
     channels = change.shape[1]
@@ -106,7 +110,7 @@ def feature_map(recipe: Recipe, recordings: Sequence[Recording]) -> FeatureMap:
         rms = size / np.sqrt(len(change))
         k = min(recipe.components, int((rms > rms[0] * 1e-6).sum()))
         projection = axes[:k].T / rms[:k]
-        # an axis has no sign of its own: let presses be positive, so that powers mean the same
+        # The sign of an axis is arbitrary: make presses positive, so that powers mean the same.
         projection *= np.where((change @ projection).mean(axis=0) < 0, -1.0, 1.0)
     else:
         projection = np.eye(channels) / np.sqrt((change**2).mean())
@@ -125,7 +129,7 @@ def feature_map(recipe: Recipe, recordings: Sequence[Recording]) -> FeatureMap:
 
 
 def floor(recordings: Sequence[Recording]) -> FloatArray:
-    """Least value of each target: zero for a force that no label says is ever negative."""
+    """Least value of each target: zero for a force that is never negative in the labels."""
     labels = np.concatenate([r.labels for r in recordings])
     least: FloatArray = np.full(labels.shape[1], -np.inf)
     if recordings[0].forces:
@@ -135,12 +139,12 @@ def floor(recordings: Sequence[Recording]) -> FloatArray:
 
 
 def _tracker(changes: list[FloatArray]) -> RestTracker:
-    """Limits of what counts as rest, from how strong presses and noise are."""
+    """Limits of what counts as rest, from the strength of presses and noise."""
     size = np.concatenate([np.linalg.norm(c, axis=1) for c in changes])
     strong = float(np.percentile(size, STRONG_PERCENTILE))
-    # successive differences: a press moves slowly from frame to frame, noise does not
+    # Successive differences: a press changes slowly from frame to frame, noise does not.
     noise = np.sqrt(sum(float(np.median(np.diff(c, axis=0) ** 2, axis=0).sum()) for c in changes))
-    noise *= np.sqrt(1 / (2 * 0.455 * len(changes)))  # median of chi² to variance, of a difference
+    noise *= np.sqrt(1 / (2 * 0.455 * len(changes)))  # from the median of chi² to the variance
     return RestTracker(
         near_ut=max(NEAR_SHARE * strong, 2 * STILL_SIGMAS * noise),
         still_ut=max(STILL_SHARE * strong, STILL_SIGMAS * noise),

@@ -21,7 +21,7 @@ from tactile_tools.processes import command, running, socket_at
 
 
 def record(options: argparse.Namespace) -> None:
-    """Ask, record, write; `ActionError` when nothing that `fit` could use was recorded."""
+    """Ask, record and write; `ActionError` when nothing was recorded that `fit` could use."""
     out: Path = options.out
     trouble = refuse_existing(out)
     if trouble is not None:
@@ -64,7 +64,7 @@ def _record(options: argparse.Namespace, board: LiveBoard, ended: Callable[[], b
 
 
 def _ask(question: str) -> str:
-    """What was typed. Questions are flushed, so that a program at the other end sees them."""
+    """Ask and return what was typed. Questions are flushed for a program at the other end."""
     print(question, end="", flush=True)
     line = sys.stdin.readline()
     if not line:
@@ -75,7 +75,10 @@ def _ask(question: str) -> str:
 
 @contextlib.contextmanager
 def _bus(options: argparse.Namespace) -> Iterator[tuple[BusConfig, Callable[[], bool]]]:
-    """The bus to listen on and whether its tactiled has ended; with --port, one of our own."""
+    """Yield the bus to listen on and a function that tells whether its tactiled has ended.
+
+    With --port, tactiled is started here.
+    """
     if options.port is None:
         yield bus_config(options, BusTable(), "tool"), lambda: False
         return

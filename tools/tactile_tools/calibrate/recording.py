@@ -1,4 +1,4 @@
-"""A recording to calibrate from: field of a board over time, and what a reference measured."""
+"""A recording to calibrate from: field of a board over time, and the readings of a reference."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from tactile_tools.calibrate.label_clock import LabelClock, find_clock
 MIN_FRAMES = 50
 """Fewest frames and labels of a recording: fewer cannot be split into parts to fit and to test."""
 TARE_S = 1.0
-"""s at the start of a recording that must be untouched; their mean is its rest field."""
+"""Start of a recording that must be untouched, s; its mean is the rest field."""
 MIN_TARE_FRAMES = 5
 """Fewest frames of a tare."""
 UNTOUCHED_SHARE = 0.03
-"""A label below this share of the largest counts as untouched: the load cell's own drift at rest
-is 0.2 % of full scale, creep of a released skin pushes back with about 1 %."""
+"""A label below this share of the largest counts as untouched: the load cell's own drift at rest is
+0.2 % of full scale; creep of a released skin pushes back with about 1 %."""
 
 
 class RecordingError(Exception):
-    """A recording that cannot be used; names file, place, what is wrong and the remedy."""
+    """A recording cannot be used; the text names file, place, fault and remedy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """m frames of n taxels, k labels.
+    """m frames of n taxels, and k labels.
 
-    ``time_s`` (m,) and ``label_time_s`` (k,): s on one clock, both increasing. ``field_ut``:
-    (m, 3n) µT in taxel axes. ``rest_ut``: (m, 3n), the rest field of each frame where the
-    recording has it (single touches, between which the rig let go), else None. ``labels``:
-    (k, targets) in the targets' units. ``serial_number``: empty where the recording has none.
-    ``label_clock``: how late each label is, None where that was not found.
-    ``calibration``: what the board ran with while it was recorded, None where unknown.
+    ``time_s`` (m,) and ``label_time_s`` (k,): s on one clock, both increasing. ``field_ut``: (m,
+    3n) µT in taxel axes. ``rest_ut``: (m, 3n), the rest field of each frame where the recording has
+    it (single touches, between which the rig let go), else None. ``labels``: (k, targets) in the
+    targets' units. ``serial_number``: empty where the recording has none. ``label_clock``: how late
+    each label is, None where that was not found. ``calibration``: that of the board while it was
+    recorded, None if unknown.
     """
 
     path: Path
@@ -54,7 +54,7 @@ class Recording:
 
     @property
     def name(self) -> str:
-        """What to call it in reports."""
+        """Name of the recording in reports."""
         return self.path.name
 
     @property
@@ -68,16 +68,16 @@ class Recording:
         return not {"x", "y"} & set(self.targets)
 
     def load(self) -> FloatArray:
-        """(k,) size of the labels taken together."""
+        """Size of each label over all targets, (k,)."""
         size: FloatArray = np.linalg.norm(self.labels, axis=1)
         return size
 
     def change_ut(self, start: int = 0) -> FloatArray:
-        """(m - start, 3n) µT over the rest field, tared at frame ``start``."""
+        """Change of the field from the rest field, tared at frame ``start``: (m - start, 3n) µT."""
         if self.rest_ut is not None:
             change: FloatArray = self.field_ut[start:] - self.rest_ut[start:]
             return change
-        if not self.forces:  # nothing in it is untouched: any origin will do
+        if not self.forces:  # nothing in it is untouched, so any origin will do
             return np.asarray(self.field_ut[start:] - self.field_ut.mean(axis=0))
         field, time = self.field_ut[start:], self.time_s[start:]
         count = max(MIN_TARE_FRAMES, int(np.searchsorted(time, time[0] + TARE_S)))
@@ -85,12 +85,12 @@ class Recording:
 
     @property
     def lag_s(self) -> FloatArray:
-        """(k,) s by which each label was late when it was read."""
+        """Lag of each label when it was read, (k,) s."""
         clock = self.label_clock
         return np.zeros(len(self.label_time_s)) if clock is None else clock.lag_s
 
     def until(self, share: float) -> Recording:
-        """The first ``share`` of its frames, and the labels up to the last of them."""
+        """The first ``share`` of the frames, and the labels up to the last of them."""
         frames = int(len(self.time_s) * share)
         end = self.time_s[frames] if frames < len(self.time_s) else np.inf
         labels = int(np.searchsorted(self.label_time_s, end))
@@ -108,7 +108,7 @@ class Recording:
 
 
 def check(recording: Recording) -> Recording:
-    """Refuse, with `RecordingError`, what no model could be fitted to; else the same again."""
+    """Return the recording; `RecordingError` for one that no model could be fitted to."""
     path = recording.path
     for what, time in (("frames", recording.time_s), ("labels", recording.label_time_s)):
         if len(time) < MIN_FRAMES:
@@ -147,7 +147,7 @@ def check(recording: Recording) -> Recording:
 
 
 def with_clock(recording: Recording) -> Recording:
-    """The same with the lag of its labels, where force shows one."""
+    """Return the recording with the lag of its labels, where force shows one."""
     if not recording.forces:
         return recording
     strongest = recording.labels[:, int(np.ptp(recording.labels, axis=0).argmax())]

@@ -1,4 +1,4 @@
-"""Pictures of what a model does, and a page that shows them."""
+"""Draw what a model does, and write a page with the pictures."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BINS = 12
 
 
 def write_report(folder: Path, split: str, judged: Sequence[Judged]) -> Path:
-    """One picture a recording and ``index.html`` in ``folder``; OSError when it cannot be."""
+    """Write one picture per recording and ``index.html`` into ``folder``; OSError on failure."""
     names = []
     for number, each in enumerate(judged):
         name = f"{number + 1}_{each.recording.path.stem}.png"
@@ -36,7 +36,7 @@ def write_report(folder: Path, split: str, judged: Sequence[Judged]) -> Path:
 
 
 def draw(judged: Judged, out: Path) -> None:
-    """The picture of one recording, 1400 × 1000 px."""
+    """Draw the picture of one recording, 1400 × 1000 px."""
     figure = Figure(figsize=(14, 10), layout="constrained")
     FigureCanvasAgg(figure)
     if judged.recording.forces:
@@ -92,7 +92,7 @@ def _draw_force(figure: Figure, judged: Judged) -> None:
 
 
 def _draw_loop(axes: Any, measured: FloatArray, guess: FloatArray, colour: str, unit: str) -> None:
-    """Error over force, the way there and the way back in different strokes."""
+    """Draw error over force, loading and unloading in different strokes."""
     top = int(measured.argmax())
     error = guess - measured
     axes.plot(measured[: top + 1], error[: top + 1], color=colour, lw=1.6, label="press")
@@ -157,14 +157,14 @@ def _draw_place(figure: Figure, judged: Judged) -> None:
 
 
 def _without_history(judged: Judged) -> FloatArray:
-    """(k, targets) of the cubic model, fitted to the same samples."""
+    """Predictions of the cubic model, (k, targets), fitted to the same samples."""
     recipe = next(r for r in FORCE_RECIPES if r.name == "cubic")
     choice = Choice(recipe, recipe.penalties[0], judged.choice.delay_s, (), ())
     return predict(fit(judged.fitted_on, choice), judged.recording)
 
 
 def _one_press(judged: Judged) -> NDArray[np.intp]:
-    """Labels of the last press that is tested from its beginning to its end."""
+    """Labels of the last press that is tested from beginning to end."""
     size = judged.recording.load()
     busy = size > 0.03 * size.max()
     edges = np.flatnonzero(np.diff(np.r_[0, busy.astype(int), 0]))

@@ -1,4 +1,4 @@
-"""What an evaluation found, as JSON and as a table."""
+"""Results of an evaluation as JSON and as a table."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ AIMS = {
 
 
 def as_json(split: str, judged: Sequence[Judged]) -> dict[str, Any]:
-    """Everything, for a file or another program."""
+    """All results, for a file or another program."""
     return {
         "version": version("tactile-reach"),
         "split": split,
@@ -41,7 +41,7 @@ def as_json(split: str, judged: Sequence[Judged]) -> dict[str, Any]:
 
 
 def summary(split: str, judged: Sequence[Judged]) -> dict[str, dict[str, Any]]:
-    """Error by what was predicted: over all tested labels, and the mean of the recordings'."""
+    """Error by target: over all tested labels, and the mean of the recordings."""
     groups: dict[str, list[Judged]] = defaultdict(list)
     for each in judged:
         groups["location" if not each.recording.forces else each.model.targets[0]].append(each)
@@ -68,7 +68,7 @@ def summary(split: str, judged: Sequence[Judged]) -> dict[str, dict[str, Any]]:
 
 
 def table(split: str, judged: Sequence[Judged]) -> Table:
-    """The errors, for a terminal."""
+    """Make a table of the errors for a terminal."""
     shown = Table(title=f"tactile calibrate evaluate --split {split}")
     for heading in ("recording", "target", "rmse", "bias", "worst", "labels", "model", "delay"):
         shown.add_column(heading, justify="left" if heading in ("recording", "model") else "right")

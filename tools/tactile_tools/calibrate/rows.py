@@ -1,4 +1,4 @@
-"""Features and labels side by side: one row a label, as often as the recording can begin."""
+"""Features and labels side by side: a row per label, for each possible beginning of a recording."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ Bool = NDArray[np.bool_]
 LEAST_PAUSE_S = 3.0
 """A pause at least this long, s, can be the beginning of a recording: a tare, and time to spare."""
 LEAST_REST_S = 20.0
-"""A beginning with less than this left after it, s, would teach nothing of the past."""
+"""A beginning with less than this left after it, s, would teach nothing about the past."""
 MAX_RESTARTS = 12
-"""Beginnings of one recording at most; more take time and say the same."""
+"""Most beginnings of one recording; more take time and say the same."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,8 +34,10 @@ class Copy:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """``features`` (r, F), ``labels`` (r, targets), ``time_s`` (r,) of the label, ``recording``
-    (r,) its number; ``whole`` (r,) is True for rows of recordings from their true beginning.
+    """Rows to fit and to test on.
+
+    ``features`` (r, F), ``labels`` (r, targets), ``time_s`` (r,) of the label, ``recording`` (r,)
+    its index; ``whole`` (r,) is True for rows of recordings from their true beginning.
     """
 
     features: FloatArray
@@ -55,7 +57,7 @@ def beginnings(recording: Recording) -> list[int]:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], idle.astype(int), [0]])))
     for first, last in zip(edges[::2], edges[1::2] - 1, strict=True):
         begin, end = recording.label_time_s[first], recording.label_time_s[last]
-        # the field still creeps fast at the start of a pause, and the press begins at its end
+        # The field still creeps fast at the start of a pause, and a press begins at its end.
         start = end - 2 * TARE_S
         if end - begin < LEAST_PAUSE_S or start <= recording.time_s[0] + LEAST_PAUSE_S:
             continue
@@ -80,7 +82,7 @@ def copies(features: FeatureMap, recordings: Sequence[Recording], restarts: bool
 
 
 def align(made: Sequence[Copy], recordings: Sequence[Recording], delay_s: float) -> Rows:
-    """Row for each label: what the field was ``delay_s`` s before it was read, never after it."""
+    """Make a row for each label: the field ``delay_s`` s before it was read, never after it."""
     parts: list[tuple[FloatArray, FloatArray, FloatArray, NDArray[np.intp], Bool]] = []
     for copy in made:
         recording = recordings[copy.recording]
@@ -107,7 +109,7 @@ def align(made: Sequence[Copy], recordings: Sequence[Recording], delay_s: float)
 def causal(
     time_s: FloatArray, values: FloatArray, at_s: FloatArray, delay_s: FloatArray | float
 ) -> FloatArray:
-    """``values`` (m, F) between frames at ``at_s - delay_s``; frames after ``at_s`` stay unused."""
+    """Interpolate ``values`` (m, F) at ``at_s - delay_s``, using no frame after ``at_s``."""
     if len(time_s) == 1:
         return np.repeat(values, len(at_s), axis=0)
     wanted = np.clip(at_s - delay_s, time_s[0], time_s[-1])

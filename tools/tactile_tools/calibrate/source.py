@@ -1,4 +1,4 @@
-"""Recordings by path, whichever kind they are."""
+"""Open recordings of any kind by path."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from tactile_tools.calibrate.recording import Recording, RecordingError
 def open_recordings(
     paths: Sequence[Path], board: str | None = None, target: str | None = None
 ) -> list[Recording]:
-    """Every recording in ``paths``; `RecordingError` for the first that cannot be used.
+    """Open every recording in ``paths``; `RecordingError` for the first that cannot be used.
 
-    ``board``: which of a log. ``target``: what the load cell of a CSV pair measured.
+    ``board``: which one of a log. ``target``: what the load cell of a CSV pair measured.
     """
     seen: dict[Path, Path] = {}
     out = []

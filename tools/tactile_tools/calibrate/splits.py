@@ -1,4 +1,4 @@
-"""Parts of a recording to fit and to test on, which never hold neighbouring samples."""
+"""Split a recording into parts to fit and to test on that never hold neighbouring samples."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from tactile_core.arrays import FloatArray
 Bool = NDArray[np.bool_]
 
 TAIL_SHARE = 0.8
-"""Share of a recording's frames that ``tail20`` fits on; the rest tests (the eFlesh authors)."""
+"""Share of a recording's frames that ``tail20`` fits on; the rest is for testing (as by the eFlesh
+authors)."""
 FOLDS = 5
 """Blocks that a recording is cut into for cross-validation."""
 GAP_S = 3.0
-"""s on both sides of a block that are neither fitted nor tested: 3 s is longer than neighbouring
-samples stay alike at the rates that presses have."""
+"""Time on both sides of a block that is neither fitted nor tested, s: longer than neighbouring
+samples stay alike at the rates of presses."""
 
 
 def block_edges(time_s: FloatArray, folds: int = FOLDS) -> list[tuple[float, float]]:
-    """Times [begin, end) of ``folds`` blocks with equally many samples each."""
+    """Times [begin, end) of ``folds`` blocks with equally many samples each, s."""
     bounds = np.linspace(0, len(time_s), folds + 1).round().astype(int)
     begin = [float(time_s[b]) for b in bounds[:-1]]
     return list(zip(begin, [*begin[1:], float("inf")], strict=True))

@@ -1,7 +1,6 @@
-"""The questions of ``tactile calibrate record``, and what is labelled with the answers.
+"""The questions of ``tactile calibrate record``, and the labels that follow from the answers.
 
-Pure but for what it is given: words are asked and said through functions, frames come from a
-`Source`, labels go to a `Sink`.
+Pure: it asks and talks through functions, gets frames from a `Source` and gives labels to a `Sink`.
 """
 
 from __future__ import annotations
@@ -26,16 +25,16 @@ UNDO = ("u", "undo")
 FORCE_IT = ("f", "force")
 
 LEAST_FRAMES = 4
-"""Frames below which a window has no data worth a label."""
+"""A window with fewer frames does not get a label."""
 
 WIDTH = 80
-"""Columns in which words are kept whole where a terminal does not say how wide it is."""
+"""Columns within which words are kept whole where a terminal does not say its width."""
 
 Stamps = Sequence[int]
 
 
 class WizardError(Exception):
-    """Why the recording cannot go on; the text names the remedy."""
+    """The recording cannot go on; the text names the remedy."""
 
 
 class TareRefusedError(WizardError):
@@ -46,12 +45,15 @@ class Source(Protocol):
     """The board being calibrated; every frame of it is recorded, asked for or not."""
 
     def tare(self, force: bool = False) -> str:
-        """Tare; what came of it. `TareRefusedError` when it was refused, `WizardError` else."""
+        """Tare; returns what came of it.
+
+        `TareRefusedError` when it was refused, else `WizardError`.
+        """
 
     def collect(self, seconds: float, least: int) -> Stamps:
-        """Wait; the stamps, ns, of the frames that were captured meanwhile.
+        """Wait; returns the stamps, ns, of the frames that were captured meanwhile.
 
-        For ``least`` frames it waits longer than ``seconds``: a slow board sends few.
+        It waits longer than ``seconds`` for ``least`` frames: a slow board sends few.
         """
 
 
@@ -61,7 +63,7 @@ Sink = Callable[[Stamps, float], None]
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How long is recorded of each part, s."""
+    """Length of each part of the recording, s."""
 
     rest: float = 4.0
     hold: float = 2.0
@@ -69,9 +71,9 @@ class Timing:
 
 
 class Wizard:
-    """Asks, waits and labels. ``ask`` returns what was typed, EOFError at the end of input.
+    """Asks, waits and labels. ``ask`` returns what was typed; EOFError at the end of input.
 
-    ``width``: columns of the terminal, for words to be kept whole.
+    ``width``: columns of the terminal, so that words are kept whole.
     """
 
     def __init__(
@@ -89,7 +91,7 @@ class Wizard:
         """Labels of the last press, which may still be undone."""
 
     def run(self) -> int:
-        """All steps; the number of presses, at least one, or `WizardError`."""
+        """Take all steps; returns the number of presses, at least one, or raises `WizardError`."""
         self._say(
             "Lay the board down as it will be used. Have known weights at hand, or a force gauge. "
             f"{PRESSES} presses are asked for: in several places and with several forces, the "
@@ -111,7 +113,7 @@ class Wizard:
         return presses
 
     def _tare(self) -> None:
-        """Tare, again or by force where it is refused."""
+        """Tare; if it is refused, try again or by force."""
         force = False
         while True:
             try:
@@ -127,7 +129,7 @@ class Wizard:
                 return
 
     def _press_all(self) -> int:
-        """Presses until the user ends them; how many are kept."""
+        """Record presses until the user ends them; returns how many are kept."""
         presses, warned = 0, False
         while True:
             force = self._ask_force(presses)
@@ -147,7 +149,7 @@ class Wizard:
                 presses += self._press(force)
 
     def _press(self, force: float) -> int:
-        """One press and the rest after it, kept back until the next: 1."""
+        """Record one press and the rest after it, held back until the next press; returns 1."""
         self._ask(f"Put {force:.3g} N on the skin, hold it steady, then Enter: ")
         pressed = self._record(self._timing.hold, "holding")
         self._ask("Take it off, then Enter: ")
@@ -161,7 +163,7 @@ class Wizard:
         self._last = []
 
     def _undo(self) -> int:
-        """Forget the last press; how many that were, 0 or 1."""
+        """Forget the last press; returns how many were forgotten, 0 or 1."""
         if not self._last:
             self._say("  nothing to undo: only the last press can be, and only once")
             return 0
@@ -180,7 +182,7 @@ class Wizard:
         return stamps
 
     def _ask_force(self, presses: int) -> float | None:
-        """Newtons of the next press; 0 to undo the last, None when there is none."""
+        """Ask for the force of the next press, N; 0: undo the last press; None: the end."""
         count = f"{presses + 1} of {PRESSES}" if presses < PRESSES else f"{presses + 1}"
         undo = ", u to undo the last" if self._last else ""
         end = ", Enter to end" if presses else ""
@@ -204,7 +206,7 @@ class Wizard:
         return self._ask(question).strip().lower() in ("y", "yes")
 
     def _ask(self, question: str) -> str:
-        # The answer needs room behind the question.
+        # The answer needs room after the question.
         return self._ask_whole(wrap(question, self._width - 8) + " ")
 
     def _say(self, text: str) -> None:
@@ -212,9 +214,9 @@ class Wizard:
 
 
 def wrap(text: str, width: int) -> str:
-    """``text`` in lines of at most ``width`` columns, broken between words only.
+    """Break ``text`` into lines of at most ``width`` columns, between words only.
 
-    Further lines are indented as the first is.
+    Further lines are indented like the first.
     """
     indent = text[: len(text) - len(text.lstrip())]
     return textwrap.fill(
@@ -228,7 +230,7 @@ def wrap(text: str, width: int) -> str:
 
 
 def parse_force(text: str) -> float | None:
-    """Newtons of what was typed; None when that is no force. Weights stand for their weight."""
+    """Force of what was typed, N; None when it is not a force. A mass stands for its weight."""
     found = FORCE.fullmatch(text.strip())
     if found is None:
         return None

@@ -1,1 +1,1 @@
-"""What `tactile plot` draws, and the series it draws from."""
+"""``tactile plot``: pictures of logs, and the series that they are drawn from."""

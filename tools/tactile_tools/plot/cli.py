@@ -1,4 +1,4 @@
-"""``tactile plot``: what a skin felt and how a reach went, from a log, as a picture."""
+"""``tactile plot``: draw from a log what a skin felt and how a reach went."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WHATS = ("reach", "taxels", "forces", "field", "timing")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Draw; 0 when the picture was written, 2 for a bad argument, 3 for an unreadable log."""
+    """Draw. Exit status 0: the picture was written; 2: bad argument; 3: unreadable log."""
     from tactile_core.log.records import LogError
     from tactile_tools.plot.series import LogUnreadableError
 
@@ -50,7 +50,7 @@ def _complain(text: str, code: int) -> int:
 
 
 def _check_output(out: Path, options: argparse.Namespace) -> None:
-    """Refuse what matplotlib could not write, before the log is read."""
+    """Refuse an output that matplotlib could not write, before the log is read."""
     from tactile_tools.plot.look import LEAST_DPI, MOST_DPI
 
     allowed = (".png", ".pdf", ".svg", ".jpg", ".jpeg")
@@ -68,7 +68,7 @@ def _check_output(out: Path, options: argparse.Namespace) -> None:
 
 
 def _draw(options: argparse.Namespace, out: Path) -> str:
-    """Draw; what there would have been to choose from, in words, "" where there was nothing."""
+    """Draw; returns what else could have been chosen, in words, or ""."""
     of_reach = options.reach is not None or options.arm is not None
     if of_reach and options.what not in (None, "reach"):
         raise ToolError(f"--reach and --arm are of a reach: leave them out with {options.what}")
@@ -117,7 +117,7 @@ def _draw_skin(options: argparse.Namespace, out: Path) -> str:
 
 
 def _draw_reach(options: argparse.Namespace, out: Path, *, must: bool) -> str | None:
-    """Draw a reach; None when the log holds none, which is an error only if it must."""
+    """Draw a reach. Returns None when the log holds none, which is an error only with ``must``."""
     from tactile_tools.plot.look import LOOKS, of_several
     from tactile_tools.plot.reach import draw
     from tactile_tools.plot.reach_series import listed, read_reach

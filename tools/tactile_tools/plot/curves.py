@@ -1,4 +1,4 @@
-"""Curves over time: forces and features, the field removed, clock and latency."""
+"""Curves over time: forces and features, the ambient field removed, clock and latency."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from tactile_tools.plot.look import (
 )
 from tactile_tools.plot.series import LATENCY_BINS, BoardSeries, Spread
 
-# Holes in a curve, and the presses in it.
+# Holes in a curve, and presses in it.
 
 
 HOLE_PERIODS = 5.0
-"""Periods without a point that are a hole: what a scheduler delays is shorter."""
+"""A step longer than this many periods is a hole; delays by the scheduler are shorter."""
 NEAR = 31
-"""Steps whose median is the period thereabouts: a rate may be changed in the middle of a log."""
+"""Steps whose median is taken as the local period: the rate may change in the middle of a log."""
 
 CHATTER_S = 0.5
-"""s for which a press may be let go and still be the same."""
+"""Time for which a press may be let go and still count as the same press, s."""
 PROMINENCE = 0.4
-"""Share of a maximum by which the force must have fallen between it and a greater one."""
+"""The force must fall between two maxima by this share of the smaller one."""
 BIN_S, MOST_BINS = 0.05, 200_000
 
 
 def holes(time: Sequence[float] | FloatArray) -> list[tuple[float, float]]:
-    """(begin, end) s of each stretch in which points are missing, in order."""
+    """Find the stretches in which points are missing: (begin, end), s, in order."""
     from scipy.ndimage import median_filter
 
     times = np.asarray(time, float)
@@ -55,12 +55,12 @@ def holes(time: Sequence[float] | FloatArray) -> list[tuple[float, float]]:
 
 
 def period(time: Sequence[float] | FloatArray) -> float:
-    """Median step, s; 0 of fewer than two points."""
+    """Median step, s; 0 if there are fewer than two points."""
     return float(np.median(np.diff(time))) if len(time) > 1 else 0.0
 
 
 def broken(time: Sequence[float] | FloatArray, values: Any) -> tuple[FloatArray, FloatArray]:
-    """Curve with a NaN in each hole, so that no line is drawn through it."""
+    """Put a NaN into each hole of a curve, so that no line is drawn across it."""
     times, points = np.asarray(time, float), np.asarray(values, float)
     after = np.searchsorted(times, [end for _, end in holes(times)])
     middle = [(times[i - 1] + times[i]) / 2 for i in after]
@@ -70,10 +70,10 @@ def broken(time: Sequence[float] | FloatArray, values: Any) -> tuple[FloatArray,
 def presses(time: Sequence[float] | FloatArray, force: Any, least: float, count: int) -> list[int]:
     """Indices, in order of time, of the strongest point of each of the strongest presses.
 
-    ``force``: (points, places) N. A press is a maximum at one place (an array of a skin) that is
-    at least ``least`` N and stands out of what is about it by `PROMINENCE` of its height; what is
-    let go for less than `CHATTER_S` is the same press. Presses within `CHATTER_S` at two places
-    are one.
+    ``force``: (points, places) N. A press is a maximum at one place (an array of a skin) that is at
+    least ``least`` N and stands out from its surroundings by `PROMINENCE` of its height. What is
+    let go for less than `CHATTER_S` counts as the same press, and so do presses within `CHATTER_S`
+    at two places.
     """
     from scipy.ndimage import grey_closing
     from scipy.signal import find_peaks
@@ -85,7 +85,7 @@ def presses(time: Sequence[float] | FloatArray, force: Any, least: float, count:
     bins = ((times - times[0]) / width).astype(int)
     found: list[tuple[float, int]] = []
     for place in range(felt.shape[1]):
-        most = np.zeros(bins[-1] + 3)  # an empty bin at each end, so that what is cut off counts
+        most = np.zeros(bins[-1] + 3)  # an empty bin at each end, for cut-off presses
         np.maximum.at(most, bins + 1, felt[:, place])
         reach = 1 + round(CHATTER_S / width)
         closed = grey_closing(np.pad(most, reach), (reach,))[reach:-reach]
@@ -111,26 +111,26 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 INVALID = "#F4C7C3"
-"""Behind stretches in which features were not valid."""
+"""Colour behind stretches in which features were not valid."""
 MISSING = "0.88"
-"""Behind stretches of which the log has nothing."""
+"""Colour behind stretches that are missing in the log."""
 
 LISTED = 10
-"""Groups of events with their text; the others are numbers alone, or are counted."""
+"""Groups of events listed with their text; further ones are numbered or only counted."""
 
 TAKEN_UP = 0.6
-"""Share of the width that the numbers of events may take up before neighbours share one."""
+"""Share of the width that the numbers of events may take before neighbours are grouped."""
 
 REASONS = 3
 
 SETTLED = (0.1, 0.9)
-"""Of a clock's error, the share of its points from the first to the last that sets the scale."""
+"""Part of a clock's points, from the first to the last, whose errors set the scale."""
 
 
 def contact_forces(
     axes: Axes, board: BoardSeries, applied: tuple[Any, Any] | None, look: Look = SCREEN
 ) -> None:
-    """Normal force of the contact patches of each array."""
+    """Draw the normal force of the contact patches of each array."""
     contact = board.contact_force()
     for index, (label, _) in enumerate(board.array_slices()):
         axes.plot(
@@ -146,7 +146,7 @@ def contact_forces(
 
 
 def ambient(axes: Axes, board: BoardSeries, look: Look = SCREEN) -> None:
-    """Field at the centre of each array that compensation took off."""
+    """Draw the field at the centre of each array that compensation removed."""
     labels = [name for name, _ in board.array_slices()]
     axes.set_ylabel("ambient field\nremoved, µT")
     axes.grid(visible=True)
@@ -168,7 +168,7 @@ def ambient(axes: Axes, board: BoardSeries, look: Look = SCREEN) -> None:
 
 
 def latency(axes: Axes, board: BoardSeries, look: Look = SCREEN) -> None:
-    """From capture to receipt."""
+    """Draw the time from capture to receipt."""
     delays = np.asarray(board.delays.items, float).reshape(-1, 3)[:, 0] * 1e3
     axes.plot(*broken(board.delays.time, delays), color=COLOURS[0], lw=0.8 * look.thin)
     axes.set_ylabel("captured →\nreceived, ms")
@@ -179,13 +179,13 @@ def latency(axes: Axes, board: BoardSeries, look: Look = SCREEN) -> None:
 def draw_forces(
     board: BoardSeries, out: Path, look: Look = SCREEN, dpi: int | None = None, title: str = ""
 ) -> None:
-    """Write contact forces, peak and tip, net wrench, taxels in contact, and what happened."""
+    """Write contact forces, peak and tip, net wrench, taxels in contact, and events."""
     with drawn(look):
         forces_sheet(board, look, title).save(out, dpi)
 
 
 def forces_sheet(board: BoardSeries, look: Look = SCREEN, title: str = "") -> Sheet:
-    """The same before it is written."""
+    """Make the sheet that `draw_forces` writes."""
     groups = _grouped(board, 72.0 * (look.width_in - 0.12 * look.font_pt), look)
     sheet, rows = _sheet(
         board, f"{title or board.name}: contact forces, features and events",
@@ -226,13 +226,13 @@ def forces_sheet(board: BoardSeries, look: Look = SCREEN, title: str = "") -> Sh
 def draw_field(
     board: BoardSeries, out: Path, look: Look = SCREEN, dpi: int | None = None, title: str = ""
 ) -> None:
-    """Write the field removed, how well it was supported, what was left over, temperature."""
+    """Write the field removed, its support, the residual, and temperature."""
     with drawn(look):
         field_sheet(board, look, title).save(out, dpi)
 
 
 def field_sheet(board: BoardSeries, look: Look = SCREEN, title: str = "") -> Sheet:
-    """The same before it is written."""
+    """Make the sheet that `draw_field` writes."""
     sheet, rows = _sheet(
         board, f"{title or board.name}: ambient field and its removal",
         (1.4, 0.9, 0.9, 0.7), look,
@@ -261,7 +261,7 @@ def field_sheet(board: BoardSeries, look: Look = SCREEN, title: str = "") -> She
     rows[3].set_ylabel("chips, °C")
     for axes in rows[1:]:
         axes.grid(visible=True)
-    for axes in (rows[0], rows[1], rows[3]):  # the third has the curves of the second
+    for axes in (rows[0], rows[1], rows[3]):  # the third row has the curves of the second
         sheet.legend(axes)
     shade(sheet, rows, board, invalid=True)
     return sheet
@@ -291,13 +291,13 @@ def _warmth(axes: Axes, board: BoardSeries, labels: list[str], look: Look) -> No
 def draw_timing(
     board: BoardSeries, out: Path, look: Look = SCREEN, dpi: int | None = None, title: str = ""
 ) -> None:
-    """Write latency, stamps' uncertainty, clock error and drops, with their distributions."""
+    """Write latency, uncertainty of stamps, clock error and drops, with their distributions."""
     with drawn(look):
         timing_sheet(board, look, title).save(out, dpi)
 
 
 def timing_sheet(board: BoardSeries, look: Look = SCREEN, title: str = "") -> Sheet:
-    """The same before it is written."""
+    """Make the sheet that `draw_timing` writes."""
     row_in = 1.35 * look.row_in
     sheet = Sheet(
         look, row_in * (6 if look.narrow else 3),
@@ -343,7 +343,7 @@ def timing_sheet(board: BoardSeries, look: Look = SCREEN, title: str = "") -> Sh
 
 
 def _clock(axes: Axes, board: BoardSeries, look: Look) -> None:
-    """Error of the board's clock; what it was while it was not yet known does not set the scale."""
+    """Draw the error of the board's clock; the time before it was known does not set the scale."""
     errors = [
         (when, float(values["clock_rate_error"]) * 1e6)
         for when, values in zip(board.told.time, board.told.items, strict=True)
@@ -371,13 +371,13 @@ def _clock(axes: Axes, board: BoardSeries, look: Look) -> None:
 
 
 def _range(values: Any) -> str:
-    """ "-414", or "3 points, -414 to 220"."""
+    """Return a text such as "-414", or "3 points, -414 to 220"."""
     low, high = f"{values.min():.3g}", f"{values.max():.3g}"
     return low if len(values) == 1 else f"{len(values)} points, {low} to {high}"
 
 
 def _figures(board: BoardSeries) -> str:
-    """Rate, losses and drops in words."""
+    """Describe rate, losses and drops in words."""
     spread = board.period_spread
     mean = spread.total / spread.number if spread.number else float("nan")
     rate = f"{1 / mean:.1f} Hz, " if mean > 0 else ""
@@ -412,7 +412,10 @@ def _histogram(sheet: Sheet, axes: Axes, spread: Spread, what: str, index: int) 
 
 
 def _logarithmic(axes: Axes, values: Any) -> None:
-    """A logarithmic axis for delays: some are a hundred times others. Told: those not above 0."""
+    """Give delays a logarithmic axis, as some are a hundred times others.
+
+    Say how many are not above 0.
+    """
     known = np.asarray(values)[np.isfinite(values)]
     positive = known[known > 0]
     if not len(positive):
@@ -433,7 +436,7 @@ def _sheet(
     look: Look,
     groups: Sequence[Group] = (),
 ) -> tuple[Sheet, list[Any]]:
-    """Rows of curves under a title; what happened is a strip above them and a list below."""
+    """Make rows of curves under a title, with a strip for events above and their list below."""
     seconds = board.last - board.first
     listed = _listed(groups, board)
     text_in = look.line_in * (len(listed) + 0.5) if listed else 0.0
@@ -461,12 +464,15 @@ def _sheet(
 
 def _lines(axes: Axes, time: list[float], curves: dict[str, list[Any]]) -> None:
     for index, (label, values) in enumerate(curves.items()):
-        style = ("-", "-", "--")[index % 3]  # the last may lie on the one before it
+        style = ("-", "-", "--")[index % 3]  # the last curve may cover the one before it
         axes.plot(*broken(time, values), color=COLOURS[index], ls=style, label=label)
 
 
 def shade(sheet: Sheet, rows: Sequence[Any], board: BoardSeries, *, invalid: bool) -> None:
-    """Grey where the log has nothing, red where features were not to be acted on, and why."""
+    """Shade stretches without data grey, and those with invalid features red.
+
+    Say why in the key.
+    """
     gaps = holes(board.time)
     spans, reasons = _invalid(board) if invalid else ([], [])
     for axes in rows:
@@ -480,7 +486,7 @@ def shade(sheet: Sheet, rows: Sequence[Any], board: BoardSeries, *, invalid: boo
 def explain_shades(
     sheet: Sheet, gaps: Sequence[tuple[float, float]], reasons: Sequence[str] | None
 ) -> None:
-    """Say what the grey and the red stand for; ``reasons``: None where nothing is red."""
+    """Explain grey and red in the key; ``reasons`` is None where nothing is red."""
     from matplotlib.patches import Patch
 
     if gaps:
@@ -495,7 +501,7 @@ def explain_shades(
 
 
 def _invalid(board: BoardSeries) -> tuple[list[tuple[float, float]], list[str]]:
-    """Stretches without valid features, s, and the commonest reasons."""
+    """Find stretches without valid features, s, and the commonest reasons."""
     spans: list[tuple[float, float]] = []
     reasons: dict[str, int] = {}
     usual = period(board.feature_time)
@@ -513,7 +519,7 @@ def _invalid(board: BoardSeries) -> tuple[list[tuple[float, float]], list[str]]:
 
 
 Group = tuple[float, list[str]]
-"""When events happened, s, and their texts: those that happened together share one number."""
+"""Time of events, s, and their texts; events that happened together share a number."""
 
 
 def _grouped(board: BoardSeries, room_pt: float, look: Look) -> list[Group]:
@@ -533,7 +539,7 @@ def _number_pt(look: Look) -> float:
 
 
 def _strip(axes: Axes, groups: Sequence[Group], rows: Sequence[Any], look: Look) -> None:
-    """Numbers at the moments of events, and faint lines through the curves."""
+    """Number the events in a strip, with faint lines through the curves below."""
     begin, end = rows[0].get_xlim()
     axes.set_ylim(0, 1)
     axes.set_yticks([])
@@ -543,7 +549,7 @@ def _strip(axes: Axes, groups: Sequence[Group], rows: Sequence[Any], look: Look)
         axes.spines[side].set_visible(False)
     for number, (when, _) in enumerate(groups, 1):
         if not begin <= when <= end:
-            continue  # by a clock that is not the board's, or while it was silent
+            continue  # stamped by another clock, or while the board was silent
         axes.text(
             when, 0.5, str(number), ha="center", va="center", fontsize=_number_pt(look),
             clip_on=True,
@@ -553,7 +559,7 @@ def _strip(axes: Axes, groups: Sequence[Group], rows: Sequence[Any], look: Look)
 
 
 def _listed(groups: Sequence[Group], board: BoardSeries) -> list[str]:
-    """One line of text a group, and one for those that there is no room for."""
+    """Make a line of text for each group, and one for those there is no room for."""
     lines = []
     for number, (when, texts) in enumerate(groups[:LISTED], 1):
         counts: dict[str, int] = {}

@@ -1,7 +1,7 @@
-"""How pictures look: their sizes, titles, legends and files.
+"""Look of pictures: sizes, titles, legends and files.
 
-Everything a picture says stays inside it and off its data, at any size and however much there is
-to say: a title is wrapped, a legend stands above its axes in as many columns as there is room for.
+All text stays inside the picture and off its data, at any size and in any amount: a title is
+wrapped, a legend stands above its axes in as many columns as fit.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""Okabe and Ito's palette: told apart in print and by the colour-blind."""
+"""Palette of Okabe and Ito, distinguishable in print and by colour-blind people."""
 
 FORMATS = ("png", "pdf", "svg")
 LEAST_DPI, MOST_DPI = 30, 600
-"""Coarser cannot be read; finer takes a gigabyte."""
+"""A coarser picture cannot be read; a finer one takes a gigabyte."""
 
 ENTRIES = 12
-"""Names in one legend; of more than these, how many is told."""
+"""Names in one legend; further names are counted."""
 
 HAIR_SPACE = "\u200a"
 
 UNIT = re.compile(r"(?<=\d) (?=(?:s|N|mm|ms|Hz|µT|cycles|taxels|lost)\b)")
-"""Space between a number and what it counts, at which no line is broken."""
+"""Space between a number and its unit, where lines are not broken."""
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """One size of picture. ``width_in``: inches; ``font_pt``: points of ordinary text.
+    """One size of picture. ``width_in``: inches. ``font_pt``: ordinary text, points.
 
-    ``row_in``: inches of one row of curves. ``narrow``: panels stand below one another. ``dpi``:
-    dots an inch unless the user says otherwise.
+    ``row_in``: height of one row of curves, inches. ``narrow``: panels stand below one another.
+    ``dpi``: dots per inch, unless the user gives another number.
     """
 
     width_in: float
@@ -49,12 +49,12 @@ class Look:
 
     @property
     def thin(self) -> float:
-        """Factor on the widths of lines."""
+        """Factor on line widths."""
         return self.font_pt / 10.0
 
     @property
     def line_in(self) -> float:
-        """Inches that a line of text takes."""
+        """Height of a line of text, inches."""
         return 1.45 * self.font_pt / 72.0
 
 
@@ -63,18 +63,18 @@ LOOKS: Final = {
     "page": Look(7.1, 7.0, 1.25, False, 300),
     "column": Look(3.5, 6.5, 1.0, True, 300),
 }
-"""``page`` and ``column``: the two widths of a paper in two columns, 180 and 89 mm."""
+"""``page`` and ``column``: 180 and 89 mm, the two widths of a paper in two columns."""
 
 SCREEN: Final = LOOKS["screen"]
 
 
 def plain(text: str) -> str:
-    """``text`` as given, but for characters that would not be seen."""
+    """Return ``text`` with invisible characters replaced."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def width_pt(text: str, size_pt: float) -> float:
-    """How wide a line of text is, in points."""
+    """Width of a line of text, points."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import text_to_path
 
@@ -86,7 +86,7 @@ def width_pt(text: str, size_pt: float) -> float:
 
 
 def shortened(text: str, room_pt: float, size_pt: float) -> str:
-    """``text``, cut with … where it is wider than ``room_pt``."""
+    """Return ``text``, cut with … if it is wider than ``room_pt``."""
     if width_pt(text, size_pt) <= room_pt:
         return text
     low, high = 0, len(text)
@@ -100,7 +100,7 @@ def shortened(text: str, room_pt: float, size_pt: float) -> str:
 
 
 def wrapped(text: str, room_pt: float, size_pt: float, most: int) -> str:
-    """``text`` on at most ``most`` lines no wider than ``room_pt``; what is too long ends in …."""
+    """Break ``text`` into at most ``most`` lines no wider than ``room_pt``; the rest becomes …."""
     lines: list[str] = []
     words = text.split(" ")
     while words and len(lines) < most:
@@ -116,7 +116,7 @@ def wrapped(text: str, room_pt: float, size_pt: float, most: int) -> str:
 
 
 class Sheet:
-    """A figure in the making; `save` gives it its legends and writes it."""
+    """A figure being drawn; `save` adds the legends and writes it."""
 
     def __init__(self, look: Look, height_in: float, title: str) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -141,15 +141,15 @@ class Sheet:
         self._legends.append((axes, title))
 
     def key(self, handle: Any, text: str) -> None:
-        """Explain ``handle`` (a patch, a line) under everything else."""
+        """Explain ``handle`` (a patch, a line) below everything else."""
         self._keys.append((handle, text))
 
     def later(self, draw: Callable[[], None]) -> None:
-        """Call ``draw`` when it is known how large everything will be."""
+        """Call ``draw`` once all sizes are known."""
         self._later.append(draw)
 
     def finish(self) -> Any:
-        """Return the figure with everything in its place."""
+        """Return the figure with everything in place."""
         self._explain()
         engine: Any = self.figure.get_layout_engine()
         with _quiet():
@@ -164,7 +164,7 @@ class Sheet:
         return self.figure
 
     def save(self, out: Path, dpi: int | None = None) -> None:
-        """Write the picture; its suffix tells the format."""
+        """Write the picture in the format of its suffix."""
         self.finish()
         metadata: dict[str, Any] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(
             out.suffix.lower().lstrip("."), {}
@@ -189,7 +189,7 @@ class Sheet:
         self._keys.clear()
 
     def _name(self, axes: Axes, title: str) -> int:
-        """Lines of the legend beyond the first."""
+        """Draw the legend; returns its lines beyond the first."""
         handles, labels = axes.get_legend_handles_labels()
         if not handles:
             return 0
@@ -199,7 +199,7 @@ class Sheet:
             handles, labels = handles[:ENTRIES], labels[:ENTRIES]
             title = f"{title} and {more} more".strip()
         room = axes.get_window_extent().width * 72.0 / self.figure.dpi
-        around = 4.0 * size  # a line, and what is between two entries
+        around = 4.0 * size  # a line, and the gap between two entries
         labels = [shortened(label, room - around, size) for label in labels]
         widest = max(width_pt(label, size) for label in labels)
         columns = max(1, min(len(labels), int(room / (widest + around))))
@@ -213,15 +213,15 @@ class Sheet:
 
 
 def named(name: str) -> str:
-    """``name`` as a label: matplotlib would leave out one that begins with an underscore."""
+    """Return ``name`` as a label: matplotlib leaves out one that begins with an underscore."""
     text = plain(name)
     return HAIR_SPACE + text if text.startswith("_") else text
 
 
 @contextmanager
 def drawn(look: Look) -> Iterator[None]:
-    """Within it, everything has the sizes of ``look``, and text stands as it is given."""
-    import matplotlib as mpl  # 0.3 s: not before a picture is really wanted
+    """Draw with the sizes of ``look`` inside the block, and show text literally."""
+    import matplotlib as mpl  # takes 0.3 s: import it only when a picture is wanted
 
     thin = look.thin
     settings: Any = {
@@ -239,7 +239,7 @@ def drawn(look: Look) -> Iterator[None]:
         **{f"{a}tick.major.size": 3.5 * thin for a in "xy"},
         **{f"{a}tick.major.width": 0.8 * thin for a in "xy"},
         **{f"{a}tick.major.pad": 3.5 * thin for a in "xy"},
-        "text.hinting": "none",  # as wide as it is measured, at any size
+        "text.hinting": "none",  # as wide as measured, at any size
         "text.parse_math": False,  # a name may hold a dollar
         "pdf.fonttype": 42,
         "svg.hashsalt": "tactile",
@@ -250,14 +250,14 @@ def drawn(look: Look) -> Iterator[None]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence about letters that the font does not have: they are shown as boxes."""
+    """Suppress warnings about letters that the font lacks: they appear as boxes."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield
 
 
 def plain_ticks(axis: Any, low: float, high: float) -> None:
-    """Label a logarithmic axis with 1, 2, 5, 10 …, thinned where there are many decades."""
+    """Label a logarithmic axis with 1, 2, 5, 10 …, fewer where there are many decades."""
     import math
 
     low, high = max(low, 1e-6), max(high, 1e-5)
@@ -269,13 +269,13 @@ def plain_ticks(axis: Any, low: float, high: float) -> None:
 
 
 def say(axes: Axes, text: str) -> None:
-    """Write ``text`` in the middle of ``axes``, which has nothing else to show."""
+    """Write ``text`` in the middle of ``axes``, which are otherwise empty."""
     axes.set_yticks([])
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color="0.4")
 
 
 def of_several(what: str, which: str, names: Sequence[str], most: int = 6) -> str:
-    """ "board left (of 2: left, right)", or "board left" where there is no other."""
+    """Return "board left (of 2: left, right)", or "board left" if there is only one."""
     if len(names) < 2:
         return f"{what} {which}"
     told = ", ".join(names[:most]) + (", …" if len(names) > most else "")

@@ -1,4 +1,4 @@
-"""Picture of a reach from a log: the cupboard from above, the finger's path, and what happened."""
+"""Draw a reach from a log: the cupboard from above, the finger's path, and the events."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ ACTIVITIES = {
     "excavate_ccw": "#E69F00",
     "excavate_cw": "#CC79A7",
 }
-"""Okabe and Ito's palette: told apart in print and by the colour-blind."""
+"""Palette of Okabe and Ito, distinguishable in print and by colour-blind people."""
 OTHER = "#7f7f7f"
-TOUCHED = "#B2182B"  # contacts and what they did
+TOUCHED = "#B2182B"  # contacts and their effects
 FINGER = "#08306B"
 TARGET = "#F0E442"
 
 M_AT_1_N = 0.0105
-"""Width of the circle of 1 N; its area goes with the force."""
+"""Width of the circle for 1 N, m; its area is proportional to the force."""
 SHEAR_M_PER_N = 0.008
-SHEAR_FROM_N = 0.3  # shorter arrows would be dots
-MOVED_M = 0.004  # an object that went less far is drawn once
-SHOWN = 6  # moments that are numbered
+SHEAR_FROM_N = 0.3  # shorter arrows would look like dots
+MOVED_M = 0.004  # an object that moved less is drawn once
+SHOWN = 6  # numbered moments
 LEAST_N = 0.3  # weaker touches are not numbered
-FAINT_EVERY_S = 0.2  # all the other touches, as faint circles
+FAINT_EVERY_S = 0.2  # further touches are drawn as faint circles
 NAMED = 4
-"""Excavations named; of more, the rest are lines alone."""
+"""Excavations that are named; further ones are only lines."""
 GATES = 6
-"""Rows for what the safety gate did; of more kinds, the rarest share one."""
+"""Rows for what the safety gate did; the rarest kinds share the last one."""
 
 ROOM_M = 0.02
-"""Of the picture round what is in it."""
+"""Margin around the contents, m."""
 
 
 def draw_reach(
@@ -62,7 +62,7 @@ def draw(reach: ReachSeries, out: Path, look: Look = SCREEN, dpi: int | None = N
 
 
 def reach_sheet(reach: ReachSeries, look: Look = SCREEN) -> Sheet:
-    """The same before it is written."""
+    """Make the sheet that `draw` writes."""
     moments = reach.moments(SHOWN, LEAST_N)
     activities = list(dict.fromkeys(s.activity for s in reach.states))
     rows_in = [1.35 * look.row_in, 1.35 * look.row_in]
@@ -107,7 +107,7 @@ def reach_sheet(reach: ReachSeries, look: Look = SCREEN) -> Sheet:
 
 
 def _missing(reach: ReachSeries) -> list[tuple[float, float]]:
-    """Stretches in which any of states, arm and touch is missing, s."""
+    """Find stretches in which states, arm or touch are missing, s."""
     every = sorted([*holes(reach.time), *holes(reach.arm_time), *(holes(reach.touch_time))])
     joined: list[tuple[float, float]] = []
     for begin, end in every:
@@ -119,7 +119,7 @@ def _missing(reach: ReachSeries) -> list[tuple[float, float]]:
 
 
 def _title(reach: ReachSeries) -> str:
-    """Strategy and outcome in words, and which of several this is."""
+    """Describe strategy and outcome, and say which of several reaches this is."""
     outcome = reach.outcome()
     peak = max((t.peak_force for t in reach.touch if math.isfinite(t.peak_force)), default=0.0)
     count = len(reach.excavations())
@@ -140,13 +140,13 @@ def _title(reach: ReachSeries) -> str:
 
 
 def _flip(points: Any) -> Any:
-    """Plotted x is −y (right is right), plotted y is x (up is into the cupboard)."""
+    """Turn points into picture axes: x is −y (right is right), y is x (up is into the cupboard)."""
     points = np.asarray(points)
     return np.stack([-points[..., 1], points[..., 0]], axis=-1)
 
 
 def _spans(reach: ReachSeries) -> list[tuple[float, float, str]]:
-    """(begin, end, activity) of each stretch of one activity, s."""
+    """Find the stretches of one activity each: (begin, end, activity), s."""
     found: list[tuple[float, float, str]] = []
     torn = {end for _, end in holes(reach.time)}
     for when, state in zip(reach.time, reach.states, strict=True):
@@ -168,7 +168,7 @@ def _cupboard(
     at = np.clip(np.searchsorted(reach.time, reach.arm_time), 0, len(reach.states) - 1)
     doing = np.array([reach.states[i].activity for i in at])
     for activity in dict.fromkeys(doing.tolist()):
-        # Gaps where it did something else, or of which nothing is known, must not be bridged.
+        # A line must not bridge stretches of other activities or without data.
         line = np.where((doing == activity)[:, None], tip, np.nan)
         _, line = broken(reach.arm_time, line)
         colour = ACTIVITIES.get(activity, OTHER)
@@ -201,7 +201,7 @@ def _cupboard(
 
 
 def _outline(reach: ReachSeries) -> list[tuple[float, float]]:
-    """Corners of the finger in ``ee``, m, as wide as the log says it was."""
+    """Corners of the finger in ``ee``, m, in the width that the log gives."""
     width = max(y for _, y in FINGER_OUTLINE) - min(y for _, y in FINGER_OUTLINE)
     shown = [] if reach.last_world is None else _shown(reach.last_world)
     told = next((m.scale.y for m in shown if m.ns == "finger"), width)
@@ -222,7 +222,7 @@ def _any_moved(reach: ReachSeries) -> bool:
 
 
 def _objects(axes: Axes, reach: ReachSeries, look: Look) -> None:
-    """Draw walls and objects at the end; those that were moved at the start as well, dashed."""
+    """Draw walls and objects at the end; objects that moved also at the start, dashed."""
     if reach.last_world is None:
         return
     thin = look.thin
@@ -258,12 +258,12 @@ def _objects(axes: Axes, reach: ReachSeries, look: Look) -> None:
 
 
 def _shown(world: Any) -> list[Any]:
-    """Markers of a message but for those that only take away another, as of a fallen object."""
+    """Markers of a message, without those that only delete another (of a fallen object)."""
     return [marker for marker in world.markers if marker.action == ADD]
 
 
 def _shape(marker: Any, **look: Any) -> Any:
-    """A marker seen from above as a patch."""
+    """Make a patch of a marker seen from above."""
     from matplotlib.patches import Circle, Polygon
 
     x, y = marker.pose.position.x, marker.pose.position.y
@@ -275,7 +275,7 @@ def _shape(marker: Any, **look: Any) -> Any:
 
 
 def _contacts(sheet: Sheet, axes: Axes, reach: ReachSeries, moments: Sequence[int]) -> None:
-    """Draw numbered moments as circles with shear arrows, and every other touch faintly."""
+    """Draw numbered moments as circles with shear arrows, and all other touches faintly."""
     look = sheet.look
     marks: list[tuple[int, Any]] = []
     due = 0.0
@@ -298,7 +298,7 @@ def _contacts(sheet: Sheet, axes: Axes, reach: ReachSeries, moments: Sequence[in
 
 
 def _number(sheet: Sheet, axes: Axes, marks: Sequence[tuple[int, Any]]) -> None:
-    """Put a number beside each place, as far as may be from other numbers and places."""
+    """Number each place, far from other numbers and places."""
     look = sheet.look
     per_pt = sheet.figure.dpi / 72.0
     places = [axes.transData.transform(place) for _, place in marks]
@@ -324,7 +324,7 @@ def _number(sheet: Sheet, axes: Axes, marks: Sequence[tuple[int, Any]]) -> None:
 
 
 def _tag(look: Look) -> dict[str, Any]:
-    """How the number of a moment looks."""
+    """Style of the number of a moment."""
     box = {"boxstyle": "circle,pad=0.2", "fc": TOUCHED, "ec": "white", "lw": 0.6 * look.thin}
     return {
         "ha": "center", "va": "center", "fontsize": 0.85 * look.font_pt, "color": "white",
@@ -364,7 +364,7 @@ def _shear(axes: Axes, contact: Contact, look: Look) -> None:
 
 
 def _legends(sheet: Sheet, axes: Axes, activities: Sequence[str], moved: bool) -> None:
-    """Key to colours, sizes and arrows, under the picture from above."""
+    """Draw the key to colours, sizes and arrows below the view from above."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
     from matplotlib.transforms import ScaledTranslation
@@ -389,7 +389,7 @@ def _legends(sheet: Sheet, axes: Axes, activities: Sequence[str], moved: bool) -
         Line2D([], [], ls="", marker="*", ms=11 * thin, color=TARGET, mec="black",
                mew=thin, label="target"),
     ]  # fmt: skip
-    # Under ticks, numbers and label, however high the axes will be.
+    # Below ticks, numbers and label, whatever the height of the axes.
     down_in = (2.7 * sheet.look.font_pt + 14.0 * thin) / 72.0
     below = axes.transAxes + ScaledTranslation(0.0, -down_in, sheet.figure.dpi_scale_trans)
     legend = axes.legend(
@@ -400,7 +400,7 @@ def _legends(sheet: Sheet, axes: Axes, activities: Sequence[str], moved: bool) -
     )  # fmt: skip
 
     def size() -> None:
-        """Circles of the key as large as those in the picture."""
+        """Make circles of the key as large as those in the picture."""
         box = axes.get_window_extent()
         per_m = box.width / (axes.get_xlim()[1] - axes.get_xlim()[0]) * 72.0 / sheet.figure.dpi
         index = things.index(circle)
@@ -447,7 +447,7 @@ def _force(axes: Axes, reach: ReachSeries, moments: Sequence[int], look: Look) -
     axes.grid(visible=True)
     known = [v for v in (*total, *peak, *load) if math.isfinite(v)]
     top = 1.05 * max([1.0, *known])
-    # The numbers stand above every curve, the next one higher where two would touch.
+    # The numbers stand above every curve; where two would overlap, the second is placed higher.
     axes.set_ylim(0, top * (1.32 if moments else 1.0))
     levels, last = 2, -math.inf
     level = 0
@@ -475,7 +475,7 @@ def _gates(reach: ReachSeries) -> list[tuple[str, list[str]]]:
 
 
 def _activity(axes: Axes, reach: ReachSeries, names: Sequence[str], look: Look) -> None:
-    """Bars for what it did, and under them for what the safety gate did."""
+    """Draw bars for the activities, and below them for what the safety gate did."""
     for begin, end, activity in _spans(reach):
         colour = ACTIVITIES.get(activity, OTHER)
         axes.barh(names.index(activity), max(end - begin, 0.02), left=begin, height=0.7, fc=colour)

@@ -1,4 +1,4 @@
-"""One reach out of a log: states, arm, touch, events and the world before and after."""
+"""One reach of a log: states, arm, touch, events, and the world before and after."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ WANTED = frozenset({ARM_STATE, FEATURES, REACH_EVENT, REACH_STATE, WORLD})
 UNDER_WAY = frozenset({"homing", "reaching"})
 
 MAX_POINTS = 200_000
-"""Messages kept of each kind: half an hour of control cycles, far longer than any reach."""
+"""Messages kept of each kind: half an hour of control cycles, far longer than a reach."""
 
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """One patch of a moment. ``place``, ``shear``: (2,) m and N in ``cupboard``; ``normal`` in N.
+    """One contact patch. ``place`` (2,) m and ``shear`` (2,) N in ``cupboard``; ``normal``, N.
 
     ``shear`` is the part of the in-plane force that acts along the skin.
     """
@@ -39,7 +39,7 @@ class Contact:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """A reach that the log holds: who reached, by what strategy, how it ended ("" unknown)."""
+    """A reach in the log: its name, its strategy, and how it ended ("" if unknown)."""
 
     name: str
     strategy: str
@@ -48,10 +48,10 @@ class Told:
 
 @dataclass(eq=False)
 class ReachSeries:
-    """What a log says of one reach. Times are s since that reach began.
+    """What a log says of one reach. Times are seconds since the reach began.
 
-    ``number``: among all in the log, from 1. ``arms``, ``boards``: those heard of meanwhile, of
-    which ``arm_name`` and ``board_name`` are drawn. ``left_out``: messages beyond `MAX_POINTS`.
+    ``number``: among all in the log, from 1. ``arms``, ``boards``: those heard meanwhile;
+    ``arm_name`` and ``board_name`` are drawn. ``left_out``: number of messages beyond `MAX_POINTS`.
     """
 
     start_ns: int
@@ -72,7 +72,7 @@ class ReachSeries:
     newest: Any = None
 
     def is_over(self, state: Any) -> bool:
-        """Whether ``state`` is of a later reach, the end of this one being lost in a hole."""
+        """Whether ``state`` belongs to a later reach, the end of this one being lost in a hole."""
         last = self.newest
         return (
             last is not None
@@ -83,7 +83,7 @@ class ReachSeries:
 
     @property
     def arm_time(self) -> list[float]:
-        """Of `arm`."""
+        """Times of `arm`, s."""
         return self.arms[self.arm_name][0]
 
     @property
@@ -93,20 +93,20 @@ class ReachSeries:
 
     @property
     def touch_time(self) -> list[float]:
-        """Of `touch`."""
+        """Times of `touch`, s."""
         return self.boards.get(self.board_name, ([], []))[0]
 
     @property
     def touch(self) -> list[Any]:
-        """Features of the board that is drawn; none where nothing was felt or logged."""
+        """Features of the board that is drawn; empty where nothing was felt or logged."""
         return self.boards.get(self.board_name, ([], []))[1]
 
     def outcome(self) -> Any:
-        """The event that tells how the reach ended, None when the log was cut off before."""
+        """The event that says how the reach ended; None when the log was cut off before."""
         return next((e for _, e in self.events if e.kind == "outcome"), None)
 
     def excavations(self) -> list[tuple[float, str]]:
-        """When each excavation began, and "cw stall" and the like."""
+        """Time of the start of each excavation, s, and its kind, such as "cw stall"."""
         return [
             (when, event.text)
             for when, event in self.events
@@ -114,13 +114,13 @@ class ReachSeries:
         ]
 
     def pose_at(self, when: float) -> tuple[float, float, float]:
-        """Pose of the wrist pivot at ``when``: m, m, rad."""
+        """Pose of the wrist pivot at ``when``: x, y in m, heading in rad."""
         k = min(int(np.searchsorted(self.arm_time, when)), len(self.arm) - 1)
         arm = self.arm[k]
         return float(arm.x), float(arm.y), float(arm.heading)
 
     def placed(self) -> NDArray[np.bool_]:
-        """(features,) whether it is known where the arm was: not in a hole of its states."""
+        """Whether the arm's place is known at each of `touch`, outside holes of its states."""
         times, asked = np.asarray(self.arm_time), np.asarray(self.touch_time)
         if not len(asked):
             return np.zeros(0, bool)
@@ -130,13 +130,13 @@ class ReachSeries:
         return np.asarray(away <= max(HOLE_PERIODS * period(times), 0.02))
 
     def tip(self) -> FloatArray:
-        """(arm states, 2) m: path of the tip."""
+        """Path of the tip, (arm states, 2) m."""
         poses = np.array([(a.x, a.y, a.heading) for a in self.arm])
         ahead = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
         return np.asarray(poses[:, :2] + TIP_X * ahead)
 
     def contacts_at(self, index: int) -> list[Contact]:
-        """Patches of the ``index``-th features, where the finger then was."""
+        """Contact patches of the features at ``index``, placed where the finger was then."""
         x, y, heading = self.pose_at(self.touch_time[index])
         found = []
         for patch in self.touch[index].patches:
@@ -154,9 +154,9 @@ class ReachSeries:
         return found
 
     def moments(self, most: int, least_n: float) -> list[int]:
-        """Features of the strongest moments, in order of time: each of another press.
+        """Indices of the strongest moments of touch, each of another press, in order of time.
 
-        None below ``least_n``, none while it is not known where the arm was.
+        Moments below ``least_n`` and those at which the arm's place is unknown are left out.
         """
         sides = 1 + max((p.side for t in self.touch for p in t.patches), default=0)
         force = np.zeros((len(self.touch), sides))
@@ -173,7 +173,7 @@ _NORMALS = np.concatenate([a.rotation[:, :2, 2] for a in _SKIN.arrays])
 
 
 def _outward(place: FloatArray) -> FloatArray:
-    """(2,) unit normal of the skin in ``ee`` at its taxel nearest to ``place`` (m, ``ee``)."""
+    """Unit normal (2,) of the skin in ``ee`` at the taxel nearest to ``place`` (m, ``ee``)."""
     nearest = int(((_PLACES - place) ** 2).sum(axis=1).argmin())
     return np.asarray(_NORMALS[nearest] / np.linalg.norm(_NORMALS[nearest]))
 
@@ -190,10 +190,10 @@ def read_reach(
     board: str | None = None,
     arm: str | None = None,
 ) -> ReachSeries:
-    """Return one reach of a log, the last unless ``number`` (from 1, in the order they began).
+    """Return one reach of a log: number ``number`` from 1 in order of beginning, else the last.
 
-    ``board``, ``arm``: whose features and states; else those of which there is most.
-    LogUnreadableError when the log holds no reach, ToolError when it holds no such one.
+    ``board``, ``arm``: whose features and states to draw; by default those with the most messages.
+    LogUnreadableError when the log holds no reach, ToolError when it does not hold this one.
     """
     reader = _Reader(number)
     for topic, name, message in messages(path, WANTED):
@@ -219,7 +219,7 @@ def read_reach(
 
 
 def listed(told: Sequence[Told]) -> str:
-    """One line a reach."""
+    """List the reaches, one per line."""
     many = len({reach.name for reach in told}) > 1
     return "\n".join(
         f"  {number}  {reach.name + ': ' if many else ''}{reach.strategy}, "
@@ -236,14 +236,14 @@ def _choose(what: str, asked: str | None, held: dict[str, tuple[list[float], lis
 
 
 class _Reader:
-    """Goes through a log and keeps one reach of it."""
+    """Reads a log and keeps one reach of it."""
 
     def __init__(self, wanted: int | None) -> None:
         self.told: list[Told] = []
         self.chosen: ReachSeries | None = None
         self._wanted = wanted
         self._world: Any = None
-        self._current: dict[str, ReachSeries] = {}  # of each reach name, the last that began
+        self._current: dict[str, ReachSeries] = {}  # the latest reach of each name
 
     def take(self, topic: Any, name: str, message: Any) -> None:
         """Take the next message."""

@@ -1,4 +1,4 @@
-"""Time series of boards out of a log, for plots and summaries. Memory is bounded on any length."""
+"""Time series of boards from a log, for plots and summaries, in bounded memory."""
 
 from __future__ import annotations
 
@@ -33,24 +33,25 @@ from tactile_tools.log.terminal import ToolError
 WANTED = frozenset({AMBIENT, DIAGNOSTICS, FEATURES, FIELD, FORCES, GEOMETRY, LOG, REACH_EVENT})
 
 MAX_POINTS = 16_384
-"""Points of one curve: ten times the pixels of a picture's width. Beyond, every two become one."""
+"""Points of one curve: ten times the pixels of a picture's width. With more, each pair becomes
+one."""
 
 MAX_EVENTS = 200
-"""Remarks kept of a board, and events of reaches: more would not be legible. More are counted."""
+"""Events kept of a board or of reaches: more would not be legible. The rest are counted."""
 
 WARNING = 30
-"""Level of ``rcl_interfaces/Log`` from which a remark is an event."""
+"""Level of ``rcl_interfaces/Log`` from which a message is an event."""
 
 LATENCY_BINS = np.geomspace(1e-5, 100.0, 281)
-"""s; 40 to a decade, so that a percentile is right to 6 %."""
+"""Edges of bins, s; 40 per decade, so that a percentile is accurate to 6 %."""
 
 
 class LogUnreadableError(Exception):
-    """The file is no MCAP log, or holds nothing that was asked for. The text names the remedy."""
+    """The file is not an MCAP log, or lacks what was asked for; the text names the remedy."""
 
 
 class Track:
-    """Points of one curve. When there are too many, of every two neighbours the greater stays."""
+    """Points of one curve. When there are too many, the greater of each pair is kept."""
 
     def __init__(self, limit: int = MAX_POINTS) -> None:
         self.time: list[float] = []
@@ -65,7 +66,10 @@ class Track:
         return len(self.time)
 
     def add(self, time: float, item: Any, weight: float = 0.0) -> None:
-        """Add a point; ``weight``: what makes it worth keeping beside its neighbour."""
+        """Add a point.
+
+        Of two neighbours the one with the greater ``weight`` may outlive the other.
+        """
         if self._best is None or weight > self._best[1]:
             self._best = (time, weight, item)
         self._taken += 1
@@ -91,7 +95,7 @@ class Track:
 
 @dataclass(eq=False)
 class Spread:
-    """Distribution of a duration, s; exact count, least, greatest and mean, percentiles to 6 %."""
+    """Distribution of a duration, s: exact count, extremes and mean; percentiles to 6 %."""
 
     counts: NDArray[np.int64] = field(
         default_factory=lambda: np.zeros(len(LATENCY_BINS) + 1, np.int64)
@@ -101,18 +105,18 @@ class Spread:
     greatest: float = -np.inf
 
     def add(self, seconds: float) -> None:
-        """Count one."""
+        """Count a duration."""
         self.counts[int(np.searchsorted(LATENCY_BINS, seconds))] += 1
         self.total += seconds
         self.least, self.greatest = min(self.least, seconds), max(self.greatest, seconds)
 
     @property
     def number(self) -> int:
-        """How many were counted."""
+        """Number of durations."""
         return int(self.counts.sum())
 
     def percentile(self, share: float) -> float:
-        """s below which ``share`` (0 to 1) of them lie; NaN for none."""
+        """Duration, s, below which ``share`` (0 to 1) of them lie; NaN if there are none."""
         if not self.number:
             return float("nan")
         index = int(np.searchsorted(np.cumsum(self.counts), share * self.number))
@@ -122,21 +126,21 @@ class Spread:
 
 @dataclass(eq=False)
 class BoardSeries:
-    """What a log says of one board. Times are s since the first cycle of the log."""
+    """What a log says of one board. Times are seconds since the first cycle of the log."""
 
     name: str
-    start_ns: int = 0  # monotonic clock of the sender at time 0
+    start_ns: int = 0  # sender's monotonic clock at time 0
     geometry: Any = None
     cycles: int = 0
     first: float = 0.0
     last: float = 0.0
-    lost: int = 0  # cycles by the gaps of their numbers
+    lost: int = 0  # cycles missing in the sequence
     forces: Track = field(default_factory=Track)  # (N, 3) N, taxel axes
     delays: Track = field(default_factory=Track)  # (captured to received, uncertainty, to log), s
     felt: Track = field(default_factory=Track)  # features
     removed: Track = field(default_factory=Track)  # ambient
-    warmth: Track = field(default_factory=Track)  # °C, one an array
-    told: Track = field(default_factory=Track)  # diagnostics as a dictionary
+    warmth: Track = field(default_factory=Track)  # °C, one per array
+    told: Track = field(default_factory=Track)  # diagnostics as dictionaries
     latency_spread: Spread = field(default_factory=Spread)
     logging_spread: Spread = field(default_factory=Spread)
     period_spread: Spread = field(default_factory=Spread)
@@ -147,32 +151,32 @@ class BoardSeries:
 
     @property
     def time(self) -> list[float]:
-        """Of `force`."""
+        """Times of `force`, s."""
         return self.forces.time
 
     @property
     def force(self) -> list[FloatArray]:
-        """(N, 3) N each."""
+        """Force on each taxel, (N, 3) N each."""
         return self.forces.items
 
     @property
     def feature_time(self) -> list[float]:
-        """Of `features`."""
+        """Times of `features`, s."""
         return self.felt.time
 
     @property
     def features(self) -> list[Any]:
-        """Messages."""
+        """Messages of type ``ContactFeatures``."""
         return self.felt.items
 
     @property
     def ambient_time(self) -> list[float]:
-        """Of `ambient`."""
+        """Times of `ambient`, s."""
         return self.removed.time
 
     @property
     def ambient(self) -> list[Any]:
-        """Messages."""
+        """Messages of type ``AmbientField``."""
         return self.removed.items
 
     def array_slices(self) -> list[tuple[str, slice]]:
@@ -185,7 +189,7 @@ class BoardSeries:
         return [(n, slice(a, b)) for n, a, b in zip(names, ends, ends[1:], strict=False)]
 
     def contact_force(self) -> FloatArray:
-        """(features, arrays) N: sum of the normal forces of each array's contact patches."""
+        """Sum of the normal forces of each array's contact patches, (features, arrays) N."""
         force = np.zeros((len(self.features), len(self.array_slices())))
         for row, features in enumerate(self.features):
             for patch in features.patches:
@@ -194,7 +198,7 @@ class BoardSeries:
         return force
 
     def take(self, topic: Topic, message: Any, log_ns: int, start: int) -> None:
-        """Add one message of this board; ``start``: monotonic ns of time 0."""
+        """Add a message of this board. ``start``: monotonic ns of time 0."""
         if topic == GEOMETRY:
             self.geometry = message
         elif topic == DIAGNOSTICS:
@@ -215,7 +219,7 @@ class BoardSeries:
                 self.warmth.add(now, np.asarray(message.temperature_c, np.float32).copy())
 
     def remark(self, when: float, text: str) -> None:
-        """Keep what happened, or count it where there is too much."""
+        """Keep an event, or count it where there are too many."""
         if len(self.events) < MAX_EVENTS:
             self.events.append((when, text))
         else:
@@ -225,7 +229,7 @@ class BoardSeries:
         force = np.asarray(message.force, np.float32).reshape(-1, 3).copy()
         self.forces.add(now, force, float(np.nan_to_num(-force[:, 2]).max(initial=0.0)))
         delay = (message.received_ns - message.captured_ns) * 1e-9
-        # The header's stamp is the captured instant on the wall clock that the log goes by.
+        # The header's stamp is the instant of capture on the wall clock of the log.
         offset = stamp_ns(message.header.stamp) - message.captured_ns
         logged = (log_ns - offset - message.received_ns) * 1e-9
         self.delays.add(now, (delay, float(message.uncertainty), logged), delay + max(0.0, logged))
@@ -261,7 +265,7 @@ def messages(
 ) -> Iterator[tuple[Topic, str, Any]]:
     """Yield (topic, name, message) of a log in file order, also of one that was cut off.
 
-    LogUnreadableError when the file cannot be read, or when a message is not what it says.
+    LogUnreadableError when the file cannot be read, or when a message does not fit its type.
     """
     for topic, name, message, _ in _timed(source, wanted, progress):
         yield topic, name, message
@@ -270,7 +274,7 @@ def messages(
 def _timed(
     source: Path | Sequence[Path], wanted: frozenset[Topic], progress: Progress | None
 ) -> Iterator[tuple[Topic, str, Any, int]]:
-    """The same with the log time of each."""
+    """Yield the messages with their log times, ns."""
     decoder = Decoder()
     found: dict[str, tuple[Topic, str] | None] = {}
     checked: set[Stream] = set()
@@ -297,7 +301,7 @@ def _timed(
 
 
 def _require_fields(decoder: Decoder, stream: Stream) -> None:
-    """DecodeError where another version's definition lacks a field that this one goes by."""
+    """DecodeError when the definition of another version lacks a field that is needed here."""
     ours = {name for name, _ in codec().fields(stream.msgtype)}
     theirs = {name for name, _ in decoder.reader(stream).fields[stream.msgtype][1]}
     if lacking := ours - theirs - LATER_FIELDS.get(stream.msgtype, frozenset()):

@@ -17,22 +17,23 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SHEAR_PITCHES = 0.75
-"""Length of the arrow in the key of a map, over the distance of two taxels."""
+"""Length of the arrow in the key of a map, as a multiple of the distance of two taxels."""
 ROUND = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-"""N that a circle and an arrow of the key may stand for."""
+"""Forces, N, that a circle and an arrow of the key may stand for."""
 LARGEST = 8.0
-"""Times the key's force that the greatest of a picture may be: its circle is then three wide."""
+"""Greatest force of a picture as a multiple of the key's: its circle is then three times as
+wide."""
 ABOVE_MM = 24.0
-"""Of the longest arrow on the finger from above."""
-SHOWN_FROM_N = 0.1  # noise of a taxel is about 0.03 N
-MOMENTS = 3  # of the strongest presses
+"""Length of the longest arrow on the finger from above, mm."""
+SHOWN_FROM_N = 0.1  # a taxel's noise is about 0.03 N
+MOMENTS = 3  # number of strongest presses
 MAPS = 12
-"""Arrays drawn of one moment, those that bear the most; a board may have 128."""
+"""Arrays drawn for one moment, those with the greatest load; a board may have 128."""
 ACROSS = 4
-"""Maps beside one another; half of it in a narrow picture."""
+"""Maps side by side; half as many in a narrow picture."""
 SIDE_NAMES = {Side.LEFT: "left side", Side.RIGHT: "right side", Side.TIP: "tip", Side.NONE: ""}
 ORDER = (Side.RIGHT, Side.TIP, Side.LEFT, Side.NONE)
-"""As the skin is wrapped round the finger: its maps then join."""
+"""Order in which the skin wraps around the finger, so that neighbouring maps join."""
 PRESS, SHEAR, MASKED = COLOURS[0], COLOURS[1], "crimson"
 
 
@@ -46,7 +47,7 @@ def draw(
     dpi: int | None = None,
     title: str = "",
 ) -> None:
-    """Write the overview of one board. ``applied``: times (s) and forces (N) known to be true."""
+    """Write the overview of one board. ``applied``: times (s) and true forces (N), if known."""
     with drawn(look):
         overview_sheet(board, at, applied, look, title).save(out, dpi)
 
@@ -58,7 +59,7 @@ def overview_sheet(
     look: Look = SCREEN,
     title: str = "",
 ) -> Sheet:
-    """The same before it is written."""
+    """Make the sheet that `draw` writes."""
     moment = strongest(board, 1)[0] if at is None else nearest(board, at)
     maps = _Maps(board, [moment], look)
     heights = [maps.height_in, *(ratio * look.row_in for ratio in (1.1, 1.1, 0.8))]
@@ -87,7 +88,7 @@ def draw_taxels(
     dpi: int | None = None,
     title: str = "",
 ) -> None:
-    """Write taxel maps of some moments: those at ``at``, or the strongest."""
+    """Write taxel maps of the moments ``at`` (s), or of the strongest ones."""
     with drawn(look):
         taxels_sheet(board, at, look, title).save(out, dpi)
 
@@ -95,7 +96,7 @@ def draw_taxels(
 def taxels_sheet(
     board: BoardSeries, at: Sequence[float] | None = None, look: Look = SCREEN, title: str = ""
 ) -> Sheet:
-    """The same before it is written."""
+    """Make the sheet that `draw_taxels` writes."""
     moments = [nearest(board, when) for when in at] if at else strongest(board, MOMENTS)
     maps = _Maps(board, moments, look)
     heights = [*(maps.height_in for _ in moments), look.row_in]
@@ -111,7 +112,7 @@ def taxels_sheet(
     sheet.legend(axes)
     _finish(sheet, [axes], board)
     low, top = axes.get_ylim()
-    # Room above the curves, so that the numbers are not on them.
+    # Room above the curves for the numbers.
     axes.set_ylim(low, top + 0.25 * (top - low))
     for number, moment in enumerate(moments, start=1):
         when = board.time[moment]
@@ -131,9 +132,9 @@ def nearest(board: BoardSeries, when: float) -> int:
 
 
 def strongest(board: BoardSeries, count: int) -> list[int]:
-    """Indices, in time, of the strongest cycle of each of the strongest presses.
+    """Indices, in order of time, of the strongest cycle of each of the strongest presses.
 
-    The last cycle where nothing was pressed.
+    The last cycle if nothing was pressed.
     """
     if board.features:
         times, forces = np.asarray(board.feature_time), board.contact_force()
@@ -162,7 +163,7 @@ def _finish(sheet: Sheet, rows: list[Any], board: BoardSeries) -> None:
 
 
 class _Maps:
-    """Maps of moments to one scale: all sides in the order they join, and the finger from above."""
+    """Maps of moments on one scale: all sides in the order in which they join, and the finger."""
 
     def __init__(self, board: BoardSeries, moments: Sequence[int], look: Look) -> None:
         self.board, self.look = board, look
@@ -185,7 +186,7 @@ class _Maps:
 
     @property
     def height_in(self) -> float:
-        """Inches that the maps of one moment take."""
+        """Height of the maps of one moment, inches."""
         return self.down * 1.35 * self.look.row_in + 1.5 * self.look.line_in
 
     def draw(self, sheet: Sheet, place: Any, moment: int, label: str) -> None:
@@ -207,7 +208,7 @@ class _Maps:
             _from_above(axes, self.board, moment, self.look)
 
     def explain(self, sheet: Sheet) -> None:
-        """What circles, arrows and crosses stand for."""
+        """Draw the key to circles, arrows and crosses."""
         from matplotlib.lines import Line2D
 
         size = 7 * self.look.thin
@@ -229,7 +230,7 @@ class _Maps:
         return surface.min(axis=0) - 0.7 * self.pitch, surface.max(axis=0) + 0.7 * self.pitch
 
     def _map(self, axes: Axes, moment: int, name: str, taxels: slice, label: str) -> None:
-        """One array, seen from outside: circles for normal force, arrows for what shears it."""
+        """Draw one array seen from outside: circles for normal force, arrows for shear force."""
         surface = _surface(self.board, taxels)
         force = self.board.force[moment][taxels]
         healthy = np.isfinite(force).all(axis=1)
@@ -269,18 +270,18 @@ def _round(newton: float) -> float:
 
 
 def _surface(board: BoardSeries, taxels: slice) -> Any:
-    """Places on the unrolled skin, (n, 2) mm."""
+    """Places of the taxels on the unrolled skin, (n, 2) mm."""
     surface = np.asarray(board.geometry.surface)
     if surface.size:
         return surface.reshape(-1, 2)[taxels] * 1e3
-    # The largest boards leave it out of their geometry: the array as it lies, seen from above.
+    # The geometry of the largest boards lacks the unrolled skin; use the places seen from above.
     places = np.asarray(board.geometry.position).reshape(-1, 3)[taxels]
     centred = places - places.mean(axis=0)
     return centred @ np.linalg.svd(centred)[2][:2].T * 1e3
 
 
 def _pitch(surface: Any) -> float:
-    """mm between a taxel and the one nearest to it, the median; of one taxel 10."""
+    """Median distance of a taxel to its nearest neighbour, mm; 10 for a single taxel."""
     if len(surface) < 2:
         return 10.0
     away = np.linalg.norm(surface[:, None] - surface[None], axis=-1)
@@ -291,7 +292,7 @@ def _pitch(surface: Any) -> float:
 def _circles(
     axes: Axes, places: Any, widths: Any, *, hollow: bool = False, thin: float = 1.0
 ) -> None:
-    """Circles as wide as ``widths``, in the units of the axes."""
+    """Draw circles of diameter ``widths``, in the units of the axes."""
     from matplotlib.collections import EllipseCollection
 
     style: dict[str, Any] = (
@@ -316,7 +317,7 @@ def _arrows(axes: Axes, places: Any, along: Any, thin: float) -> None:
 
 
 def _direction(board: BoardSeries, taxels: slice) -> str:
-    """Which way the tip is on a map."""
+    """Say in which direction the tip lies on a map."""
     surface = _surface(board, taxels)
     ahead = np.asarray(board.geometry.position).reshape(-1, 3)[taxels, 0]
     slope = float(np.dot(surface[:, 0] - surface[:, 0].mean(), ahead - ahead.mean()))
@@ -328,7 +329,7 @@ def _direction(board: BoardSeries, taxels: slice) -> str:
 
 
 def _from_above(axes: Axes, board: BoardSeries, moment: int, look: Look) -> None:
-    """The finger from above with its contact patches: where it is touched, what pushes on it."""
+    """Draw the finger from above, with its contact patches and the forces on them."""
     outline = np.array([*FINGER_OUTLINE, FINGER_OUTLINE[0]]) * 1e3
     axes.plot(-outline[:, 1], outline[:, 0], color="0.3", lw=1.3 * look.thin)
     position = np.asarray(board.geometry.position).reshape(-1, 3) * 1e3
@@ -348,7 +349,8 @@ def _from_above(axes: Axes, board: BoardSeries, moment: int, look: Look) -> None
                 arrowprops={"arrowstyle": "-|>", "color": SHEAR, "lw": 1.4 * look.thin,
                             "mutation_scale": 10 * look.thin, "shrinkA": 0, "shrinkB": 0},
             )  # fmt: skip
-        # At the edge on the side that is touched, one under another: never on each other.
+        # Labels stand at the edge on the touched side, one below another, so that they never
+        # overlap.
         for side, mine in ((-1, [p for p in patches if p.centroid.y > 0]),
                            (1, [p for p in patches if p.centroid.y <= 0])):  # fmt: skip
             last = np.inf
