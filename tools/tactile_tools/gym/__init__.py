@@ -13,5 +13,5 @@ __all__ = ["ENVIRONMENT", "CupboardEnv"]
 
 ENVIRONMENT = "Cupboard-v0"
 
-if ENVIRONMENT not in gymnasium.registry:  # a second import under another name changes nothing
+if ENVIRONMENT not in gymnasium.registry:  # imported under another name
     gymnasium.register(id=ENVIRONMENT, entry_point="tactile_tools.gym.env:CupboardEnv")

@@ -1,8 +1,8 @@
 """Reaching into a cluttered cupboard by touch, with the safety gate between agent and arm.
 
-World, arm, touch and gate are the objects that the daemons and the lockstep trials use, on virtual
-time: the same seed and actions give the same observations to the bit. What an agent asks for passes
-the gate, so a policy trained here has seen what the gate does, and cannot learn to exceed limits.
+World, arm, touch and gate are the objects of the daemons and the lockstep trials, on virtual time:
+the same seed and actions give the same observations bit for bit. An agent's actions pass the gate,
+so a policy trained here has met the gate and cannot learn to exceed its limits.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Float32 = NDArray[np.float32]
 Observation = dict[str, Float32]
 
 MAX_PATCHES: Final = 8
-"""Contacts that an observation holds, strongest first; weaker ones are left out."""
+"""Contacts in an observation, strongest first; weaker ones are left out."""
 
 PATCH_FIELDS: Final = ("present", "x", "y", "force_x", "force_y", "normal_force")
 TOUCH_FIELDS: Final = ("valid", "peak_force", "total_force", "tip_force", "left", "right", "tip")
@@ -42,7 +42,7 @@ ARM_FIELDS: Final = ("x", "y", "cos", "sin", "vx", "vy", "omega", "fx", "fy", "m
 GOAL_FIELDS: Final = ("ahead", "left", "time_left")
 
 FORCE_LIMIT_N: Final = 100.0
-"""Forces are cut to this in observations, several times what the gate allows."""
+"""Forces in observations are cut to this, several times what the gate allows."""
 
 MAX_SCENE: Final = 1 << 31
 
@@ -65,14 +65,14 @@ class CupboardEnv(gymnasium.Env[Observation, Float32]):
 
     Observation, all float32, forces in N on the finger, places in m:
 
-    - ``arm`` (10,): pivot's x, y, cosine and sine of its heading, twist (m/s, rad/s), and the
-      wrench of the arm's own sensor (N, N·m), in the frame ``cupboard``;
-    - ``goal`` (3,): where the goal lies from the tip, ahead and left in the finger's frame; the
-      part of the time that is left;
-    - ``touch`` (7,): 1 where touch is valid, greatest and summed normal force, that at the tip, and
-      which side the greatest is on;
-    - ``patches`` (8, 6): contacts, strongest first: 1 where there is one, place and force in the
-      finger's frame ``ee``, normal force; zeros after the last.
+    - ``arm`` (10,): x and y of the pivot, cosine and sine of its heading, twist (m/s, rad/s), and
+      the wrench of the arm's own sensor (N, N·m), in the frame ``cupboard``;
+    - ``goal`` (3,): place of the goal from the tip, ahead and left in the finger's frame; the part
+      of the time that is left;
+    - ``touch`` (7,): 1 if touch is valid; greatest, summed and tip normal force; three flags for
+      the side of the greatest (left, right, tip);
+    - ``patches`` (8, 6): contacts, strongest first: 1, then place and force in the finger's frame
+      ``ee`` and normal force; zeros after the last.
 
     Reward: part of the initial distance gained in the step, and 1 for reaching the goal. The
     episode ends when the goal is reached or the gate latches (``info["held"]`` says why), and is
@@ -80,7 +80,7 @@ class CupboardEnv(gymnasium.Env[Observation, Float32]):
 
     ``scene``: as for ``tactile reach --scene``. ``depth``: touch from exact contacts, or through
     simulated taxels and the whole pipeline. ``overrides``: parameters as for ``reachd --set``.
-    SceneError or SettingError, both ValueError, for what does not exist.
+    SceneError or SettingError (both are ValueError) for an unknown scene or parameter.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - gymnasium declares it so
@@ -126,7 +126,7 @@ class CupboardEnv(gymnasium.Env[Observation, Float32]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode in another scene; ``options={"scene_seed": n}`` chooses which.
+        """Begin an episode in another scene; ``options={"scene_seed": n}`` chooses the scene.
 
         RuntimeError when the gate refuses to arm.
         """
@@ -140,7 +140,7 @@ class CupboardEnv(gymnasium.Env[Observation, Float32]):
     def step(
         self, action: Float32
     ) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Ask for a twist for some control cycles; numbers beyond -1 to 1 are cut to them.
+        """Ask for a twist for some control cycles; numbers beyond -1 to 1 are cut to that range.
 
         RuntimeError before the first `reset`.
         """
@@ -161,11 +161,11 @@ class CupboardEnv(gymnasium.Env[Observation, Float32]):
         return episode.observe(), float(reward), terminated, truncated, episode.info()
 
     def close(self) -> None:
-        """Let go of the world."""
+        """Release the world."""
         self._episode = None
 
     def make_episode_parts(self, scene_seed: int, board_seed: int) -> tuple[Any, World, Sense]:
-        """Parameters, world and sense of touch of one episode."""
+        """Parameters, world and sense of touch of an episode."""
         scene = load_scene(self._scene_name, scene_seed)
         chosen = parameter_set(self._set_name or scene.parameters, self._overrides)
         sense: Sense = ContactSense() if self._depth == "contacts" else TaxelSense(board_seed)
@@ -204,7 +204,7 @@ class _Episode:
 
     @property
     def elapsed(self) -> float:
-        """s since the episode began."""
+        """Time since the episode began, s."""
         return seconds_between(self._began, self._now)
 
     @property
@@ -212,7 +212,7 @@ class _Episode:
         return self.reached or self.held is not None or self.elapsed >= self.goal.time_limit
 
     def cycle(self, asked: NDArray[np.float64]) -> None:
-        """One control cycle: what is asked for, the gate, the arm, the world."""
+        """Run one control cycle: the action, the gate, the arm, the world."""
         ahead, left = asked[0] * self._p.v_max, asked[1] * self._p.v_max
         c, s = math.cos(self._state.heading), math.sin(self._state.heading)
         wanted = Twist(
@@ -297,7 +297,7 @@ def _limits(fields: tuple[str, ...]) -> Float32:
 
 
 def _cut(fields: tuple[str, ...], values: tuple[float, ...]) -> Float32:
-    """``values`` as float32 within their limits; what is not finite becomes 0."""
+    """Return ``values`` as float32 within their limits; what is not finite becomes 0."""
     limit = _limits(fields)
     plain = np.nan_to_num(np.array(values, np.float64), nan=0.0)
     cut: Float32 = np.clip(plain.astype(np.float32), -limit, limit)

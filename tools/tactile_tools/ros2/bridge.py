@@ -1,9 +1,9 @@
-"""The bridge: what our bus says becomes ROS 2 topics, and what ROS 2 asks for comes to our bus.
+"""The bridge: our streams become ROS 2 topics, and accepted requests from ROS 2 reach our bus.
 
-Messages are ROS 2 types already, so their bytes go over unchanged, in the thread that received
-them. Nothing is queued on the way out; what the link cannot take is dropped, and gaps of a stream
-show in its sequence numbers. Requests from ROS are off unless accepted by name: whoever reaches the
-router may send them, while our bus lets in only who proves a right.
+Messages have ROS 2 types already, so their bytes are passed on unchanged, in the thread that
+received them. Nothing is queued on the way out: what the link cannot take is dropped, and shows as
+a gap in the sequence numbers. Requests from ROS are refused unless accepted by name, because anyone
+who reaches the router may send them, while our bus admits only those who prove a right.
 """
 
 from __future__ import annotations
@@ -53,18 +53,18 @@ log = logging.getLogger(__name__)
 Request = Literal["goals", "twist", "wrench"]
 
 REQUESTS: Final[tuple[Request, ...]] = ("goals", "twist", "wrench")
-"""What can be accepted from ROS."""
+"""Requests from ROS that can be accepted."""
 
 NOT_BRIDGED: Final = (COMMAND, REFERENCE)
-"""Commands carry a proof that is nobody else's business; references come from ROS, if at all."""
+"""Commands carry a proof that must stay on our bus; references come from ROS, if at all."""
 
 SHARED: Final = {DIAGNOSTICS: "/diagnostics", TF: "/tf", LOG: "/rosout"}
-"""Topics that ROS tools look for under one name."""
+"""Topics that ROS tools look for under one fixed name."""
 
 FRAME: Final = "cupboard"
 
 MAX_ROUTES: Final = 256
-"""Streams that are bridged; a publisher that makes up names cannot fill the ROS graph."""
+"""Most streams that are bridged, so that made-up names cannot fill the ROS graph."""
 
 MAX_GOALS: Final = 4
 """Goals that may wait for reachd's answer."""
@@ -72,14 +72,14 @@ MAX_GOALS: Final = 4
 GOAL_TIMEOUT_S: Final = 3.0
 
 TWIST_AGE_S: Final = 0.5
-"""Age at which a stamped twist is refused: clocks of two machines may differ by some of it."""
+"""A twist with an older stamp is refused; the clocks of two machines may differ by part of this."""
 
 GEOMETRY_TIMEOUT_S: Final = 5.0
 
 KEYS: Final = ("tactile/*/*", "arm/*/state", "reach/*/*", "world/*/*", TF.template)
 
 Derive = Callable[[Any], Any]
-"""Message of a standard type from one of ours, None where there is nothing to say."""
+"""Make a message of a standard type from one of ours; None where nothing is to be sent."""
 
 
 @dataclass(slots=True)
@@ -98,7 +98,7 @@ class _Route:
     last: tuple[bytes, int] | None = None
 
     def lost_before(self, sample: BusSample) -> int:
-        """Messages of this stream that were lost on the way to us, just before ``sample``."""
+        """Messages of this stream that were lost on their way to us, just before ``sample``."""
         if sample.source is None or sample.sequence is None:
             return 0
         last, self.last = self.last, (sample.source, sample.sequence)
@@ -133,14 +133,14 @@ DERIVED: Final[dict[Topic, tuple[tuple[str, str, Derive], ...]]] = {
         ("arm/{name}/wrench", "geometry_msgs/msg/WrenchStamped", _arm_wrench),
     ),
 }
-"""The same in types that every ROS tool knows, for subscribers without `tactile_msgs`; made only
-while somebody subscribes."""
+"""Messages made in types that every ROS tool knows, for subscribers without `tactile_msgs`; made
+only while somebody subscribes."""
 
 
 class Bridge:
-    """Bridges between ``bus`` and ``node``; `tick` is to be called often, from one thread.
+    """Bridges between ``bus`` and ``node``; call `tick` often, from one thread.
 
-    ``accept``: requests from ROS that are passed on. ``reach``: whose goals and twists those are.
+    ``accept``: requests from ROS that are passed on. ``reach``: the reach that they are for.
     ``counts``: messages passed and not passed, by reason.
     """
 
@@ -160,7 +160,7 @@ class Bridge:
         self._reach = reach
         self._wall_ns = wall_ns
         self._routes: dict[str, _Route] = {}
-        self._new: dict[str, None] = {}  # keys that wait to be declared
+        self._new: dict[str, None] = {}  # keys still to be declared
         self._not_bridged: set[str] = set()
         self._boards: set[str] = set()
         self._by_topic: dict[str, RosPublisher] = {}
@@ -191,11 +191,11 @@ class Bridge:
 
     @property
     def routes(self) -> dict[str, str]:
-        """ROS topic of each key that is bridged."""
+        """ROS topic of each bridged key."""
         return {key: route.publisher.endpoint.topic for key, route in self._routes.items()}
 
     def tick(self) -> None:
-        """Declare what is new on the bus, tell of the router, publish the bridge's own health."""
+        """Declare new streams, report the state of the router, publish the bridge's diagnostics."""
         for key in list(self._new):
             self._declare(key)
         self._watch_router()
@@ -205,14 +205,14 @@ class Bridge:
             self._publish_health(now_ns)
 
     def close(self) -> None:
-        """Take everything back but the two sessions."""
+        """Close everything except the two sessions."""
         self._closed.set()
         for tap in self._taps:
             tap.close()
         for publisher in self._requests:
             publisher.close()
 
-    # To ROS.
+    # To ROS
 
     def _hear(self, sample: BusSample) -> None:
         route = self._routes.get(sample.key)
@@ -273,7 +273,7 @@ class Bridge:
         return made
 
     def _greet(self, board: str) -> None:
-        """A board was heard for the first time: ask for its geometry, listen for its reference."""
+        """A new board was heard: ask for its geometry, and listen for its reference."""
         self._boards.add(board)
         self._bus.get(service_key(board, "geometry"), lambda _: None, timeout=GEOMETRY_TIMEOUT_S)
         if "wrench" in self._accept:
@@ -285,7 +285,7 @@ class Bridge:
                 lambda sample: self._hear_wrench(sample, reference),
             )
 
-    # From ROS.
+    # From ROS
 
     def _hear_wrench(self, sample: BusSample, reference: Publisher) -> None:
         message = self._decode(REFERENCE.msgtype, sample)
@@ -346,10 +346,10 @@ class Bridge:
     def _refuse(self, what: str, why: str) -> None:
         reason = f"refused_{what}"
         self.counts[reason] += 1
-        if self.counts[reason] == 1 or what == "goal":  # a twist comes a hundred times a second
+        if self.counts[reason] == 1 or what == "goal":  # twists come a hundred times a second
             self._say(30, f"{what} from ROS refused: {why}")
 
-    # Of the bridge itself.
+    # The bridge's own diagnostics
 
     def _say(self, level: int, text: str) -> None:
         log.log(level, "%s", text)

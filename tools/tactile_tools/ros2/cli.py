@@ -25,7 +25,7 @@ COMMANDS = {
 
 
 def fill(parser: Parser) -> None:
-    """Give ``tactile ros2`` its subcommands."""
+    """Add the subcommands of ``tactile ros2``."""
     parser.description = "ROS 2 without ROS installed here: docs/ros2.md."
     add_commands(parser, COMMANDS)
 

@@ -1,7 +1,8 @@
-"""A reaching strategy that follows twists from elsewhere: a ROS 2 controller, a learned policy.
+"""Reaching strategy that follows twists from outside, such as a ROS 2 controller or a policy.
 
-``reachd --strategy tactile_tools.ros2.follow:FollowTwist``. Every twist passes the safety gate like
-that of any other strategy, within a reach that has a goal, a time limit and an outcome.
+Run it with ``reachd --strategy tactile_tools.ros2.follow:FollowTwist``. Every twist passes the
+safety gate like that of any other strategy, within a reach that has a goal, a time limit and an
+outcome.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from tactile_core.bus.topics import Topic
 from tactile_core.types import Instant, seconds_between
 
 WANTED: Final = Topic("reference/{name}/twist", "geometry_msgs/msg/TwistStamped", 100)
-"""Velocity that the wrist pivot shall have: m/s and rad/s, planar, in ``cupboard``."""
+"""Wanted velocity of the wrist pivot: m/s and rad/s, planar, in ``cupboard``."""
 
 FRAMES: Final = ("", "cupboard")
 
 TIMEOUT_S: Final = 0.1
-"""Silence after which the arm is asked to stand still."""
+"""Silence after which the arm is asked to stand still, s."""
 
 
 def planar_twist(message: Any) -> Twist | None:
-    """Twist of a ``TwistStamped``; None when it is not finite, planar or in ``cupboard``."""
+    """Twist of a ``TwistStamped``; None unless it is finite, planar and in ``cupboard``."""
     linear, angular = message.twist.linear, message.twist.angular
     parts = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
     if message.header.frame_id not in FRAMES or not all(math.isfinite(part) for part in parts):
@@ -40,9 +41,9 @@ def planar_twist(message: Any) -> Twist | None:
 
 
 class FollowTwist:
-    """Follows ``reference/<reach>/twist``; stands still without one. Runs within reachd only.
+    """Follows ``reference/<reach>/twist``; stands still without one. Runs only within reachd.
 
-    ``reach`` is the name of the reach (reachd --name): derive a class to change it.
+    ``reach`` is the name of the reach (reachd --name); derive a class to change it.
     """
 
     reach = "reach"
@@ -62,11 +63,11 @@ class FollowTwist:
             if not sessions:
                 raise RuntimeError("FollowTwist needs the bus of reachd: it cannot run in lockstep")
             self._latest = latest(sessions[0], WANTED.key(self.reach))
-        self._latest.newest()  # whatever was wanted before this reach
+        self._latest.newest()  # drop twists from before this reach
         self._twist, self._heard, self.activity = ZERO, None, "waiting"
 
     def step(self, touch: Touch, arm: ArmState, goal: Goal, now: Instant) -> Twist:
-        """The newest twist, zero once it is older than `TIMEOUT_S`."""
+        """Return the newest twist; zero once it is older than `TIMEOUT_S`."""
         del touch, arm, goal
         sample = None if self._latest is None else self._latest.newest()
         if sample is not None:

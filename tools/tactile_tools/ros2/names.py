@@ -1,8 +1,8 @@
-"""How ROS 2 over zenoh (rmw_zenoh) names topics, types, endpoints and QoS. Pure.
+"""Names of topics, types, endpoints and QoS as ROS 2 over zenoh (rmw_zenoh) writes them. Pure.
 
-A topic's data travels under ``<domain>/<topic>/<type>/<hash of the type>``. What exists is
-announced by liveliness tokens, one per node and one per endpoint; without them ``ros2 topic list``
-shows nothing. Layout: the graph cache section of rmw_zenoh's design document.
+The data of a topic travels under ``<domain>/<topic>/<type>/<hash of the type>``. Liveliness tokens,
+one per node and one per endpoint, announce what exists; without them ``ros2 topic list`` shows
+nothing. Source: section "graph cache" of rmw_zenoh's design document.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final, Literal
 ADMIN_SPACE: Final = "@ros2_lv"
 
 DISTROS: Final = ("humble", "jazzy", "kilted", "lyrical", "rolling")
-"""ROS 2 distributions that rmw_zenoh exists for."""
+"""ROS 2 distributions that rmw_zenoh supports."""
 
 DEFAULT_DISTRO: Final = "jazzy"
 
@@ -35,7 +35,7 @@ EndpointKind = Literal["MP", "MS", "SS", "SC"]
 
 @dataclass(frozen=True, slots=True)
 class Qos:
-    """The part of a QoS profile that is announced. ``depth``: of the history, keep last."""
+    """The announced part of a QoS profile. ``depth``: of the history (keep last)."""
 
     reliable: bool = True
     transient_local: bool = False
@@ -43,7 +43,7 @@ class Qos:
 
     @property
     def token(self) -> str:
-        """As it stands in a liveliness token; empty where the value is rmw_zenoh's default."""
+        """Form in a liveliness token; empty where the value is rmw_zenoh's default."""
         reliability = "" if self.reliable else "2"
         durability = "1" if self.transient_local else ""
         return f"{reliability}:{durability}:,{self.depth}:,:,:,,"
@@ -51,7 +51,7 @@ class Qos:
 
 STREAM: Final = Qos()
 LATCHED: Final = Qos(transient_local=True, depth=1)
-"""The last message is kept and given to whoever subscribes later."""
+"""The last message is kept and given to later subscribers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,13 +73,13 @@ class Node:
         )
 
     def resolve(self, topic: str) -> str:
-        """Absolute name of ``topic``: within the namespace unless it begins with a slash."""
+        """Absolute name of ``topic``, which is in the namespace unless it begins with a slash."""
         return topic if topic.startswith("/") else f"{self.namespace}/{topic}"
 
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """A publisher, subscription or service of a node. ``topic``: absolute. ``number``: its own."""
+    """A publisher, subscription or service of a node. ``topic``: absolute. ``number``: its id."""
 
     node: Node
     number: int
@@ -107,12 +107,12 @@ class Endpoint:
 
 
 def mangle(name: str) -> str:
-    """A name as one chunk of a key: slashes become %, and nothing becomes a single %."""
+    """Return a name as one chunk of a key: slashes become %, an empty name becomes a single %."""
     return name.replace("/", "%") or "%"
 
 
 def dds_type(type_name: str) -> str:
-    """``pkg/msg/Name`` as ``pkg::msg::dds_::Name_``; ValueError for anything else."""
+    """Return ``pkg/msg/Name`` as ``pkg::msg::dds_::Name_``; ValueError for anything else."""
     parts = type_name.split("/")
     if len(parts) != 3 or parts[1] not in ("msg", "srv", "action"):
         raise ValueError(f"{type_name!r} is not a type such as std_msgs/msg/Header")
@@ -120,11 +120,11 @@ def dds_type(type_name: str) -> str:
 
 
 def ros_name(name: str) -> str:
-    """``name`` of a board, arm or reach as ROS allows it: no dash, no digit in front."""
+    """Return the ``name`` of a board, arm or reach as ROS allows it: no dash, no digit in front."""
     plain = name.replace("-", "_")
     return f"_{plain}" if plain[:1].isdigit() else plain
 
 
 def type_hash(distro: str, rihs01: str) -> str:
-    """Hash as ``distro`` writes it. ``rihs01``: the hash of the type, ``RIHS01_...``."""
+    """Hash of a type as ``distro`` writes it. ``rihs01``: the hash in the form ``RIHS01_...``."""
     return NO_HASH if distro in WITHOUT_HASHES else rihs01

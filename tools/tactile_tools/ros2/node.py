@@ -1,4 +1,4 @@
-"""A ROS 2 node over a zenoh client session: publishers, subscriptions and the tokens of them.
+"""A ROS 2 node in a zenoh client session: publishers, subscriptions and their tokens.
 
 A client of the router hears and reaches every node, also behind a router that does not forward
 between peers (rmw_zenohd's default). It reconnects by itself when the router comes back.
@@ -26,16 +26,16 @@ DEFAULT_ROUTER = "tcp/127.0.0.1:7447"
 CONNECT_TIMEOUT_S = 3.0
 
 HEARTBEAT_S = 0.5
-"""After the last message of a latched topic, its number is repeated once so late: a subscriber that
-missed the message asks for it again. rmw_zenoh does the same."""
+"""The number of the last message of a latched topic is repeated once after this time, s, so that a
+subscriber that missed it can ask again. rmw_zenoh does the same."""
 
 
 class RouterError(Exception):
-    """The router cannot be reached; the message names the remedy."""
+    """The router cannot be reached; the text names the remedy."""
 
 
 def open_client(router: str, timeout_s: float = CONNECT_TIMEOUT_S) -> zenoh.Session:
-    """A client session at ``router``; `RouterError` when nothing answers there in time."""
+    """Open a client session at ``router``; `RouterError` when nothing answers there in time."""
     values = {
         "mode": "client",
         "connect/endpoints": [router],
@@ -60,7 +60,7 @@ def open_client(router: str, timeout_s: float = CONNECT_TIMEOUT_S) -> zenoh.Sess
 
 
 class RosPublisher:
-    """Publishes CDR bytes on one topic; drops when the link is full, never waits.
+    """Publishes CDR bytes on one topic; drops when the link is full, and never waits.
 
     ``matched``: whether anybody subscribes; always true for a latched topic, which keeps its last
     message for later subscribers.
@@ -73,7 +73,7 @@ class RosPublisher:
         self._putting = threading.Lock()
         self._gid = uuid.uuid4().bytes
         drop = zenoh.CongestionControl.DROP
-        self._publisher: Any  # zenoh's two kinds have nothing in common but their methods
+        self._publisher: Any  # zenoh's two kinds share only their methods
         if endpoint.qos.transient_local:
             self._publisher = zenoh.ext.declare_advanced_publisher(
                 session,
@@ -90,22 +90,25 @@ class RosPublisher:
                 endpoint.key, congestion_control=drop, express=True
             )
             publisher.declare_matching_listener(self._match)
-            # The stubs say bool.
+            # zenoh's stubs declare a bool, but it is a status object.
             status: Any = publisher.matching_status
             self.matched = status.matching
             self._publisher = publisher
         self._token = session.liveliness().declare_token(endpoint.token)
 
     def put(self, data: bytes, wall_ns: int, lost: int = 0) -> None:
-        """Send ``data`` stamped with its wall-clock time; ``lost``: messages lost before it."""
+        """Send ``data``, stamped with its wall-clock time.
+
+        ``lost``: messages lost just before it.
+        """
         wall_ns = min(max(wall_ns, 0), WALL_LIMIT_NS)
-        with self._putting:  # boards of several daemons share /diagnostics
+        with self._putting:  # several daemons share /diagnostics
             self._sequence += 1 + lost
             attachment = ATTACHMENT.pack(self._sequence, wall_ns, 16, self._gid)
             self._publisher.put(data, attachment=attachment)
 
     def close(self) -> None:
-        """Take the publisher and its token back."""
+        """Undeclare the publisher and its token."""
         with contextlib.suppress(zenoh.ZError):
             self._token.undeclare()
             self._publisher.undeclare()
@@ -115,7 +118,10 @@ class RosPublisher:
 
 
 class RosSubscription:
-    """Hands every sample of one topic to ``take``, in zenoh's thread. ``oversized``: not taken."""
+    """Gives every sample of one topic to ``take``, in zenoh's thread.
+
+    ``oversized``: samples that were too large and were not taken.
+    """
 
     def __init__(
         self, session: zenoh.Session, endpoint: Endpoint, take: Callable[[BusSample], None]
@@ -127,7 +133,7 @@ class RosSubscription:
         self._token = session.liveliness().declare_token(endpoint.token)
 
     def close(self) -> None:
-        """Take the subscription and its token back."""
+        """Undeclare the subscription and its token."""
         with contextlib.suppress(zenoh.ZError):
             self._token.undeclare()
             self._subscriber.undeclare()
@@ -140,7 +146,7 @@ class RosSubscription:
 
 
 class RosNode:
-    """One node with its endpoints. Not thread-safe: declare and close from one thread."""
+    """One node with its endpoints. Not thread-safe: declare and close in one thread."""
 
     def __init__(
         self, router: str, name: str, *, namespace: str = "", domain: int = 0, distro: str
@@ -153,11 +159,11 @@ class RosNode:
 
     @property
     def connected(self) -> bool:
-        """Whether the router is there."""
+        """Whether the router is connected."""
         return bool(self._session.info.routers_zid())
 
     def publish(self, topic: str, type_name: str, qos: Qos = STREAM) -> RosPublisher:
-        """Declare a publisher; ``topic`` is within the namespace unless it begins with a slash."""
+        """Declare a publisher; ``topic`` is in the namespace unless it begins with a slash."""
         made = RosPublisher(self._session, self._endpoint("MP", topic, type_name, qos))
         self._endpoints.append(made)
         return made
@@ -171,11 +177,11 @@ class RosNode:
         return made
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Take everything back and leave; a router that does not answer is not waited for."""
+        """Undeclare everything and leave, without waiting for a router that does not answer."""
 
         def leave() -> None:
-            # zenoh raises RuntimeError where another thread is in the middle of a put: what is left
-            # then ends with the process, or with the session.
+            # zenoh raises RuntimeError while another thread is in the middle of a put; what is then
+            # left ends with the process, or with the session.
             for endpoint in self._endpoints:
                 with contextlib.suppress(zenoh.ZError, RuntimeError):
                     endpoint.close()

@@ -52,11 +52,11 @@ ament_package()
 """
 
 EMAIL = "tactile-reach@example.org"
-"""ROS tools refuse a package without an address; the project has none of its own."""
+"""ROS tools refuse a package without an address, and the project has none."""
 
 
 def definitions() -> dict[str, str]:
-    """Text of each of our message definitions, by the name of the type, sorted."""
+    """Text of each of our message definitions, by type name, sorted."""
     folder = Path(messages.__file__).with_name("msg")
     return {path.stem: path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.msg"))}
 
@@ -80,7 +80,7 @@ def files() -> dict[str, str]:
 
 
 def write(folder: Path) -> list[Path]:
-    """Write the package into ``folder`` and take away message files that are not in it; OSError."""
+    """Write the package to ``folder`` and delete message files that are not in it; OSError."""
     wanted = files()
     (folder / "msg").mkdir(parents=True, exist_ok=True)
     for old in (folder / "msg").glob("*.msg"):

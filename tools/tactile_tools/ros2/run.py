@@ -1,4 +1,4 @@
-"""Running the bridge as a process: sessions, signals, and what it says of itself."""
+"""Run the bridge as a process: sessions, signals and reports."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from tactile_tools.ros2.node import RosNode, RouterError
 log = logging.getLogger(__name__)
 
 TICK_S = 0.02
-"""How often new streams are looked for."""
+"""Period at which new streams are looked for, s."""
 
 TELL_S = 10.0
-"""How often a running bridge says what it passed on."""
+"""Period at which a running bridge reports what it passed on, s."""
 
 QUIET_S = 5.0
-"""Silence of the bus after which it is mentioned, once."""
+"""Silence of the bus after which it is mentioned, once, s."""
 
 DONE, USAGE, REFUSED = 0, 2, 3
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run ``tactile ros2 bridge``; the exit status."""
+    """Run ``tactile ros2 bridge``; returns the exit status."""
     logging.basicConfig(
         format="%(levelname)s %(message)s",
         level=logging.DEBUG if options.verbose else logging.INFO,
@@ -73,7 +73,7 @@ def _serve(
     where: str,
     stopping: threading.Event,
 ) -> None:
-    """Bridge until told to stop, and say now and then what was passed on."""
+    """Bridge until stopped, reporting now and then what was passed on."""
     bridge = Bridge(bus, node, accept=frozenset(options.accept), reach=options.reach)
     print(
         f"bridging to {options.router}, domain {options.domain}, {options.distro}; from ROS: "

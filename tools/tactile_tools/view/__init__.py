@@ -1,1 +1,1 @@
-"""The live page: what boards feel and how a reach goes, in a browser; logs too."""
+"""``tactile view``: the live page with the boards' touch and the reach, also for logs."""

@@ -1,4 +1,4 @@
-"""``tactile view``: the live page of running daemons, or of a log."""
+"""``tactile view``: serve the live page of running daemons, or of a log."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DONE, FAILED, USAGE, REFUSED = range(4)
 PORT = 8420
 
 LEAST_TOKEN = 16
-"""Characters of a token that somebody chooses."""
+"""Fewest characters of a token given by the user."""
 
 EPILOG = f"""\
 examples:
@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
     loopback = is_loopback(options.bind)
     token = options.token
     if token is not None and (len(token) < LEAST_TOKEN or not token.isalnum()):
-        # Letters and digits alone need no quoting in an address or a cookie.
+        # Letters and digits need no quoting in an address or a cookie.
         return _complain(
             f"--token of {len(token)} characters; allowed: at least {LEAST_TOKEN} letters and "
             "digits; without --token one is made",
@@ -52,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
         )
     if not loopback and token is None:
         token = make_token()
-    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # strangers' nonsense is not ours
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # strangers' errors
     from tactile_tools.view.player import PlayError
 
     try:
@@ -115,7 +115,7 @@ async def _serve(
 
 
 def _read_end(stopping: asyncio.Event) -> None:
-    """End with whoever started this page, however that came to its end."""
+    """Stop when the process that started this page has ended, for whatever reason."""
     try:
         if os.read(sys.stdin.fileno(), 4096):
             return

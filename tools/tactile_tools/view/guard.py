@@ -1,7 +1,7 @@
-"""Who may open the page: pure decisions on Host, Origin, token and the owner of a connection.
+"""Decide who may open the page, from Host, Origin, token and the owner of a connection. Pure.
 
-The page can tare and record, so a web site that the browser also shows must not reach it (a
-foreign ``Origin``, or a name that was made to point here), nor another user of this machine.
+The page can tare and record, so it must be closed to other users of this machine and to web sites
+open in the same browser (a foreign ``Origin``, or a name that was made to point here).
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ LOCAL_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9.-]{1,253})(?::(\d{1,5}))?")
 
 MAX_TABLE_BYTES = 4 << 20
-"""Of the kernel's list of connections that are looked through: 25,000 of them."""
+"""Bytes read of the kernel's list of connections: 25,000 connections."""
 
 
 def make_token() -> str:
-    """A secret for a page that others than this machine can reach."""
+    """Make a secret for a page that other machines can reach."""
     return secrets.token_urlsafe(24)
 
 
@@ -44,9 +44,9 @@ def is_loopback(address: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Guard:
-    """``token``: what a browser must know, None on loopback. ``names``: further names of this host.
+    """Rules of one page. ``token``: secret of the browsers; None on loopback.
 
-    ``port``: of the page, which a ``Host`` must name.
+    ``names``: further names of this host. ``port``: of the page; a ``Host`` must name it.
     """
 
     port: int
@@ -54,11 +54,11 @@ class Guard:
     names: frozenset[str] = field(default_factory=frozenset)
 
     def refuse_host(self, host: str | None) -> str | None:
-        """Why a request for ``host`` is refused, None when it is not."""
+        """Say why a request for ``host`` is refused; None when it is accepted."""
         match = HOST.fullmatch(host or "")
         name = "" if match is None else match[1].strip("[]").lower()
         port = 80 if match is None or match[2] is None else int(match[2])
-        # A tunnel ends at a port of its own; with a loopback name that is still this machine.
+        # A tunnel ends at another port; with a loopback name it is still this machine.
         if name in LOCAL_NAMES:
             return None
         known = name in self.names or (self.token is not None and _is_address(name))
@@ -67,7 +67,7 @@ class Guard:
         return f"this page is not served for the host {(host or 'without a name')[:100]}"
 
     def refuse_origin(self, host: str | None, origin: str | None) -> str | None:
-        """Why a web socket asked for by a page of ``origin`` is refused. No browser: no origin."""
+        """Say why a web socket of a page of ``origin`` is refused; only browsers send an origin."""
         if origin is None:
             return None
         parts = urlsplit(origin)
@@ -76,7 +76,7 @@ class Guard:
         return f"pages of {origin[:100]} may not use this one"
 
     def knows_token(self, path: str, cookies: str | None) -> bool:
-        """Whether the address or a cookie of a request holds the token, where one is needed."""
+        """Whether the address or a cookie of a request holds the token, if one is needed."""
         if self.token is None:
             return True
         given = parse_qs(urlsplit(path).query).get("token", [])
@@ -90,7 +90,7 @@ class Guard:
 
     @property
     def cookie(self) -> str:
-        """Name of the cookie: pages on other ports of a host share its cookies."""
+        """Name of the cookie, with the port: pages on other ports share a host's cookies."""
         return f"{COOKIE}_{self.port}"
 
 
@@ -103,9 +103,9 @@ def _is_address(name: str) -> bool:
 
 
 def owner_of(address: tuple[str, int], folder: Path = Path("/proc/net")) -> int | None:
-    """User whose process holds the end ``address`` of a TCP connection of this machine.
+    """Id of the user whose process holds the end ``address`` of a TCP connection of this machine.
 
-    None where the system does not say: it is not Linux, or the process is in another container.
+    None where the system does not say: not Linux, or a process in another container.
     """
     host, port = address
     try:
@@ -126,7 +126,7 @@ def owner_of(address: tuple[str, int], folder: Path = Path("/proc/net")) -> int 
 
 
 def _tables(ip: ipaddress.IPv4Address | ipaddress.IPv6Address, port: int) -> list[tuple[str, str]]:
-    """Tables of the kernel and how the address is written in them: words of the host's order."""
+    """Tables of the kernel, and the address as written there: words in the host's byte order."""
     if ip.version == 6 and ip.ipv4_mapped is not None:
         ip = ip.ipv4_mapped
     packed = ip.packed
@@ -145,7 +145,7 @@ def _words(packed: bytes) -> str:
 
 
 def refuse_owner(address: tuple[str, int]) -> str | None:
-    """Why a connection of this machine is refused: it belongs to another of its users."""
+    """Say why a connection from this machine is refused: it belongs to another user."""
     owner = owner_of(address)
     if owner is None or owner in (0, os.getuid()):
         return None

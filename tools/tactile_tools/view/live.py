@@ -1,6 +1,6 @@
-"""The bus as a source of the page: the newest value of each stream, decoded only when it is shown.
+"""The bus as the page's source: the newest value of each stream, decoded only when it is shown.
 
-zenoh keeps one sample a stream in its own threads, so that what nobody looks at costs no Python.
+zenoh keeps one sample of each stream in its own threads, so that unseen streams cost no Python.
 """
 
 from __future__ import annotations
@@ -40,30 +40,30 @@ log = logging.getLogger(__name__)
 BOARD_TOPICS = (GEOMETRY, DIAGNOSTICS, FEATURES, FORCES, AMBIENT)
 
 TOKENS = {"tactile/*/alive": "tactile", "reach/*/alive": "reach", "arm/*/alive": "arm"}
-"""Keys of the tokens by which daemons are found."""
+"""Keys of the liveliness tokens that announce daemons."""
 
 MAX_EVENTS_WAITING = 256
-"""Events of a reach between two looks of the page: they come a few a second."""
+"""Events of a reach that may wait between two polls; they come a few a second."""
 
 MAX_TOKENS_WAITING = 1024
-"""Comings and goings of daemons between two looks."""
+"""Announcements of daemons that may wait between two polls."""
 
 GEOMETRY_PERIOD_S = 2.0
-"""Between two requests to a board that has not said where its taxels are."""
+"""Time between two requests to a board whose geometry is unknown, s."""
 
 GEOMETRY_TIMEOUT_S = 1.0
 
 TARE_S = 120.0
-"""For a tare to end: several times eight frames of a board at 0.5 Hz."""
+"""Time allowed for a tare, s: several times eight frames of a board at 0.5 Hz."""
 
 REQUEST_S = 10.0
-"""For everything else that a button asks."""
+"""Time allowed for any other request of a button, s."""
 
 
 @dataclass(slots=True)
 class _Board:
     streams: dict[Topic, Latest]
-    asked: float = -1e9  # when it was last asked for its geometry
+    asked: float = -1e9  # when its geometry was last requested
 
 
 @dataclass(slots=True)
@@ -74,7 +74,7 @@ class _Reach:
 
 
 class LiveSource:
-    """Boards, reach, arm and cupboard of the daemons on the bus. `poll` from one thread."""
+    """Boards, reach, arm and cupboard of the daemons on the bus. Call `poll` from one thread."""
 
     playing = False
 
@@ -95,7 +95,7 @@ class LiveSource:
         ]
 
     def poll(self, model: PageModel) -> bool:
-        """Hand the model what is new; whether there was anything."""
+        """Give the model what is new; returns whether there was anything."""
         now = monotonic_now()
         new = self._take_tokens(model)
         for name, board in self._boards.items():
@@ -114,7 +114,7 @@ class LiveSource:
         return new
 
     def missing_geometry(self, model: PageModel) -> list[str]:
-        """Boards that should be asked where their taxels are; each at most every two seconds."""
+        """Boards whose geometry should be requested; each at most every two seconds."""
         due, now = [], time.monotonic()
         for name, board in self._boards.items():
             shown = model.boards.get(name)
@@ -126,12 +126,12 @@ class LiveSource:
         return due
 
     def ask_geometry(self, name: str) -> None:
-        """Have a board say where its taxels are. Blocks."""
+        """Make a board publish its geometry. Blocks."""
         with suppress(ServiceError):
             call(self._session, service_key(name, "geometry"), timeout=GEOMETRY_TIMEOUT_S)
 
     def ask(self, key: str, request: object, *, slow: bool = False) -> Any:
-        """Ask a service. Blocks. `ServiceError` with its reason."""
+        """Call a service and return its reply. Blocks. `ServiceError` with the reason."""
         return call(self._session, key, request, timeout=TARE_S if slow else REQUEST_S)
 
     def close(self) -> None:

@@ -1,6 +1,6 @@
-"""A log as a source of the page: played at any speed from any place, a second read ahead.
+"""A log as the page's source: played at any speed from any place, one second read ahead.
 
-Memory holds some seconds of the log whatever its length.
+Memory holds some seconds of the log, whatever its length.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ SHOWN: frozenset[Topic] = frozenset(
 )  # fmt: skip
 
 AHEAD_S = 1.0
-"""Of the log that is read at once, at normal speed."""
+"""Length of log that is read at once at normal speed, s."""
 
 BACK_S = 1.5
-"""Before a place that is jumped to, so that what comes once a second is there."""
+"""Read before the place of a jump, s, so that what comes once a second is there."""
 
 MAX_WINDOW_MESSAGES = 200_000
 """Messages of one window; a log of 16 boards at 1 kHz has 80,000 a second."""
 
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-"""How fast a log may be played, times real time."""
+"""Speeds at which a log may be played, as multiples of real time."""
 
 
 class PlayError(Exception):
@@ -66,12 +66,12 @@ class _Item(NamedTuple):
 
 
 class LogPlayer:
-    """Plays a log. `load` blocks and belongs to a thread of its own; all else to the page's."""
+    """Plays a log. `load` blocks and runs in a thread of its own; the rest runs in the page's."""
 
     playing = True
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        """`PlayError` when there is nothing to be shown."""
+        """Open the log; `PlayError` when it has nothing to show."""
         try:
             found = find_series(paths)
             if len(found) > 1:
@@ -90,22 +90,22 @@ class LogPlayer:
         self.undecodable = 0
         self._items: list[_Item] = []
         self._next = 0
-        self._loaded_ns = self.first_ns - 1  # messages up to here are in, or have been
+        self._loaded_ns = self.first_ns - 1  # messages up to this log time were loaded
         self._model_fresh = False
 
-    # By the page's thread
+    # Called by the page's thread
 
     def advance(self, seconds: float) -> None:
         """Let ``seconds`` of real time pass."""
         if not self.paused:
             step = round(seconds * self.speed * NS_PER_S)
-            # No further than what has been read: a slow disk makes it slow, not blank.
+            # Never beyond what was read: a slow disk slows the playing and does not blank the page.
             self.position_ns = min(self.position_ns + step, self.last_ns, self._loaded_ns)
             if self.position_ns >= self.last_ns:
                 self.paused = True
 
     def seek(self, share: float) -> None:
-        """Go to a place, 0 for the begin and 1 for the end; `needs_load` is then true."""
+        """Go to a place, 0 for the beginning and 1 for the end; then `window` says what to load."""
         share = min(max(share, 0.0), 1.0)
         self.position_ns = self.first_ns + round(share * (self.last_ns - self.first_ns))
         back_ns = max(self.first_ns, self.position_ns - round(BACK_S * NS_PER_S))
@@ -113,7 +113,7 @@ class LogPlayer:
         self._model_fresh = False
 
     def play(self, speed: float | None = None) -> None:
-        """Go on, from the begin when the end had been reached."""
+        """Play on, from the beginning if the end was reached."""
         if speed is not None:
             if speed not in SPEEDS:
                 allowed = ", ".join(f"{each:g}" for each in SPEEDS)
@@ -125,20 +125,23 @@ class LogPlayer:
 
     @property
     def window(self) -> tuple[int, int] | None:
-        """What is to be read next, log times in ns; None while there is enough."""
+        """Log times to read next, ns, first and last; None while enough is loaded."""
         ahead_ns = round(AHEAD_S * max(self.speed, 1.0) * NS_PER_S)
         if self._loaded_ns >= min(self.position_ns + ahead_ns // 2, self.last_ns):
             return None
         return self._loaded_ns + 1, max(self.position_ns, self._loaded_ns) + ahead_ns
 
     def take_window(self, window: tuple[int, int], items: list[_Item]) -> None:
-        """Add what `load` has read, unless the place has been changed meanwhile."""
+        """Add what `load` has read, unless the place was changed meanwhile."""
         if window[0] == self._loaded_ns + 1:
             self._items = self._items[self._next :] + items
             self._next, self._loaded_ns = 0, window[1]
 
     def poll(self, model: PageModel) -> bool:
-        """Hand the model the newest of each stream up to the present place; whether any was new."""
+        """Give the model the newest of each stream up to the present place.
+
+        Returns whether any was new.
+        """
         if not self._model_fresh:
             model.forget()
             for name, message in self._geometry.items():
@@ -165,7 +168,7 @@ class LogPlayer:
         return True
 
     def status(self) -> dict[str, Any]:
-        """Where playing is."""
+        """State of playing for the page."""
         span = max(self.last_ns - self.first_ns, 1)
         return {
             "file": self.name,
@@ -176,10 +179,10 @@ class LogPlayer:
             "speed": self.speed,
         }
 
-    # By a thread of its own
+    # Called by a thread of its own
 
     def load(self, window: tuple[int, int]) -> list[_Item]:
-        """Messages logged in ``window``, in the order of their times; blocks for the disk."""
+        """Read the messages logged in ``window``, in the order of time; blocks for the disk."""
         items: list[_Item] = []
         known: dict[Stream, tuple[Topic, str] | None] = {}
         for record in read_series(self._series, Reading(), None, _is_shown, window):
@@ -195,7 +198,7 @@ class LogPlayer:
         return items
 
     def _find_geometry(self) -> dict[str, Any]:
-        """The first geometry of each board: it stands at the begin of every file."""
+        """Find the first geometry of each board; every file begins with it."""
         found: dict[str, Any] = {}
         boards: set[str] = set()
         window = (self.first_ns, self.first_ns + 60 * NS_PER_S)
@@ -221,7 +224,7 @@ def _is_shown(topic: str) -> bool:
 
 
 def _span(series: Series) -> tuple[int, int]:
-    """Log times of the first and the last message that the page can show."""
+    """Log times of the first and the last message that the page can show, ns."""
     spans = [_span_of(path) for path in series.paths]
     told = [span for span in spans if span is not None]
     if not told:

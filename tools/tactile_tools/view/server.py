@@ -1,8 +1,9 @@
-"""The page and its stream over HTTP and web sockets, on ``websockets`` alone.
+"""Serve the page over HTTP and its stream over web sockets, with ``websockets`` alone.
 
-One loop polls the source at most 30 times a second while somebody looks, makes one frame, and
-every viewer is sent the newest. A viewer says which frame it has drawn; one that has two still to
-draw is sent no more, so a slow browser loses frames and not time, and costs nobody anything.
+While somebody watches, one loop polls the source at most 30 times a second and makes one frame, and
+the newest frame is sent to every viewer. A viewer reports each frame it has drawn; one with two
+frames still to draw is sent no more. So a slow browser loses frames, does not fall behind, and
+holds nobody up.
 """
 
 from __future__ import annotations
@@ -38,25 +39,25 @@ log = logging.getLogger(__name__)
 FRAMES_PER_S = 30.0
 
 SHARE = 0.035
-"""Of a core that making frames may cost; on a busy machine, or with many taxels, there are fewer
-frames a second. Sending them to a viewer costs about as much again."""
+"""Part of a core that making frames may cost; on a busy machine, or with many taxels, there are
+fewer frames a second. Sending them to a viewer costs about as much again."""
 
 IDLE_S = 0.5
-"""Between looks at the source while nobody watches, and between frames when nothing is new."""
+"""Time between polls while nobody watches, and between frames when nothing is new, s."""
 
 MAX_VIEWERS = 16
 
 MAX_UNDRAWN = 2
-"""Frames that a viewer may have been sent and not yet drawn."""
+"""Frames that a viewer may have been sent and not drawn yet."""
 
 MAX_REQUEST = 4096
-"""Bytes of what a viewer may say at once."""
+"""Largest message of a viewer, bytes."""
 
 MAX_PENDING = 4
 """Requests of one viewer that may wait for a daemon."""
 
 SEND_S = 20.0
-"""For a viewer to take a frame; one that does not is dropped."""
+"""Time for a viewer to take a frame, s; one that does not is disconnected."""
 
 FILES = {
     "/": ("index.html", "text/html; charset=utf-8"),
@@ -80,7 +81,7 @@ MAX_RECORD_NAME = 80
 
 
 class Said(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """What a viewer says: which frame it has drawn, or what it asks for (``do``)."""
+    """Message of a viewer: the frame it has drawn, or a request (``do``)."""
 
     ack: int | None = None
     do: Literal["tare", "record", "stop_record", "rate", "stop", "seek", "play", "pause"] | None = (
@@ -100,8 +101,8 @@ class _Viewer:
 
     def __init__(self, connection: ServerConnection) -> None:
         self.connection = connection
-        self.sent = 0  # number of the last frame
-        self.undrawn: deque[int] = deque()  # numbers of those it has not drawn yet
+        self.sent = 0  # number of the last frame sent
+        self.undrawn: deque[int] = deque()  # numbers of frames sent and not drawn yet
         self.layout = -1
         self.skipped = 0
         self.acked = asyncio.Event()
@@ -110,7 +111,7 @@ class _Viewer:
 
 
 class PageServer:
-    """Serves one source to many viewers. Used from one event loop."""
+    """Serves one source to many viewers, from one event loop."""
 
     def __init__(
         self,
@@ -140,7 +141,7 @@ class PageServer:
         }
 
     async def start(self, host: str, port: int) -> int:
-        """Begin to serve; the port. OSError when it cannot be had."""
+        """Begin to serve; returns the port. OSError when the port cannot be opened."""
         self._server = await serve(
             self._serve_viewer,
             host,
@@ -179,7 +180,7 @@ class PageServer:
                     await asyncio.wait_for(self._watched.wait(), pause)
 
     async def close(self) -> None:
-        """End every connection."""
+        """Close every connection."""
         if self._server is not None:
             self._server.close()
             await self._server.wait_closed()
@@ -192,7 +193,7 @@ class PageServer:
                 self._start(asyncio.to_thread(source.ask_geometry, name))
             return new
         if not self._viewers:
-            return False  # a log waits for whoever looks at it
+            return False  # a log waits for its viewers
         window = source.window
         if window is not None:
             source.take_window(window, await asyncio.to_thread(source.load, window))
@@ -220,13 +221,13 @@ class PageServer:
     # HTTP
 
     def _answer_http(self, connection: ServerConnection, request: Request) -> Response | None:
-        """A file, a refusal, or None to go on with the web socket."""
+        """Answer with a file or a refusal; None continues with the web socket."""
         headers = request.headers
         try:
             host = headers.get("Host")
             origin = headers.get("Origin")
             cookies = headers.get("Cookie")
-        except LookupError:  # several of one name
+        except LookupError:  # the header is there more than once
             return _refusal(HTTPStatus.BAD_REQUEST, "a header is there twice")
         refused = self._guard.refuse_host(host) or self._guard.refuse_origin(host, origin)
         if refused is None and self._loopback:
@@ -254,7 +255,7 @@ class PageServer:
         return _response(HTTPStatus.OK, body, kind)
 
     def _without_token(self) -> Response:
-        """Keep the token in a cookie and take it out of the address, which people pass on."""
+        """Move the token from the address to a cookie, because people pass addresses on."""
         token = self._guard.token or ""
         response = _response(HTTPStatus.SEE_OTHER, b"", "text/plain")
         response.headers["Location"] = "/"
@@ -359,11 +360,11 @@ class PageServer:
             self._reply(viewer, said.id, True, text)
 
     def _reply(self, viewer: _Viewer, number: int, ok: bool, text: str) -> None:
-        with contextlib.suppress(asyncio.QueueFull):  # a viewer that asks and does not listen
+        with contextlib.suppress(asyncio.QueueFull):  # the viewer does not read
             viewer.replies.put_nowait(self._encode({"reply": number, "ok": ok, "text": text}))
 
     async def _do(self, said: Said) -> str:
-        """Carry a request out and say what came of it."""
+        """Carry a request out; returns what came of it."""
         source = self._source
         if isinstance(source, LogPlayer):
             return _play(source, said)

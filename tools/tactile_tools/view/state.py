@@ -1,8 +1,8 @@
-"""Bus messages into what the live page shows. Pure: no clock, no bus, no thread.
+"""State of the live page, from bus messages. Pure: no clock, no bus, no thread.
 
-`PageModel.take` is handed messages, newest last; `PageModel.frame` gives one picture of everything
-as plain values for JSON. Frames are small: forces are whole mN, and what seldom changes (geometry,
-names) is apart in `PageModel.layout`, whose ``version`` tells when it is new.
+`PageModel.take` is given messages, newest last; `PageModel.frame` returns everything to show as
+plain values for JSON. Frames are small: forces are whole mN, and what seldom changes (geometry,
+names) is in `PageModel.layout`, whose ``version`` says when it is new.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ from tactile_core.types import Instant, seconds_between
 SIDES = ("none", "left", "right", "tip")
 
 HISTORY_S = 20.0
-"""Seconds of force shown, and kept for a page that is opened later."""
+"""Length of the force curves, s, also kept for a page that is opened later."""
 
 HISTORY_PERIOD_S = 0.03
-"""Between two points kept of it."""
+"""Time between two points kept of it, s."""
 
 STALE_S = 0.5
-"""Without features after which a board's values are shown as old."""
+"""Time without features after which a board's values are shown as old, s."""
 
 STALE_PERIODS = 3.0
-"""Or so many periods of a slow board, if that is longer."""
+"""The same in periods of a slow board, if that is longer."""
 
 DIAGNOSTICS_STALE_S = 3.5
-"""Without diagnostics, which come once a second, after which they say nothing any more."""
+"""Time without diagnostics, which come once a second, after which they are ignored, s."""
 
 MAX_BOARDS = 32
-"""Boards on one page; of more, those that are gone leave it first."""
+"""Boards on one page; when there are more, those that are gone leave it first."""
 
 MAX_EVENTS = 40
 """Events of a reach kept for the page."""
@@ -59,7 +59,7 @@ MAX_OBJECTS = 400
 """Objects of a cupboard that are drawn."""
 
 MAX_REASONS, MAX_TEXT = 8, 300
-"""Reasons shown of a board, and characters of a text that comes over the bus."""
+"""Reasons shown of a board, and characters of a text from the bus."""
 
 STATUS_BITS = (
     (1, "saturated"),
@@ -70,7 +70,7 @@ STATUS_BITS = (
     (32, "missing"),
     (64, "implausible"),
 )
-"""What ``TaxelForces.status`` says of a masked taxel."""
+"""Meaning of the bits of ``TaxelForces.status``."""
 
 REMEDIES: Mapping[str, str] = {
     "waiting": "waiting for the board to say what it is",
@@ -81,7 +81,7 @@ REMEDIES: Mapping[str, str] = {
     "gone": "tactiled has stopped: start it again",
     "stale": "nothing has come from tactiled: it may be stopped or the network down",
 }
-"""What each state of a board that is not streaming means, with the remedy."""
+"""Each state of a board that is not streaming, in words with the remedy."""
 
 
 @dataclass(slots=True)
@@ -92,7 +92,7 @@ class BoardModel:
     alive: bool = True
     layout: dict[str, Any] | None = None
     features: Any = None
-    heard: Instant | None = None  # features, by the page's clock
+    heard: Instant | None = None  # of the last features, by the page's clock
     forces: Any = None
     ambient: Any = None
     told: dict[str, str] = field(default_factory=dict)
@@ -119,18 +119,18 @@ class ReachModel:
 
 
 class PageModel:
-    """Everything one page shows."""
+    """Everything that the page shows."""
 
     def __init__(self) -> None:
         self.boards: dict[str, BoardModel] = {}
         self.reach = ReachModel()
         self.version = 0
-        """Of `layout`; it goes up with every change."""
+        """Version of `layout`; every change increases it."""
 
-    # What comes in
+    # Input
 
     def take(self, topic: Topic, name: str, message: Any, now: Instant) -> None:
-        """One decoded message of ``topic`` that belongs to ``name``; ``now``: when it was heard."""
+        """Take a decoded message of ``topic`` from ``name``, received at ``now``."""
         reach = self.reach
         if topic == REACH_STATE:
             reach.name, reach.state, reach.heard = name, message, now
@@ -145,7 +145,7 @@ class PageModel:
             self._take_board(topic, self._board(name), message, now)
 
     def set_alive(self, name: str, alive: bool) -> None:
-        """A tactiled that serves board ``name`` has come, or has gone."""
+        """Note that a tactiled with board ``name`` has come or gone."""
         if alive or name in self.boards:
             board = self._board(name)
             if board.alive != alive:
@@ -153,12 +153,12 @@ class PageModel:
                 self.version += 1
 
     def set_reach_alive(self, name: str, alive: bool) -> None:
-        """A reachd called ``name`` has come, or has gone."""
+        """Note that a reachd called ``name`` has come or gone."""
         if alive or name == self.reach.name:
             self.reach.name, self.reach.alive = name, alive
 
     def forget(self) -> None:
-        """Begin anew but for the geometry: another place in a log."""
+        """Forget everything but the geometry, for another place in a log."""
         for board in self.boards.values():
             layout, name = board.layout, board.name
             self.boards[name] = BoardModel(name, layout=layout)
@@ -205,10 +205,10 @@ class PageModel:
                 if all(math.isfinite(each) for each in values):
                     objects[key] = [key[0], marker.type, *(round(each, 4) for each in values)]
 
-    # What goes out
+    # Output
 
     def layout(self) -> dict[str, Any]:
-        """What seldom changes: the boards and where their taxels are."""
+        """What seldom changes: the boards and the places of their taxels."""
         return {
             "version": self.version,
             "boards": {name: board.layout for name, board in sorted(self.boards.items())},
@@ -219,11 +219,14 @@ class PageModel:
         }
 
     def history(self) -> dict[str, list[tuple[float, ...]]]:
-        """Points of force of each board in the last seconds, for a page that has just opened."""
+        """Points of the last seconds' forces of each board, for a page that has just opened."""
         return {name: list(board.history) for name, board in self.boards.items()}
 
     def frame(self, now: Instant, wall_s: float | None = None) -> dict[str, Any]:
-        """Everything that changes. ``now``: the page's clock; ``wall_s``: time to show, if any."""
+        """Everything that changes.
+
+        ``now``: the page's clock. ``wall_s``: time of day to show, if any.
+        """
         t = round(now * 1e-9, 4)
         frame: dict[str, Any] = {
             "t": t,
@@ -328,7 +331,7 @@ def _remember(board: BoardModel, force: Mapping[str, Any], t: float) -> None:
     """Keep a point of force for pages that are opened later."""
     history = board.history
     if history and t < history[-1][0]:
-        history.clear()  # another place of a log
+        history.clear()  # a jump to another place of a log
     if history and t - history[-1][0] < HISTORY_PERIOD_S:
         return
     sides = force["sides"]
@@ -374,7 +377,7 @@ def _force(features: Any) -> dict[str, Any]:
 
 
 def _taxels(forces: Any) -> dict[str, Any]:
-    """Force and bound of each taxel in whole mN, and those that are masked with their bits."""
+    """Force and bound of each taxel in whole mN, and the masked taxels with their bits."""
     status = np.asarray(forces.status)
     masked = np.flatnonzero(status)
     bound = getattr(forces, "normal_bound", None)
@@ -388,7 +391,7 @@ def _taxels(forces: Any) -> dict[str, Any]:
 
 
 def _millinewtons(values: Any, unknown: int = 0) -> list[int]:
-    """Whole mN of an array of N; ``unknown`` where a value is not finite or beyond 1 MN."""
+    """Round newtons to whole mN; ``unknown`` where a value is not finite or beyond 1 MN."""
     array = np.asarray(values, np.float64) * 1e3
     good = np.abs(array) < 1e9  # False for NaN
     whole = np.where(good, np.rint(np.where(good, array, 0.0)), unknown)
@@ -397,7 +400,7 @@ def _millinewtons(values: Any, unknown: int = 0) -> list[int]:
 
 
 def _ambient(ambient: Any) -> dict[str, Any]:
-    """Strength of the field that was removed, µT at each array's centre."""
+    """Strength of the removed field at each array's centre, µT."""
     plane = np.asarray(ambient.plane, np.float64)
     centres = plane.reshape(-1, 3, 3)[:, :, 0] if plane.size % 9 == 0 else np.zeros((0, 3))
     strength = np.linalg.norm(centres, axis=1)
@@ -441,13 +444,13 @@ def _layout(message: Any) -> dict[str, Any]:
 
 
 def _grid(rows: int, columns: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Places for taxels whose own are not told: a grid of 10 mm."""
+    """Places for taxels whose own are unknown: a grid of 10 mm."""
     x, y = np.meshgrid(np.arange(columns) * 10.0, np.arange(rows) * 10.0)
     return np.stack([x, y], axis=-1).reshape(-1, 2)
 
 
 def _told(message: Any, name: str) -> tuple[dict[str, str], str]:
-    """Values of a board's diagnostics, and the state of its log ("" without one)."""
+    """Values of a board's diagnostics, and the state of its log ("" if it has none)."""
     values: dict[str, str] = {}
     log_state = ""
     for status in message.status:
@@ -493,12 +496,12 @@ def _twist(twist: Any) -> list[float | None]:
 
 
 def _number(value: float, digits: int = 4) -> float | None:
-    """Rounded; None for what JSON cannot hold."""
+    """Round a number; None for one that JSON cannot hold."""
     return round(float(value), digits) if math.isfinite(value) else None
 
 
 def _float(text: str | None) -> float | None:
-    """A number of the diagnostics, which are texts."""
+    """Parse a number of the diagnostics, which are texts."""
     try:
         value = float(text or "")
     except ValueError:
