@@ -26,6 +26,7 @@ lint: setup  ## style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy examples/*.py
 
 # Neighbouring tests share daemons and logs, so each worker gets a stretch of them.
 WORKERS := -n 2 --dist worksteal

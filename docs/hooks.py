@@ -1,4 +1,4 @@
-"""Lets the site show documents that live beside the code, and links into the repository as text."""
+"""Show documents that lie beside the code in the site, and links into the repository as text."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BESIDE = {
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
 }
-"""File of the repository to its page of the site."""
+"""File of the repository: its page in the site."""
 
 _LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
 
@@ -29,7 +29,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:  # noqa: ARG001 (mkdocs passes them by name)
-    """Point links at pages of the site; a link to any other file becomes its name."""
+    """Point links at pages of the site; a link to any other file becomes the file's name."""
     where = {page: (ROOT / source).parent for source, page in BESIDE.items()}
     folder = where.get(page.file.src_uri, (ROOT / "docs" / page.file.src_uri).parent)
     depth = page.file.src_uri.count("/")

@@ -1,11 +1,11 @@
 """A board in thirty lines: the bytes of an AnySkin on a pseudo-terminal.
 
     python fake_board.py ./pad &
-    tactiled --port ./pad --board anyskin
+    tactiled --port ./pad --kind anyskin
 
 Five chips send temperature (°C) and field (µT) as float32, then CR LF, 100 times a second. Every
 four seconds something seems to press on the chip in the middle. A board that you design yourself
-had better speak our protocol (PROTOCOL.md), which has checksums, numbers and device time.
+should rather speak our protocol (PROTOCOL.md), which has checksums, numbers and device time.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ CHIPS, PERIOD_S = 5, 0.01
 
 
 def frame(seconds: float, noise: random.Random) -> bytes:
-    """What the board sends ``seconds`` after power-on."""
+    """Bytes that the board sends ``seconds`` after power-on."""
     pressed = max(0.0, seconds % 4.0 - 2.0) if seconds > 4.0 else 0.0
     values = []
     for chip in range(CHIPS):
@@ -43,7 +43,7 @@ def main(path: str) -> None:
     while True:
         sent += 1
         time.sleep(max(0.0, start + sent * PERIOD_S - time.monotonic()))
-        with contextlib.suppress(BlockingIOError):  # nobody reads
+        with contextlib.suppress(BlockingIOError):  # the bytes are lost when nobody reads
             os.write(board, frame(sent * PERIOD_S, noise))
 
 

@@ -1,9 +1,9 @@
 """A gripper that holds a cup by the shear it feels: python hold_cup.py [SECONDS].
 
-The cup is being filled, so it grows heavier. The gripper cannot weigh it; it feels the cup's weight
-as shear on the skin, and presses just hard enough that friction carries it with something to spare.
-`GripControl` is all of the control and knows nothing of simulation: `main` runs it against a
-simulated cup that presses on a simulated skin, through tactiled, as a real gripper would.
+The cup is being filled, so it grows heavier. The gripper cannot weigh it, but feels the cup's
+weight as shear on the skin, and presses just hard enough for friction to carry it with some
+reserve. `GripControl` is the whole control and knows nothing of the simulation: `main` runs it
+against a simulated cup that presses on a simulated skin, through tactiled, as a real gripper would.
 """
 
 import contextlib
@@ -26,19 +26,26 @@ from sim_device.skin.elastomer import Contact
 from tactile_core.calibration import save
 from tactile_core.types import monotonic_now
 
-FRICTION = 0.6  # of the cup on the skin; the control believes less
+FRICTION = 0.6  # between cup and skin; the control assumes less
 G = 9.81
 
 
 class GripControl:
-    """Grip force (N) from the forces felt: normal force, shear and how far they may be off."""
+    """Grip force, N, from felt normal force, shear and the bound of their error.
+
+    ``friction``: coefficient that the control relies on. ``spare``: factor of reserve. ``least``:
+    smallest grip, N.
+    """
 
     def __init__(self, friction: float = 0.45, spare: float = 1.3, least: float = 1.0) -> None:
         self.friction, self.spare, self.least = friction, spare, least
         self.grip = least
 
     def step(self, normal: float, shear: float, bound: float, dt: float) -> float:
-        """Harder at once when it might slip, softer slowly when it certainly does not."""
+        """Grip harder at once if the cup might slip, and softer slowly if it certainly does not.
+
+        Forces in N; ``dt``: time since the last step, s. Returns the new grip force, N.
+        """
         wanted = self.spare * (shear + bound) / self.friction
         felt_too_soft = max(0.0, wanted - normal)
         if felt_too_soft > 0.0:
@@ -60,8 +67,8 @@ class Cup:
         self.held = 0.0
 
     def contacts(self, seconds: float) -> list[Contact]:
-        """What the skin feels: the grip into it, half of the weight along it."""
-        since = seconds - 4.0  # the skin is tared untouched
+        """Contacts on the skin at ``seconds``: the grip into it, half of the weight along it."""
+        since = seconds - 4.0  # the skin must be untouched during the tare
         if since < 0.0:
             return []
         self.mass = 0.05 + 0.25 * min(max((since - 2.0) / 6.0, 0.0), 1.0)
@@ -73,19 +80,19 @@ class Cup:
 
 
 def serve_board(board: SerialBoard, end: int, stop: threading.Event) -> None:
-    """Be the board on the other side of a pseudo-terminal."""
+    """Play the board at the far end of a pseudo-terminal."""
     while not stop.is_set():
         now = monotonic_now()
-        with contextlib.suppress(OSError):  # nothing was said, or nobody is there yet
+        with contextlib.suppress(OSError):  # nothing was sent, or nobody is there yet
             board.receive(os.read(end, 4096), now)
         data = board.tick(now)
-        with contextlib.suppress(BlockingIOError):  # a full line loses it, as a real one does
+        with contextlib.suppress(BlockingIOError):  # a full line loses bytes, as a real one does
             os.write(end, data)
         time.sleep(0.004)
 
 
 def main(seconds: float = 12.0) -> int:
-    """Hold the cup; 0 when it did not slip."""
+    """Hold the cup for ``seconds``. Returns 0 if it did not slip, 1 if it did."""
     skin = build_skin("finger", 1)
     array = skin.geometry.arrays[0]
     middle = array.taxels // 2 + array.columns // 2

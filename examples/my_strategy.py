@@ -1,6 +1,6 @@
 """A reaching strategy of your own.
 
-tactile reach --strategy my_strategy:Wiggle --seed 7 --headless
+Run it with ``tactile reach --strategy my_strategy:Wiggle --seed 7 --headless``.
 """
 
 import math
@@ -10,18 +10,18 @@ from reachd.interfaces import Twist
 
 
 class Wiggle:
-    """Straight at the goal; while something presses, sideways away from it."""
+    """Goes straight to the goal; while something presses, sideways away from it."""
 
     def __init__(self, parameters: Any, rng: Any) -> None:
-        """``rng``: the only source of chance, so that the same seed gives the same reach."""
+        """Keep the parameter set and ``rng``, the only source of chance: same seed, same reach."""
         self.p, self.rng, self.activity = parameters, rng, "straight"
 
     def start(self, goal: Any, now: Any) -> None:
-        """A reach begins."""
+        """Begin a reach."""
         self.activity = "straight"
 
     def step(self, touch: Any, arm: Any, goal: Any, now: Any) -> Twist:
-        """A hundred times a second: how the wrist should move."""
+        """Return the twist of the wrist pivot; called a hundred times a second."""
         tip_x = arm.x + self.p.tip_length * math.cos(arm.heading)
         tip_y = arm.y + self.p.tip_length * math.sin(arm.heading)
         angle = math.atan2(goal.y - tip_y, goal.x - tip_x)

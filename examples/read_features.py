@@ -6,7 +6,7 @@ import tactile_reach as tr
 
 
 def main(name: str | None = None, count: int = 20) -> None:
-    """Print ``count`` values of the board ``name`` (the only one, without a name)."""
+    """Print ``count`` values of board ``name``; without a name, of the only board."""
     with tr.connect() as bus, bus.board(name).features(timeout_s=30.0) as stream:
         for _ in range(count):
             f = next(stream)
@@ -25,6 +25,7 @@ def main(name: str | None = None, count: int = 20) -> None:
 
 if __name__ == "__main__":
     try:
-        main(*sys.argv[1:2], *(int(word) for word in sys.argv[2:3]))
+        words = sys.argv[1:]
+        main(words[0] if words else None, int(words[1]) if words[1:] else 20)
     except tr.TactileError as error:
         sys.exit(f"read_features: {error}")

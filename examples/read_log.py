@@ -14,7 +14,7 @@ def main(path: str, board: str | None = None) -> None:
     valid = frame[frame["valid"]]
     print(f"{len(frame)} features, {len(valid)} of them valid")
     print(valid.groupby(valid.index.astype(int))["normal_force"].max().rename("N").round(2))
-    force = log.board(board or names[0])["forces"]["force"]  # one row a message
+    force = log.board(board or names[0])["forces"]["force"]  # one row per message
     print(f"forces of {force.shape[1] // 3} taxels at {len(force)} instants")
 
 

@@ -6,7 +6,7 @@ import tactile_reach as tr
 
 
 def main(name: str | None = None) -> None:
-    """Tare, and take the reading as it is when the skin seems to be touched."""
+    """Tare; if it is refused because the skin seems touched, tare by force."""
     with tr.connect() as bus:
         board = bus.board(name)
         try:

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import shutil
+import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
+import msgspec
+import numpy as np
 import pytest
 
+from armd.config import ArmConfig
+from armd.driver import Driver, RobotMode
 from tests.support.paths import ROOT
 
 EXAMPLES = ROOT / "examples"
@@ -27,7 +35,7 @@ class Rig:
         self.processes = [
             self.popen(sys.executable, str(EXAMPLES / "fake_board.py"), "pad"),
             self.popen(
-                command("tactiled"), "--port", "pad", "--board", "anyskin", "--wait", "--log", "l"
+                command("tactiled"), "--port", "pad", "--kind", "anyskin", "--wait", "--log", "l"
             ),
         ]
 
@@ -55,7 +63,7 @@ def command(name: str) -> str:
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
     made = Rig(tmp_path_factory.mktemp("e"))
     end = time.monotonic() + SLOW_S
-    # A board that is there and streams is what all of them need.
+    # Every example needs a board that streams.
     while made.popen(
         command("tactile"), "echo", "tactile/board0/features", "--count", "1", "--timeout", "5"
     ).wait():
@@ -108,7 +116,7 @@ def test_a_cpp_program_decodes_what_python_does(rig: Rig) -> None:
             f"{message.normal_force:.4f} N, {len(message.patches)} contacts"
         )
         at += 4 + size
-    # A message cut short is told, not read past its end.
+    # A truncated message is reported, and not read beyond its end.
     cut = (20).to_bytes(4, "little") + data[4:24]
     done = subprocess.run([rig.folder / "features"], input=data + cut, capture_output=True)
     lines = [line for line in done.stdout.decode().splitlines() if not line.startswith(" ")]
@@ -133,18 +141,57 @@ def test_the_cup_is_held(tmp_path: Path) -> None:
         timeout=2 * SLOW_S, env=os.environ | {"TACTILE_RUNTIME_DIR": str(tmp_path / "r")},
     )  # fmt: skip
     assert "300 g" in done.stdout, done.stdout + done.stderr
-    # Whether it slips depends on how soon a busy machine lets the gripper act.
+    # A busy machine may delay the gripper so much that the cup slips.
     assert done.returncode in (0, 1), done.stderr
 
 
-def test_the_grip_follows_the_shear() -> None:
-    import importlib.util
-
-    spec = importlib.util.spec_from_file_location("hold_cup", EXAMPLES / "hold_cup.py")
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    return module
+
+
+def test_the_example_driver_moves_a_robot_that_speaks_its_protocol() -> None:
+    module = load("arm_driver")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as robot:
+        robot.bind(("127.0.0.1", 0))
+        robot.settimeout(SLOW_S)
+        table = {"address": "127.0.0.1", "port": robot.getsockname()[1]}
+        config = msgspec.convert({"robot": table, "tool": {"payload": 0.5}}, ArmConfig)
+        heard: list[str] = []
+
+        def answer() -> None:
+            for number in range(3):
+                data, sender = robot.recvfrom(1024)
+                heard.append(data.decode())
+                mode = 1 if number < 2 else 0
+                state = [number / 125, 0.4, 0.1, 0.3, *[0.0] * 15, mode]
+                robot.sendto(" ".join(map(str, state)).encode(), sender)
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        driver: Driver = module.ExampleDriver(config)
+        driver._socket.settimeout(SLOW_S)  # a busy machine answers late
+        driver.connect()
+        driver.move(np.array([0.01, 0, 0, 0, 0, 0]))
+        ready = driver.read()
+        driver.halt()
+        fault = driver.read()
+        thread.join()
+        driver.close()
+    assert heard[1].split()[:2] == ["v", "0.010000"]
+    assert ready is not None
+    assert ready.position.tolist() == [0.4, 0.1, 0.3]
+    assert ready.mode is RobotMode.READY
+    assert fault is not None
+    assert fault.mode is RobotMode.FAULT
+
+
+def test_the_grip_follows_the_shear() -> None:
+    module = load("hold_cup")
     control = module.GripControl()
     grip = control.least
     for step in range(1000):

@@ -1,4 +1,4 @@
-"""Configuration of the wrapper."""
+"""Configuration of the wrapping robot."""
 
 from dataclasses import dataclass, field
 
@@ -8,11 +8,12 @@ from lerobot.robots import RobotConfig
 @RobotConfig.register_subclass("tactile_reach")
 @dataclass(kw_only=True)
 class TactileReachConfig(RobotConfig):
-    """``boards``: taxels of each board by its name, 0 for sums alone. ``robot``: what is wrapped.
+    """Configuration of `TactileReach`.
 
-    ``connect``: zenoh endpoints of tactiled, empty for this machine's own. ``keys``: folder of keys
-    of a rig with certificates. ``max_age_s``: age from which touch is not valid. ``wait_s``: how
-    long to wait for each board when connecting.
+    ``boards``: number of taxels of each board by name, 0 for the sums alone. ``robot``: the wrapped
+    robot, None for touch alone. ``connect``: zenoh endpoints of tactiled, empty for those of this
+    machine. ``keys``: folder of keys of a rig with certificates. ``max_age_s``: age from which
+    touch is not valid. ``wait_s``: how long to wait for each board when connecting.
     """
 
     boards: dict[str, int] = field(default_factory=dict)

@@ -21,7 +21,7 @@ SUMS = ("valid", "normal_force", "peak_force", "tip_force", "fx", "fy", "fz", "m
 
 
 class Board:
-    """Newest touch of one board, by name of the observation; never waits."""
+    """Newest touch of one board by name of the observation; never waits."""
 
     def __init__(self, session: Any, name: str, taxels: int, max_age_s: float) -> None:
         self.keys = [f"{name}.{field}" for field in SUMS]
@@ -31,7 +31,7 @@ class Board:
         self._forces = _Newest(latest(session, FORCES.key(name)), FORCES) if taxels else None
 
     def read(self) -> dict[str, float]:
-        """All observations; zeros where touch is missing, too old or not valid."""
+        """Return all observations; zeros where touch is missing, too old or not valid."""
         found = dict.fromkeys([*self.keys, *self._taxel_keys], 0.0)
         message = self._features.read(self._max_age_s)
         if message is None or not message.valid:
@@ -54,7 +54,7 @@ class Board:
 
     @property
     def heard(self) -> bool:
-        """Whether something has come on every stream that is read."""
+        """Whether a message has come on every stream that is read."""
         streams = [s for s in (self._features, self._forces) if s is not None]
         return all(stream.read(math.inf) is not None for stream in streams)
 
@@ -66,13 +66,13 @@ class _Newest:
         self._came_s = -math.inf
 
     def read(self, max_age_s: float) -> Any:
-        """The newest message, None when it came more than ``max_age_s`` ago."""
+        """Return the newest message; None when it came more than ``max_age_s`` ago."""
         sample = self._stream.newest()
         if sample is not None:
             try:
                 self.message = codec().decode(self._topic, sample.data)
                 self._came_s = time.monotonic()
-            except DecodeError:  # of another version: as if nothing had come
+            except DecodeError:  # from another version: treat it as missing
                 pass
         return self.message if time.monotonic() - self._came_s <= max_age_s else None
 
@@ -83,7 +83,10 @@ def _finite(value: Any) -> float:
 
 
 class TactileReach(Robot):
-    """Observations: those of the wrapped robot, and touch. Actions: those of the wrapped robot."""
+    """Robot that wraps another: its observations and touch; its actions.
+
+    Either may be used alone.
+    """
 
     config_class = TactileReachConfig
     name = "tactile_reach"
@@ -98,7 +101,7 @@ class TactileReach(Robot):
 
     @cached_property
     def observation_features(self) -> dict[str, Any]:
-        """Type of each observation: of touch, float."""
+        """Type of each observation; touch is float."""
         features = {} if self.robot is None else dict(self.robot.observation_features)
         for name, taxels in self.config.boards.items():
             features |= {f"{name}.{field}": float for field in SUMS}
@@ -107,7 +110,7 @@ class TactileReach(Robot):
 
     @cached_property
     def action_features(self) -> dict[str, Any]:
-        """Those of the wrapped robot."""
+        """Actions of the wrapped robot."""
         return {} if self.robot is None else self.robot.action_features
 
     @property
@@ -116,7 +119,10 @@ class TactileReach(Robot):
         return self._session is not None and (self.robot is None or self.robot.is_connected)
 
     def connect(self, calibrate: bool = True) -> None:
-        """Connect both; ConnectionError that names the boards there are when one does not come."""
+        """Connect bus and robot.
+
+        ConnectionError when a board does not come; it names the boards there are.
+        """
         config = self.config
         self._session = open_session(
             BusConfig(listen=(), connect=tuple(config.connect) or None, keys=config.keys)
@@ -136,7 +142,10 @@ class TactileReach(Robot):
 
     @property
     def is_calibrated(self) -> bool:
-        """Of the wrapped robot; a board is calibrated with `tactile calibrate`."""
+        """Whether the wrapped robot is calibrated.
+
+        Boards are calibrated with `tactile calibrate`.
+        """
         return self.robot is None or self.robot.is_calibrated
 
     def calibrate(self) -> None:
@@ -150,7 +159,7 @@ class TactileReach(Robot):
             self.robot.configure()
 
     def get_observation(self) -> dict[str, Any]:
-        """Newest observations; never waits for touch."""
+        """Return the newest observations, without waiting for touch."""
         if self._session is None:
             raise ConnectionError(f"{self} is not connected: call connect() first")
         observation = {} if self.robot is None else dict(self.robot.get_observation())
@@ -159,11 +168,11 @@ class TactileReach(Robot):
         return observation
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
-        """Hand the action to the wrapped robot."""
+        """Pass the action to the wrapped robot."""
         return {} if self.robot is None else self.robot.send_action(action)
 
     def disconnect(self) -> None:
-        """Disconnect both."""
+        """Disconnect bus and robot."""
         if self.robot is not None and self.robot.is_connected:
             self.robot.disconnect()
         self._leave()

@@ -1,4 +1,4 @@
-"""The plugin as LeRobot finds, makes and asks it; needs LeRobot and this package installed."""
+"""The plugin as LeRobot finds, makes and uses it; needs LeRobot and this package installed."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_lerobots_factory_makes_it_and_its_observations_are_as_declared(skin: Sk
     assert observation["left.normal_force"] == 3.0
     assert observation["left.fz"] == -1.5
     assert observation["left.taxel0.z"] == -1.5
-    assert observation["left.taxel1.y"] == 0.0  # not a number: masked
+    assert observation["left.taxel1.y"] == 0.0  # NaN: masked
     assert not robot.is_connected
 
 

@@ -1,9 +1,9 @@
-"""A driver for armd, whole: a robot of one's own that takes velocities over UDP.
+"""A complete driver for armd: a robot of your own that takes velocities over UDP.
 
-Copy it to ``armd/drivers``, add a line to ``catalogue.DRIVERS``, and run the tests of ``arms``
-with it. The robot here answers each datagram ``v vx vy vz wx wy wz`` (m/s, rad/s, base) with its
-state, and rests by itself 50 ms after the last one: whatever does not do that by itself needs a
-watchdog first.
+Copy it to ``armd/drivers``, add a line to ``catalogue.DRIVERS``, and run the tests in
+``tests/armd`` with it. This robot answers each datagram ``v vx vy vz wx wy wz`` (m/s, rad/s, base
+frame) with its state, and comes to rest by itself 50 ms after the last one. A robot that does not
+do that by itself needs a watchdog first.
 """
 
 from __future__ import annotations
@@ -19,40 +19,43 @@ from armd.frames import rotation_matrix
 from tactile_core.types import ArmLimits
 
 PORT = 4711
-NUMBERS = 20  # s; position, rotation vector; twist; wrench; 1 while it may move
+NUMBERS = 20  # time s; position, rotation vector; twist; wrench; 1 if it may move
 
 
 class ExampleDriver:
-    """See `armd.driver.Driver`."""
+    """Implements `armd.driver.Driver`, which describes its methods."""
 
     rate = 125.0
     holds = 0.05
-    note = "an example: there is not any robot"
+    note = "an example: no such robot exists"
 
     def __init__(self, config: ArmConfig) -> None:
         self.braking = config.robot.acceleration
-        self._address = (config.robot.address, PORT)
+        self._address = (config.robot.address, config.robot.port or PORT)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.settimeout(0.02)
 
     def connect(self) -> RobotFacts:
-        """Look whether it answers; say what it says of itself, None for what it does not."""
+        """Check that the robot answers.
+
+        It says nothing about its tool, so those facts stay None.
+        """
         self.move(np.zeros(6))
         if self.read() is None:
             raise DriverError(
-                f"no robot at {self._address[0]}:{PORT}: look at [robot] address and its cable"
+                "no robot at {}:{}: check [robot] address and the cable".format(*self._address)
             )
         return RobotFacts(f"example at {self._address[0]}")
 
     def read(self) -> RobotState | None:
-        """The newest state, None when there is not a newer one within 20 ms."""
+        """Return the newest state; None if no new one comes within 20 ms."""
         try:
             data, _ = self._socket.recvfrom(1024)
             numbers = np.array(data.split(), dtype=np.float64)
         except (TimeoutError, ValueError):
             return None
         except OSError as error:
-            raise DriverError(f"the robot cannot be heard: {error}") from error
+            raise DriverError(f"the robot cannot be read: {error}") from error
         if numbers.size != NUMBERS:
             return None
         ready = numbers[19] == 1.0
@@ -63,34 +66,34 @@ class ExampleDriver:
             numbers[7:13],
             numbers[13:19],
             RobotMode.READY if ready else RobotMode.FAULT,
-            "" if ready else "it stopped: look what it met",
+            "" if ready else "it stopped: see what it met",
         )
 
     def move(self, velocity: Float) -> None:
-        """Without waiting for an answer."""
+        """Send a velocity without waiting for an answer."""
         words = " ".join(f"{v:.6f}" for v in velocity)
         try:
             self._socket.sendto(f"v {words}".encode(), self._address)
         except OSError as error:
-            raise DriverError(f"the robot cannot be told: {error}") from error
+            raise DriverError(f"the robot cannot be commanded: {error}") from error
 
     def halt(self) -> None:
-        """Rest at once."""
+        """Come to rest at once."""
         self.move(np.zeros(6))
 
     def limit(self, limits: ArmLimits) -> None:
-        """It has none of its own: armd keeps them."""
+        """Nothing to do: the robot has no limits of its own, and armd keeps them."""
 
     def recover(self) -> None:
-        """Because an operator asked for it."""
+        """Clear a stop, because an operator asked for it."""
         self._socket.sendto(b"recover", self._address)
         time.sleep(0.1)
 
     def zero_force(self) -> None:
-        """Take the present wrench for none."""
+        """Take the present wrench as zero."""
         self._socket.sendto(b"zero", self._address)
 
     def close(self) -> None:
-        """Rest and let go."""
+        """Come to rest and close the socket."""
         self.halt()
         self._socket.close()
