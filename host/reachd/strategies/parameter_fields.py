@@ -128,6 +128,26 @@ class Parameters:
         float, Meta(ge=0, le=1, description="chance that the direction follows the contact")
     ]
 
+    jam_time: Annotated[
+        Seconds, Meta(gt=0, description="time without progress that is a jam, for quick_sweep")
+    ]
+    jam_progress: Annotated[
+        Metres, Meta(gt=0, description="gain of distance that counts as progress, for quick_sweep")
+    ]
+    jam_force: Annotated[
+        Newtons, Meta(gt=0, description="sum of normal forces that is a jam, for quick_sweep")
+    ]
+    sweep_time: Annotated[Seconds, Meta(gt=0, description="time that a sweep takes")]
+    sweep_angle: Annotated[
+        Radians, Meta(ge=0, le=3.1416, description="direction of a sweep off the goal's")
+    ]
+    sweep_omega: Annotated[
+        RadiansPerSecond, Meta(ge=0, description="turn rate of a sweep, to its side")
+    ]
+    sweep_obedience: Annotated[
+        float, Meta(ge=0, le=1, description="chance that a sweep goes away from the contact")
+    ]
+
     safety: SafetySettings
     note: str = ""
 
@@ -146,7 +166,7 @@ class Parameters:
                 "set both",
                 ("v_max",),
             )
-        fastest = max(self.omega_max, self.excavate_omega_max)
+        fastest = max(self.omega_max, self.excavate_omega_max, self.sweep_omega)
         if self.safety.turn_rate < fastest:
             raise ConfigError(
                 f"omega_max ({fastest:g} rad/s) exceeds safety.turn_rate "

@@ -110,6 +110,13 @@ HARDWARE = Parameters(
     # "on the left or right side of the end-effector … CCW or CW", without exception.
     direction_from="side",
     direction_obedience=1.0,
+    jam_time=0.3,
+    jam_progress=0.0018,
+    jam_force=4.5,
+    sweep_time=0.6,
+    sweep_angle=math.radians(55.0),
+    sweep_omega=_HARDWARE_OMEGA,
+    sweep_obedience=1.0,
     safety=SafetySettings(
         # The tip moves at v_max while the finger turns at ω_max: the pivot must be that much
         # faster, or every excavation would be cut short.
@@ -189,6 +196,13 @@ AUTHORS_SIM = Parameters(
     progress_reference="excavation_start",
     direction_from="cupboard_y",
     direction_obedience=0.75,
+    jam_time=0.3,
+    jam_progress=0.0018,
+    jam_force=4.5,
+    sweep_time=0.6,
+    sweep_angle=math.radians(55.0),
+    sweep_omega=0.2,
+    sweep_obedience=1.0,
     safety=SafetySettings(
         speed=_SIM_SPEED,
         turn_rate=_SIM_OMEGA,

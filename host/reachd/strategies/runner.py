@@ -19,6 +19,7 @@ from reachd.strategies.builtin import (
     StrategyEvent,
 )
 from reachd.strategies.parameter_fields import Parameters
+from reachd.strategies.quick_sweep import QuickSweep
 from tactile_core.types import Instant, record
 
 GROUP = "tactile_reach.strategies"
@@ -32,6 +33,7 @@ BUILT_IN: dict[str, Factory] = {
     "excavate": Excavate,
     "hybrid_clock": HybridClock,
     "hybrid_event": HybridEvent,
+    "quick_sweep": QuickSweep,
 }
 
 
