@@ -320,7 +320,7 @@ class Reporter:
             self._send_event(Event(now, "state", status.state, status.text))
         for event in cycle.events:
             text = f"{event.direction} {event.trigger}"
-            self._send_event(Event(event.at, "excavation", event.kind, text))
+            self._send_event(Event(event.at, event.family, event.kind, text))
         for onset in cycle.onsets:
             text = f"{onset.effect}: {onset.text}"
             self._send_event(Event(now, "intervention", onset.code, text))

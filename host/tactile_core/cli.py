@@ -548,8 +548,11 @@ def add_board(parser: Adding, what: str, **options: Any) -> None:
 KINDS: Final = ("auto", "tactile", "anyskin", "reskin", "eflesh")
 """Values of --kind besides a layout; the last three mean the same boards."""
 
-STRATEGIES: Final = ("straight", "burrow", "excavate", "hybrid_clock", "hybrid_event")
-"""Strategies built into reachd."""
+PAPER_STRATEGIES: Final = ("straight", "burrow", "excavate", "hybrid_clock", "hybrid_event")
+"""The paper's strategies, which its experiments compare."""
+
+STRATEGIES: Final = (*PAPER_STRATEGIES, "quick_sweep")
+"""Strategies that come with reachd."""
 
 DEFAULT_STRATEGY: Final = "hybrid_event"
 """The best strategy of the paper."""

@@ -23,15 +23,22 @@ nobody takes them."""
 
 @dataclass(frozen=True, slots=True)
 class StrategyEvent:
-    """Something a strategy decided. ``kind`` is "excavation_start" or "excavation_end".
+    """Something a strategy decided.
 
-    ``direction`` is "cw" or "ccw"; ``trigger`` is "clock", "stall", "push" or a plug-in's word.
+    ``kind``: "excavation_start", "excavation_end", "sweep_start", "sweep_end", or a word of the
+    strategy's own. ``direction``: "cw" or "ccw". ``trigger``: "clock", "stall", "push", "jam", or a
+    word of the strategy's own.
     """
 
     at: Instant
     kind: str
     direction: str
     trigger: str
+
+    @property
+    def family(self) -> str:
+        """What it belongs to, ``ReachEvent.kind``: "excavation", "sweep"."""
+        return self.kind.partition("_")[0]
 
 
 @record
@@ -75,7 +82,7 @@ class ReachingStrategy(ABC):
 
     @property
     def activity(self) -> str:
-        """What it is doing; see ``seam.Strategy``."""
+        """What it is doing now; see `interfaces.Strategy`."""
         return self._activity
 
     def start(self, goal: Goal, now: Instant) -> None:

@@ -45,9 +45,9 @@ def load(spec: str) -> Strategy:
     return load_strategy(spec, HARDWARE, np.random.default_rng(0))
 
 
-def test_five_strategies_are_built_in() -> None:
-    names = ("straight", "burrow", "excavate", "hybrid_clock", "hybrid_event")
-    assert available()[:5] == names
+def test_built_in_strategies_are_available() -> None:
+    names = ("straight", "burrow", "excavate", "hybrid_clock", "hybrid_event", "quick_sweep")
+    assert available()[:6] == names
     for name in names:
         assert load(name).activity == "straight"
 

@@ -1,4 +1,4 @@
-"""The five strategies: what they do when, and that they are functions of their inputs."""
+"""The built-in strategies: what they do when, and that they are functions of their inputs."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from reachd.interfaces import ZERO, ArmState, Goal, Twist
 from reachd.strategies import load_strategy
 from reachd.strategies.builtin import MAX_EVENTS, Moment, ReachingStrategy
 from reachd.strategies.parameters import AUTHORS_SIM, HARDWARE, parameters
+from reachd.strategies.runner import BUILT_IN
 from tactile_core.geometry import Side
 from tactile_core.types import Instant, after
 
@@ -118,7 +119,7 @@ def test_non_finite_inputs_are_not_used(name: str, value: float, make_touch: Cal
 
 @settings(max_examples=40, deadline=None)
 @given(
-    st.sampled_from(["straight", "burrow", "excavate", "hybrid_clock", "hybrid_event"]),
+    st.sampled_from(list(BUILT_IN)),
     st.sampled_from([HARDWARE, AUTHORS_SIM]),
     st.integers(0, 1000),
 )

@@ -33,7 +33,7 @@ def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, s
 
 def test_names_in_help_match_available_names() -> None:
     assert tuple(AXES) == AXIS_NAMES
-    assert names.STRATEGIES == STRATEGIES
+    assert names.PAPER_STRATEGIES == STRATEGIES
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from rich.progress import (
 )
 
 from sim_device.world.engines import ENGINES
-from tactile_core.cli import REFUSED, STRATEGIES, CommandError, require, working
+from tactile_core.cli import PAPER_STRATEGIES, REFUSED, CommandError, require, working
 from tactile_tools.experiments.arguments import named_values
 from tactile_tools.experiments.backends import Backend, BackendError, Processes
 from tactile_tools.experiments.cli import AXIS_NAMES
@@ -89,7 +89,7 @@ def _sweep(options: argparse.Namespace) -> Study:
 
 
 def _chosen(options: argparse.Namespace) -> tuple[str, ...]:
-    return tuple(options.strategy or STRATEGIES)
+    return tuple(options.strategy or PAPER_STRATEGIES)
 
 
 strategies = _studied(lambda o: strategies_study(_common(o), _chosen(o)), "strategies")

@@ -24,6 +24,8 @@ ACTIVITIES = {
     "burrow": "#009E73",
     "excavate_ccw": "#E69F00",
     "excavate_cw": "#CC79A7",
+    "sweep_ccw": "#E69F00",
+    "sweep_cw": "#CC79A7",
 }
 """Palette of Okabe and Ito, distinguishable in print and by colour-blind people."""
 OTHER = "#7f7f7f"
@@ -93,7 +95,7 @@ def reach_sheet(reach: ReachSeries, look: Look = SCREEN) -> Sheet:
         axes.tick_params(labelbottom=False)
         sheet.legend(axes)
         for begin, end, activity in _spans(reach):
-            if activity.startswith("excavate"):
+            if activity.startswith(("excavate", "sweep")):
                 axes.axvspan(
                     begin, end, color=ACTIVITIES.get(activity, OTHER), alpha=0.15, lw=0, zorder=0
                 )

@@ -118,7 +118,7 @@ class TrialLog:
         self._write(COMMAND, ARM, command, now)
         self._write(REACH_STATE, REACH, self._reach_state(step, stamp), now)
         for event in step.control.events:
-            self._event(now, "excavation", event.kind, f"{event.direction} {event.trigger}")
+            self._event(now, event.family, event.kind, f"{event.direction} {event.trigger}")
         for intervention in step.control.onsets:
             text = f"{intervention.effect}: {intervention.text}"
             self._event(now, "intervention", intervention.code, text)
