@@ -71,6 +71,10 @@ COMMANDS: Final = {
         "repeat the paper's studies: trials, statistics, report",
         "tactile_tools.experiments.cli",
     ),
+    "benchmark": Command(
+        "run a strategy on fixed scene sets and write its entry for the leaderboard",
+        "tactile_tools.experiments.cli:fill_benchmark",
+    ),
     "demo": Command(
         "reach into a simulated cupboard, leave a log and a picture",
         f"{HERE}:_fill_demo",

@@ -18,6 +18,7 @@ from tactile_core.cli import (
     add_strategies,
     count,
     later,
+    positive,
     seed,
 )
 from tactile_tools.options import add_depth, add_engine, add_strategy
@@ -26,6 +27,10 @@ AXIS_NAMES = (
     "density", "friction_objects", "friction_all", "force", "width", "time", "noise", "rate", "dead"
 )  # fmt: skip
 """Names of `axes`, which takes half a second to import; a test checks that they are equal."""
+
+SCENE_SET_NAMES = ("squeezed", "dense", "high_friction", "narrow", "hardware", "recorded")
+LIMITS_S = (20.0, 40.0)
+"""As in `benchmark`, likewise."""
 
 HERE = "tactile_tools.experiments.cli"
 
@@ -167,6 +172,83 @@ def _trial(parser: Parser) -> None:
     add_path(parser, "--log", "MCAP file of the trial")
     add_path(parser, "--png", "picture of the trial; needs --log")
     parser.set_defaults(func=_work("trial", "mujoco", extra="sim"))
+
+
+BENCHMARK_EXAMPLES = """\
+examples:
+  tactile benchmark my_strategies:Wiggle --scenes 20 --sets squeezed --engine mujoco --depth contacts --limit 20
+  tactile benchmark quick_sweep --out runs/quick_sweep --entry docs/results/benchmark/quick_sweep.json
+
+A run that was stopped or killed goes on where it was when the same command is given again; with
+more scenes, sets, engines, depths and limits the same folder grows. Rules for entries:
+docs/leaderboard.md.
+Exit: 0 done, 1 some trials could not be run, 2 bad argument, 3 refused by the system,
+130 stopped by Ctrl-C.
+"""
+
+
+def fill_benchmark(parser: Parser) -> None:
+    """Add the options of ``tactile benchmark``."""
+    parser.description = (
+        "Run one strategy on fixed scene sets, in each engine, depth of sensing and time limit; "
+        "print success, time, forces, objects pushed out and CPU time, and write them as JSON."
+    )
+    parser.epilog = BENCHMARK_EXAMPLES
+    parser.add_argument("strategy", metavar="STRATEGY", help="name or module:Class")
+    parser.add_argument(
+        "--sets",
+        nargs="+",
+        action="extend",
+        choices=SCENE_SET_NAMES,
+        metavar="SET",
+        help="scene sets (default all: %(choices)s)",
+    )
+    parser.add_argument(
+        "--scenes", type=count, default=100, metavar="N", help="of each set (default 100)"
+    )
+    parser.add_argument(
+        "--engine",
+        nargs="+",
+        action="extend",
+        choices=ENGINES,
+        help="physics engines (default mujoco and pymunk)",
+    )
+    parser.add_argument(
+        "--depth",
+        nargs="+",
+        action="extend",
+        choices=("contacts", "taxels"),
+        help="what is felt (default both)",
+    )
+    parser.add_argument(
+        "--limit",
+        nargs="+",
+        action="extend",
+        type=positive("s"),
+        metavar="S",
+        help="time limits, s (default 20 and 40)",
+    )
+    _param_option(parser)
+    cores = os.cpu_count() or 1
+    parser.add_argument(
+        "--jobs",
+        "--workers",
+        type=count,
+        default=cores,
+        metavar="N",
+        help=f"processes (default {cores})",
+    )
+    add_path(parser, "--out", "folder of the run (default runs/benchmark-STRATEGY)")
+    add_path(parser, "--entry", "entry to write (default: entry.json in the folder of the run)")
+    parser.add_argument("--name", help="name on the leaderboard (default: the strategy's)")
+    parser.add_argument(
+        "--note",
+        default="",
+        metavar="TEXT",
+        help="where the code is, what it was tuned on and what that took, for the leaderboard",
+    )
+    parser.add_argument("--retry", action="store_true", help="run trials again that failed")
+    parser.set_defaults(func=_work("benchmark"))
 
 
 def _study_options(parser: Parser, *, scenes: int) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +19,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Table
 
 from sim_device.world.engines import ENGINES
 from tactile_core.cli import PAPER_STRATEGIES, REFUSED, CommandError, require, working
@@ -24,9 +27,11 @@ from tactile_tools.experiments.arguments import named_values
 from tactile_tools.experiments.backends import Backend, BackendError, Processes
 from tactile_tools.experiments.cli import AXIS_NAMES
 from tactile_tools.experiments.dask_backend import DaskCluster
+from tactile_tools.experiments.document import percent, slug
 from tactile_tools.experiments.journal import DiskError, FolderError
 from tactile_tools.experiments.rows import Row, TableError, describe
 from tactile_tools.experiments.runner import check, run_study
+from tactile_tools.experiments.statistics import Rate
 from tactile_tools.experiments.studies import (
     READINGS,
     Options,
@@ -35,9 +40,15 @@ from tactile_tools.experiments.studies import (
     strategies_study,
     sweep_study,
 )
+from tactile_tools.experiments.tables import load_run
 
 SETS, DEPTHS = ("authors_sim",), ("contacts",)
 """Defaults of a study that names none."""
+
+BENCHMARK_ENGINES = ("mujoco", "pymunk")
+
+STOPPED = 130
+"""Exit status after Ctrl-C."""
 
 TOLD_EVERY_S = 30.0
 """Seconds between lines of progress where there is no terminal for a bar."""
@@ -124,7 +135,7 @@ def _study(study: Study, options: argparse.Namespace, word: str) -> int:
             f"stopped: {told.finished} of {told.total} trials are finished and kept; "
             "the same command runs the rest"
         )
-        return 130
+        return STOPPED
     _say(console, summary, told, directory)
     return 1 if summary["errors"] else 0
 
@@ -194,6 +205,80 @@ def _say(console: Console, summary: dict[str, Any], told: _Teller, directory: Pa
         for text in told.failed:
             console.print(f"  {text}", markup=False)
     console.print(f"wrote {directory}/trials.parquet, trials.csv and summary.json")
+
+
+@_told
+def benchmark(options: argparse.Namespace) -> int:
+    """``tactile benchmark``."""
+    from tactile_tools.experiments import benchmark as board
+
+    _look_here(options.strategy)
+    sets = tuple(dict.fromkeys(options.sets or board.SCENE_SETS))
+    missing = board.recorded_missing() if "recorded" in sets else None
+    if missing and not options.sets:
+        print(f"note: without the set recorded: {missing}")
+        sets = tuple(name for name in sets if name != "recorded")
+    elif missing:
+        raise ValueError(missing)
+    common = Options(
+        scenes=options.scenes,
+        seed=board.FIRST_SEED,
+        sets=sets,
+        engines=tuple(dict.fromkeys(options.engine or BENCHMARK_ENGINES)),
+        depths=tuple(dict.fromkeys(options.depth or ("contacts", "taxels"))),
+        source=None,
+        parameters=named_values("--param", options.param),
+    )
+    limits = tuple(sorted(dict.fromkeys(options.limit or board.LIMITS_S)))
+    study = board.benchmark_study(common, options.strategy, limits)
+    name = options.name or options.strategy
+    options.out = options.out or Path("runs") / f"benchmark-{slug(name)}"
+    options.dask = None
+    code = _study(study, options, "benchmark")
+    if code == STOPPED:
+        return code
+    entry = board.entry_of(study, load_run(options.out).rows, name, options.note)
+    path = options.entry or options.out / "entry.json"
+    try:
+        board.write_entry(entry, path)
+    except OSError as error:
+        raise DiskError(f"cannot write {path}: {error.strerror}") from error
+    _show_entry(entry)
+    print(f"wrote {path}")
+    return code
+
+
+def _look_here(strategy: str) -> None:
+    """Let a strategy module:Class lie in the current folder, here and in the workers."""
+    here = os.getcwd()
+    if ":" in strategy and here not in sys.path:
+        sys.path.append(here)
+
+
+def _show_entry(entry: dict[str, Any]) -> None:
+    """Print an entry, a line a case."""
+    table = Table(title=entry["name"], title_justify="left", pad_edge=False)
+    heads = ("set", "engine", "depth", "limit", "success", "time", "peak force", "out", "CPU")
+    for at, head in enumerate(heads):
+        table.add_column(head, justify="right" if at > 2 else "left")
+    for case in entry["cases"]:
+        if "success" not in case:
+            shown = [f"{case['errors']} errors", "", "", "", ""]
+        else:
+            count, trials, _, _ = case["success"]
+            force = case["peak_contact_n"]
+            shown = [
+                percent(Rate(count, trials)),
+                f"{case['time_s']['mean']:.1f} s",
+                f"{force['median']:.1f} N, p90 {force['p90']:.1f}",
+                f"{case['ejected_per_trial']:.2f}",
+                f"{case['cpu_s_per_trial']:.2f} s",
+            ]
+        limit = f"{case['limit_s']:g} s"
+        table.add_row(case["set"], case["engine"], case["depth"], limit, *shown)
+    console = Console()
+    console.print(table)
+    console.print("Means of a trial; peak force: the greatest single contact, median of trials.")
 
 
 @_told

@@ -197,6 +197,11 @@ def rebuild(directory: Path, definition: Mapping[str, Any]) -> tuple[Study, Opti
             case "robustness":
                 axes = tuple(definition["axes"])
                 study = robustness_study(options, tuple(definition["strategies"]), axes)
+            case "benchmark":
+                from tactile_tools.experiments.benchmark import benchmark_study
+
+                limits = tuple(definition["limits"])
+                study = benchmark_study(options, definition["strategies"][0], limits)
             case other:
                 raise FolderError(f"{directory} is a study {other!r}, which this version lacks")
     except (KeyError, TypeError, ValueError) as error:
