@@ -184,7 +184,7 @@ def entry_of(study: Study, rows: Sequence[Row], name: str, note: str) -> dict[st
         "parameters": d["parameters"],
         "note": note,
         "versions": sorted({row["version"] for row in rows if row["version"]}),
-        "command": command_of(d),
+        "commands": [command_of(d)],
         "cases": cases,
     }
 
@@ -218,16 +218,14 @@ def summary_of(rows: Sequence[Row]) -> dict[str, Any]:
     }
     if not good:
         return summary
-    reached = [row for row in good if row["success"]]
+    times = [row["time_s"] for row in good if row["success"]]
     simulated = sum(row["simulated_s"] for row in good)
     return summary | {
         "success": _rate([row["success"] for row in good]),
         "entered_7_5_mm": _rate([row["entered"] for row in good]),
         "time_s": {
             "mean": _rounded(fmean(row["time_s"] for row in good)),
-            "median_of_reached": _rounded(median(r["time_s"] for r in reached))
-            if reached
-            else None,
+            "median_of_reached": _rounded(median(times)) if times else None,
         },
         "peak_contact_n": _spread([row["peak_contact_n"] for row in good]),
         "peak_load_n": _spread([row["peak_load_n"] for row in good]),
@@ -258,6 +256,37 @@ def _rounded(value: float, digits: int = 4) -> float:
     return round(float(value), digits)
 
 
+def merged(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+    """``old`` with the cases of ``new``, those that both have from ``new``; EntryError.
+
+    An entry so grows by one command after another.
+    """
+    for key in ("name", "strategy", "parameters"):
+        if old.get(key) != new[key]:
+            raise EntryError(
+                f"the entry there is of another {key} ({old.get(key)!r}, here {new[key]!r}): "
+                "choose another --entry"
+            )
+    fresh = {_case_key(case) for case in new["cases"]}
+    kept = [case for case in old["cases"] if _case_key(case) not in fresh]
+    order = list(SCENE_SETS)
+    cases = sorted(
+        [*kept, *new["cases"]],
+        key=lambda c: (order.index(c["set"]), c["engine"], c["depth"], c["limit_s"]),
+    )
+    return {
+        **new,
+        "note": new["note"] or old["note"],
+        "versions": sorted({*old["versions"], *new["versions"]}),
+        "commands": list(dict.fromkeys([*old["commands"], *new["commands"]])),
+        "cases": cases,
+    }
+
+
+def _case_key(case: Mapping[str, Any]) -> tuple[object, ...]:
+    return tuple(case[key] for key in ("set", "engine", "depth", "limit_s"))
+
+
 def write_entry(entry: Mapping[str, Any], path: Path) -> None:
     """Write ``entry`` to ``path``, whole or not at all; OSError."""
     replace_file(path, (json.dumps(entry, indent=1, ensure_ascii=False) + "\n").encode())
@@ -269,7 +298,7 @@ def read_entry(path: Path) -> dict[str, Any]:
         raw = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise EntryError(f"cannot read {path}: {error}") from None
-    wanted = {"name": str, "strategy": str, "note": str, "command": str, "cases": list}
+    wanted = {"name": str, "strategy": str, "note": str, "commands": list, "cases": list}
     if not isinstance(raw, dict) or raw.get("format") != FORMAT:
         raise EntryError(
             f"{path} is not an entry in format {FORMAT}: make it with tactile benchmark"

@@ -176,8 +176,9 @@ def _trial(parser: Parser) -> None:
 
 BENCHMARK_EXAMPLES = """\
 examples:
-  tactile benchmark my_strategies:Wiggle --scenes 20 --sets squeezed --engine mujoco --depth contacts --limit 20
-  tactile benchmark quick_sweep --out runs/quick_sweep --entry docs/results/benchmark/quick_sweep.json
+  tactile benchmark quick_sweep                          # everything: about an hour of CPU time
+  tactile benchmark my_strategies:Wiggle --sets squeezed --engine mujoco --depth contacts --limit 20
+  tactile benchmark quick_sweep --out runs/quick_sweep --entry quick_sweep.json
 
 A run that was stopped or killed goes on where it was when the same command is given again; with
 more scenes, sets, engines, depths and limits the same folder grows. Rules for entries:

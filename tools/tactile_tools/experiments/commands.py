@@ -19,7 +19,6 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
 
 from sim_device.world.engines import ENGINES
 from tactile_core.cli import PAPER_STRATEGIES, REFUSED, CommandError, require, working
@@ -240,6 +239,8 @@ def benchmark(options: argparse.Namespace) -> int:
     entry = board.entry_of(study, load_run(options.out).rows, name, options.note)
     path = options.entry or options.out / "entry.json"
     try:
+        if path.exists():
+            entry = board.merged(board.read_entry(path), entry)
         board.write_entry(entry, path)
     except OSError as error:
         raise DiskError(f"cannot write {path}: {error.strerror}") from error
@@ -257,28 +258,36 @@ def _look_here(strategy: str) -> None:
 
 def _show_entry(entry: dict[str, Any]) -> None:
     """Print an entry, a line a case."""
-    table = Table(title=entry["name"], title_justify="left", pad_edge=False)
-    heads = ("set", "engine", "depth", "limit", "success", "time", "peak force", "out", "CPU")
-    for at, head in enumerate(heads):
-        table.add_column(head, justify="right" if at > 2 else "left")
+    form = "{:13} {:7} {:8} {:>5} {:>17} {:>6} {:>13} {:>4} {:>5}"
+    heads = (
+        "set",
+        "engine",
+        "depth",
+        "limit",
+        "success [95 %]",
+        "time",
+        "force, p90",
+        "out",
+        "CPU",
+    )
+    print(entry["name"])
+    print(form.format(*heads, "CPU"))
     for case in entry["cases"]:
-        if "success" not in case:
-            shown = [f"{case['errors']} errors", "", "", "", ""]
-        else:
-            count, trials, _, _ = case["success"]
+        cells = [f"{case['errors']} errors", "", "", "", ""]
+        if "success" in case:
             force = case["peak_contact_n"]
-            shown = [
-                percent(Rate(count, trials)),
+            cells = [
+                percent(Rate(*case["success"][:2])),
                 f"{case['time_s']['mean']:.1f} s",
-                f"{force['median']:.1f} N, p90 {force['p90']:.1f}",
+                f"{force['median']:.1f}, {force['p90']:.1f} N",
                 f"{case['ejected_per_trial']:.2f}",
-                f"{case['cpu_s_per_trial']:.2f} s",
+                f"{case['cpu_s_per_trial']:.1f} s",
             ]
         limit = f"{case['limit_s']:g} s"
-        table.add_row(case["set"], case["engine"], case["depth"], limit, *shown)
-    console = Console()
-    console.print(table)
-    console.print("Means of a trial; peak force: the greatest single contact, median of trials.")
+        print(form.format(case["set"], case["engine"], case["depth"], limit, *cells))
+    print(
+        "time, out (objects pushed out) and CPU: means of a trial; force: greatest contact, median"
+    )
 
 
 @_told
