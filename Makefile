@@ -7,7 +7,7 @@ SOAK_MINUTES ?= 60
 KILLS ?= 1000
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-random test-loaded lint demo demo-ur arms demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage hostile recordings stress soak fuzz-pipeline kills firmware-test docs docs-reference pictures clean
+.PHONY: help setup test test-random test-loaded lint demo demo-ur arms arms-scenes demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage hostile recordings stress soak fuzz-pipeline kills firmware-test docs docs-reference pictures clean
 
 help:  ## list the targets (what `make` alone does)
 	@echo "make TARGET, where TARGET is one of:"
@@ -54,6 +54,10 @@ demo: setup  ## reach into a simulated cupboard, leave a log and a picture
 # Such a reach with an emulated robot of Universal Robots, through armd and its vendor's client.
 demo-ur: setup  ## the same with an emulated robot of Universal Robots
 	$(BIN)/tactile demo --arm ur --seed 36
+
+# The same fifty scenes with the simulated arm and with the emulated robot; an hour, resumable.
+arms-scenes: setup  ## 50 scenes with the simulated arm and an emulated UR; an hour, goes on where cut off
+	$(BIN)/tactile arm-scenes --scenes 50 --out docs/results/ur.json
 
 # Every driver against every fault, ten times over; some minutes.
 arms: setup  ## every driver of a robot against every fault

@@ -15,6 +15,7 @@ from tactile_core.cli import (
     add_bus,
     add_commands,
     add_json,
+    add_out,
     add_path,
     add_seeds,
     checked,
@@ -110,6 +111,10 @@ COMMANDS: Final = {
         "replug boards for an hour, and watch memory and descriptors",
         f"{HERE}:_fill_soak",
     ),
+    "arm-scenes": Command(
+        "reach in the same scenes with the simulated arm and an emulated robot",
+        f"{HERE}:_fill_arm_scenes",
+    ),
 }
 
 WHATS = ("reach", "taxels", "forces", "field", "timing")
@@ -123,6 +128,9 @@ GATE_FILES = ("gate/gate.py", "gate/limits.py", "gate/motion.py")
 
 MAX_DAYS = 3650.0
 """Longest validity of a certificate, days."""
+
+ARMS = ("simulated", "ur", "xarm")
+"""What can move the finger in a demo, as `tactile_tools.reach.one_reach.ARMS`."""
 
 SOAKED = 16
 """Greatest number of boards in a `soak`."""
@@ -294,10 +302,10 @@ def _fill_demo(parser: Parser) -> None:
     add_seeds(parser, default=35)
     parser.add_argument(
         "--arm",
-        choices=("simulated", "ur"),
+        choices=ARMS,
         default="simulated",
         help="what moves the finger: the simulated arm, or an emulated robot of Universal Robots "
-        "through armd and its vendor's client (default simulated)",
+        "or UFACTORY through armd and its vendor's client (default simulated)",
     )
     parser.add_argument(
         "--view-port",
@@ -708,6 +716,30 @@ def _fill_soak(parser: Parser) -> None:
     )
     add_report(parser)
     parser.set_defaults(func=later("tactile_tools.dev.soak:run"))
+
+
+def _fill_arm_scenes(parser: Parser) -> None:
+    parser.description = (
+        "Reaches in scenes 0, 1, 2 … with each arm, one after the other, in real processes and "
+        "real time: half a minute a reach. The result has success with its 95 % Wilson interval "
+        "and the reason of each failure. It is written after each reach; a run that was cut off "
+        "goes on. Run it on a machine that does nothing else. Exit: 0 each reach has its row, 2 "
+        "bad argument, 3 refused by the system."
+    )
+    add_out(parser, "result, as JSON", required=True, force="begin anew")
+    parser.add_argument(
+        "--arm", choices=ARMS, nargs="+", help="arms to compare (default simulated ur)"
+    )
+    parser.add_argument(
+        "--scenes", type=count, default=50, metavar="N", help="how many (default 50)"
+    )
+    parser.add_argument(
+        "--first", type=natural, default=0, metavar="N", help="number of the first (default 0)"
+    )
+    add_scene(parser)
+    add_strategy(parser)
+    add_path(parser, "--logs", "folder in which to keep the log of each reach that failed")
+    parser.set_defaults(func=later("tactile_tools.dev.arm_scenes:run"))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import itertools
-import os
 import socket
 import subprocess
 import sys
@@ -17,9 +16,8 @@ import numpy as np
 
 from tactile_core.cli import FAILED, REFUSED, CommandError, require, seeds_of, working
 from tactile_tools.plot.series import LogUnreadableError
-from tactile_tools.processes import busy_text, command, free_port, running, socket_at, wait_for
-
-BOARD = "finger"
+from tactile_tools.processes import busy_text, command, free_port, running
+from tactile_tools.reach.one_reach import EMULATED, ReachRig, ReachScene, parameter_set_of
 
 MAGIC = b"\x89MCAP"
 ORDERLY_S = 5.0  # s, for the zero twist and the end of the log; both take a second at most
@@ -34,27 +32,7 @@ VIEW_PORT = 8420
 PAGE_S = 20.0
 """Time for the live page to answer on a busy machine, s."""
 
-PROCESSES = {"simulated": "three processes", "ur": "four processes and a robot's own client"}
-
-UR_ADDRESS = "127.0.0.23"
-"""The ports of these robots are fixed; hardly anything else uses this loopback address."""
-
-UR_CONFIG = f"""\
-[robot]
-address = "{UR_ADDRESS}"
-
-[tool]
-payload = 0.8
-position = [0.0, 0.0, 0.1]
-pivot = [0.0, 0.03, 0.02]
-pivot_rotation = [0.0, -1.5707963, 0.0]
-
-[frame]
-origin = [0.4, -0.2, 0.3]
-inside = [0.4, -0.5, 0.3]
-left = [0.6, -0.2, 0.3]
-"""
-"""The cupboard stands to the robot's right; the finger lies across its flange."""
+PROCESSES = {False: "three processes", True: "four processes and a robot's own client"}
 
 TIME_LIMIT_S = 30.0
 """The authors' 20 s, and reserve for a busy machine: stale inputs hold the arm there."""
@@ -73,8 +51,9 @@ def run(options: argparse.Namespace) -> int:
     from tactile_tools.plot.reach import draw_reach
 
     try:
-        # Refuse a wrong strategy before any process is started.
-        load_strategy(options.strategy, parameters(_set(options)), np.random.default_rng(0))
+        # Before three processes are started in vain.
+        own = parameters(parameter_set_of(options.scene))
+        load_strategy(options.strategy, own, np.random.default_rng(0))
         with tempfile.TemporaryDirectory(prefix="tactile-demo-") as name:
             code = _run(options, Path(name))
         if code not in (0, 1):
@@ -93,16 +72,6 @@ def run(options: argparse.Namespace) -> int:
         why = busy_text() or "the machine was not busy: the picture and the log say what held it"
         print(f"tactile demo: the target was not reached; {why}", file=sys.stderr)
     return code
-
-
-def _ask(words: list[str]) -> str:
-    """Run a command and return what it printed; `CommandError` when it refused its arguments."""
-    done = subprocess.run(words, check=False, capture_output=True, text=True)
-    if done.returncode == 2:
-        raise CommandError(done.stderr.strip().splitlines()[-1])
-    if done.returncode != 0:
-        raise RuntimeError(done.stderr.strip() or f"{words[0]} ended with {done.returncode}")
-    return done.stdout.strip()
 
 
 def _start_of(path: Path) -> bytes:
@@ -148,46 +117,20 @@ def what_next(log: Path, png: Path) -> str:
     )
 
 
-def _set(options: argparse.Namespace) -> str:
-    """Name of the parameter set that belongs to the scene."""
-    return "hardware" if options.scene == "hardware" else "authors_sim"
-
-
 def _run(options: argparse.Namespace, folder: Path) -> int:
-    simdevice, tactiled, reachd = command("simdevice"), command("tactiled"), command("reachd")
-    board = folder / BOARD
-    calibration = folder / "finger.cal.toml"
-    scene = ["--scene", options.scene, "--scene-seed", str(options.scene_seed)]
-    goal = _ask([simdevice, "cupboard", *scene, "--print-goal"])
-    _ask([simdevice, "calibration", "--seed", str(options.seed), "--out", str(calibration)])
+    scene = ReachScene(options.arm, options.scene, options.scene_seed, options.seed)
+    rig = ReachRig(scene, folder)
     options.log.unlink(missing_ok=True)
-    arm, skin, reach = (socket_at(folder, n) for n in ("arm", "tactiled", "reachd"))
-    cupboard = [
-        *(simdevice, "cupboard", *scene, "--seed", str(options.seed), "--pty", str(board)),
-        *("--listen", arm, "--connect", skin),
-    ]
-    if options.arm == "ur":
-        config = folder / "arm.toml"
-        config.write_text(UR_CONFIG, encoding="utf-8")
-        cupboard = [
-            *(simdevice, "ur", "--config", str(config), "--address", UR_ADDRESS, *scene),
-            *("--seed", str(options.seed), "--pty", str(board), "--world", "world"),
-            *("--connect", arm),
-        ]
-    sensing = [
-        *(tactiled, "--port", str(board), "--name", BOARD, "--calibration", str(calibration)),
-        *("--listen", skin, "--connect", arm, "--no-log"),
-    ]
     print(
-        f"A cupboard ({options.scene} {options.scene_seed}), the target at {goal} m, "
-        f"{PROCESSES[options.arm]}.",
+        f"A cupboard ({options.scene} {options.scene_seed}), the target at {rig.goal} m, "
+        f"{PROCESSES[options.arm in EMULATED]}.",
         flush=True,
     )
     with contextlib.ExitStack() as stack:
         if not options.no_view:
             port = _page_port(options.view_port)
             page = [command("tactile"), "view", "--port", str(port)]
-            page += [word for at in (arm, skin, reach) for word in ("--connect", at)]
+            page += [word for at in (rig.arm, rig.skin, rig.reach) for word in ("--connect", at)]
             said = folder / "view.txt"
             showing = stack.enter_context(running(page, said))
             address = f"http://127.0.0.1:{port}"
@@ -195,35 +138,14 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
                 print(f"Watch it at {address}", flush=True)
             else:
                 print(f"The live page could not be opened: {said.read_text()[-300:]}", flush=True)
-        said = folder / "cupboard.txt"
-        first = stack.enter_context(running(cupboard, said))
-        wait_for(board, first, said)
-        if options.arm == "ur":
-            served = [command("armd"), "--driver", "ur", "--config", str(config)]
-            served += ["--listen", arm, "--connect", skin]
-            stack.enter_context(running(served, folder / "armd.txt"))
-        stack.enter_context(running(sensing, folder / "tactiled.txt"))
-        reaching = subprocess.Popen(
-            [
-                *(reachd, "--strategy", options.strategy, "--target", goal),
-                *("--set", _set(options), "--time-limit", f"{TIME_LIMIT_S:g}"),
-                *("--board", BOARD, "--seed", str(options.seed), "--log", str(options.log)),
-                *("--listen", reach, "--connect", arm, "--connect", skin),
-            ],
-            # Its locks lie in our folder, so that another reach on this machine does not keep it
-            # out.
-            env=os.environ | {"TACTILE_RUNTIME_DIR": str(folder)},
-        )
-        code = _ended(reaching)
-        if code == 1 and options.arm == "ur":
-            said = folder / "armd.txt"
-            lines = said.read_text(errors="replace").splitlines()
-            print(*(line for line in lines if " ERROR " in line), sep="\n")
+        stack.enter_context(rig)
+        code = _ended(rig.reachd(options.strategy, TIME_LIMIT_S, "--log", str(options.log)))
+        if code == 1:
+            print(*rig.arm_errors(), sep="\n", end="")
         if code == 3:
-            for name in ("cupboard.txt", "tactiled.txt", "armd.txt"):
-                if not (folder / name).exists():
-                    continue
-                print(f"--- {name}\n{(folder / name).read_text(errors='replace')[-1500:]}")
+            for name in ("cupboard", "tactiled", "armd"):
+                if text := rig.said(name):
+                    print(f"--- {name}\n{text[-1500:]}")
     return code
 
 
