@@ -168,7 +168,7 @@ def replay(arguments: argparse.Namespace) -> int:
     from sim_device.faults import FaultPlan
     from sim_device.ports import PtyPort
     from sim_device.ports_plan import Planned
-    from sim_device.runner import ReplayStation
+    from sim_device.runner import ReplayServer
 
     try:
         recording = load(arguments.recording)
@@ -187,8 +187,8 @@ def replay(arguments: argparse.Namespace) -> int:
         "begins when a host reads"
     )
     link = arguments.pty
-    station = ReplayStation(PtyPort(link), board)
-    plan = Planned(station, str(link), f"tactiled --port {link} --kind anyskin", (line,))
+    server = ReplayServer(PtyPort(link), board)
+    plan = Planned(server, str(link), f"tactiled --port {link} --kind anyskin", (line,))
     return _serve([plan], arguments)
 
 
@@ -236,7 +236,7 @@ def _serve(planned: Sequence[Planned], arguments: argparse.Namespace) -> int:
     ending: Ending = arguments.ending or Ending()
     # Set before the first port opens: a signal after that must still remove the links.
     ending.orderly = True
-    runner = Runner([plan.station for plan in planned])
+    runner = Runner([plan.server for plan in planned])
     status = StatusLine(planned)
     try:
         _open(runner)

@@ -16,7 +16,7 @@ from sim_device.board.catalogue import build_skin, identity
 from sim_device.board.firmware import DEFAULT_RATE, BoardOptions, CanBoard, Identity, SerialBoard
 from sim_device.faults import FaultPlan, Window
 from sim_device.ports import PtyPort, PythonCanPort, SlcanPort
-from sim_device.runner import Board, CanStation, MakeBoard, SerialStation, Station
+from sim_device.runner import Board, CanServer, MakeBoard, PortServer, SerialServer
 from sim_device.skin.environment import (
     AttitudeScript,
     Environment,
@@ -76,12 +76,12 @@ class BoardsRequest:
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """Station not yet open. ``lines``: what to tell the user about each of its boards.
+    """PortServer not yet open. ``lines``: what to tell the user about each of its boards.
 
     ``connect``: the command that reads it. ``note``: gives its state for a status line.
     """
 
-    station: Station
+    server: PortServer
     name: str
     connect: str
     lines: tuple[str, ...] = field(default=())
@@ -124,7 +124,7 @@ def parse_arrays(text: str) -> tuple[int, ...]:
 
 
 def plan_boards(request: BoardsRequest) -> list[Planned]:
-    """Stations for a request, with all boards made. ValueError if options do not fit together."""
+    """Port servers for a request, all boards made. ValueError if options do not fit together."""
     buses: list[tuple[SlcanPort | PythonCanPort, CanSpec]] = [
         (
             SlcanPort(link, dialect=request.adapter),
@@ -163,8 +163,8 @@ def _plan_serial(maker: _Maker, number: int, link: Path) -> Planned:
     connect = f"tactiled --port {link}" + (" --kind anyskin" if anyskin else "")
     if request.format and not request.format.endswith("-text"):
         connect = f"tactiled --port {link} --kind {request.format}"
-    station = SerialStation(PtyPort(link), make, request.unplugged)
-    return Planned(station, str(link), connect, (maker.describe(number),))
+    server = SerialServer(PtyPort(link), make, request.unplugged)
+    return Planned(server, str(link), connect, (maker.describe(number),))
 
 
 def _plan_bus(
@@ -174,7 +174,7 @@ def _plan_bus(
     share = None if spec.bitrate is None else BUS_SHARE * spec.bitrate / len(nodes)
     makes = [maker.can(number + k, node, spec.fd, share) for k, node in enumerate(nodes)]
     lines = tuple(f"{maker.describe(number + k)}, node {node}" for k, node in enumerate(nodes))
-    return Planned(CanStation(port, makes), str(spec), f"tactiled --can {spec}", lines)
+    return Planned(CanServer(port, makes), str(spec), f"tactiled --can {spec}", lines)
 
 
 class _Maker:

@@ -56,7 +56,7 @@ MakeBoard = Callable[[float], Board[Payload]]
 """Makes a new board that is powered the given number of seconds after the simulation started."""
 
 
-class Station(Protocol):
+class PortServer(Protocol):
     """One port and the boards on it."""
 
     @property
@@ -84,7 +84,7 @@ class Station(Protocol):
         """Pass on everything that is due."""
 
 
-class SerialStation:
+class SerialServer:
     """Board on a pseudo-terminal. ``unplugged``: when it has neither power nor port."""
 
     def __init__(
@@ -142,7 +142,7 @@ class SerialStation:
             self.port.send(out)
 
 
-class CanStation:
+class CanServer:
     """Boards on one CAN bus."""
 
     def __init__(
@@ -194,7 +194,7 @@ class CanStation:
                 self.port.send(out, now)
 
 
-class ReplayStation:
+class ReplayServer:
     """Recording on a pseudo-terminal. Nothing of it is lost: it begins when a host reads, and
     waits while no host does."""
 
@@ -203,8 +203,8 @@ class ReplayStation:
         self.board = board
         self._ended: Instant | None = None
         self._full: Instant | None = None
-        self._baited: Instant | None = None
-        self._bait_seen = False
+        self._probed_at: Instant | None = None
+        self._probe_waiting = False
         self._now = Instant(0)
 
     @property
@@ -252,41 +252,41 @@ class ReplayStation:
                 self.board.postpone(stalled)
         out = self.board.tick(now)
         self.port.send(out)
-        if not self.board.started and self._bait_is_taken(now):
+        if not self.board.started and self._probe_was_read(now):
             self.board.start(now)
         if self.board.finished and self._ended is None:
             self._ended = now
 
-    def _bait_is_taken(self, now: Instant) -> bool:
-        self._baited = self._baited or now
+    def _probe_was_read(self, now: Instant) -> bool:
+        self._probed_at = self._probed_at or now
         if self.port.unread:
-            self._bait_seen = True
+            self._probe_waiting = True
             return False
-        return self._bait_seen or seconds_between(self._baited, now) > SETTLE_TIME
+        return self._probe_waiting or seconds_between(self._probed_at, now) > SETTLE_TIME
 
 
 class Runner:
-    """Serves stations on an absolute grid of `TICK` until told to stop."""
+    """Runs port servers on an absolute grid of `TICK` until told to stop."""
 
-    def __init__(self, stations: Sequence[Station]) -> None:
-        self.stations = tuple(stations)
+    def __init__(self, servers: Sequence[PortServer]) -> None:
+        self.servers = tuple(servers)
 
     def open(self) -> None:
         """Open every port, or none: raises the error of the first that fails."""
-        opened: list[Station] = []
+        opened: list[PortServer] = []
         try:
-            for station in self.stations:
-                station.open()
-                opened.append(station)
+            for server in self.servers:
+                server.open()
+                opened.append(server)
         except BaseException:
-            for station in opened:
-                station.close()
+            for server in opened:
+                server.close()
             raise
 
     def close(self) -> None:
         """Close every port and remove its link."""
-        for station in self.stations:
-            station.close()
+        for server in self.servers:
+            server.close()
 
     def run(
         self,
@@ -294,7 +294,7 @@ class Runner:
         duration: float | None = None,
         on_status: Callable[[float], None] | None = None,
     ) -> None:
-        """Serve until ``stopping()``, for ``duration`` s, or until every station has finished.
+        """Serve until ``stopping()``, for ``duration`` s, or until every server has finished.
 
         ``on_status``: called with the seconds since the start every `STATUS_PERIOD`.
         """
@@ -305,9 +305,9 @@ class Runner:
             elapsed = seconds_between(start, now)
             if duration is not None and elapsed >= duration:
                 return
-            for station in self.stations:
-                station.service(now)
-            if all(station.finished for station in self.stations):
+            for server in self.servers:
+                server.service(now)
+            if all(server.finished for server in self.servers):
                 return
             if on_status is not None and now >= status:
                 on_status(elapsed)
@@ -318,7 +318,7 @@ class Runner:
             self._wait(seconds_between(monotonic_now(), tick))
 
     def _wait(self, seconds: float) -> None:
-        descriptors = [fd for station in self.stations if (fd := station.fileno()) >= 0]
+        descriptors = [fd for server in self.servers if (fd := server.fileno()) >= 0]
         select.select(descriptors, [], [], max(0.0, seconds))
 
 

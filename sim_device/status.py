@@ -28,7 +28,7 @@ class StatusLine(LiveLines):
     def show_at(self, elapsed_s: float) -> None:
         """Show rates since the last call and losses so far, ``elapsed_s`` after the start."""
         before, counts = self._last
-        now = [plan.station.sent for plan in self._planned]
+        now = [plan.server.sent for plan in self._planned]
         self._last = elapsed_s, now
         span = elapsed_s - before
         parts = []
@@ -37,7 +37,7 @@ class StatusLine(LiveLines):
             part = f"{plan.name} {rate:.0f}/s"
             if plan.note is not None:
                 part += f"  {plan.note()}"
-            elif losses := sum(plan.station.losses.values()):
+            elif losses := sum(plan.server.losses.values()):
                 part += f" lost {losses}"
             parts.append(part)
         self._text = f"{elapsed_s:8.1f} s  " + "  ".join(parts)
@@ -56,7 +56,7 @@ class StatusLine(LiveLines):
     def sum_up(self) -> None:
         """Print to standard error what each port sent and lost."""
         for plan in self._planned:
-            losses = {k: v for k, v in plan.station.losses.items() if v}
+            losses = {k: v for k, v in plan.server.losses.items() if v}
             lost = ", ".join(f"{name} {count}" for name, count in sorted(losses.items()))
-            text = f"{plan.name}: {plan.station.sent} sent" + (f"; {lost}" if lost else "")
+            text = f"{plan.name}: {plan.server.sent} sent" + (f"; {lost}" if lost else "")
             print(text, file=sys.stderr, flush=True)

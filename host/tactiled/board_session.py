@@ -33,7 +33,7 @@ from tactiled.boards.events import (
     Sampled,
     Streaming,
 )
-from tactiled.calibration_store import Choice, Shelf
+from tactiled.calibration_store import CalibrationStore, Choice
 from tactiled.journal import STATE_PREFIX, describe_state
 from tactiled.publisher import MessageMaker, Sink
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
@@ -80,10 +80,12 @@ class Latency:
     p99: float = math.nan
 
 
-class Station:
+class BoardSession:
     """Owned by the pipeline's thread; others read its plain attributes."""
 
-    def __init__(self, name: str, outlet: Sink, shelf: Shelf, settings: PipelineSettings) -> None:
+    def __init__(
+        self, name: str, sink: Sink, store: CalibrationStore, settings: PipelineSettings
+    ) -> None:
         self.name = name
         self.node = 0
         """Of the board on its bus; 0 on a serial line."""
@@ -106,15 +108,15 @@ class Station:
         """Which of the board's chips are masked; None before it was identified."""
         self.summary: dict[str, Any] = {}
         """`diagnostics.summary` of the last second; replaced as a whole, for other threads."""
-        self._outlet = outlet
-        self._shelf = shelf
+        self._sink = sink
+        self._store = store
         self._settings = settings
         self._maker: MessageMaker | None = None
         self._picture: SkinPicture | None = None
         self._warned = ""
         self._state_age = 0  # s since the log was last told of the rest field
         self._latencies: deque[float] = deque(maxlen=LATENCIES)
-        self._rate_from: deque[tuple[Instant, int]] = deque([(outlet.now(), 0)], RATE_OVER)
+        self._rate_from: deque[tuple[Instant, int]] = deque([(sink.now(), 0)], RATE_OVER)
         self._repeats = Repeats()
         self._silences = Silences()
         self._unplugged = False
@@ -128,12 +130,12 @@ class Station:
     @property
     def recorder(self) -> Recorder | None:
         """The log that this board's messages go to."""
-        return self._outlet.recorder
+        return self._sink.recorder
 
     @property
     def clock_problem(self) -> str:
         """What is to be said of the stamps of this board's messages; see `WallClock`."""
-        return self._outlet.wall.problem
+        return self._sink.wall.problem
 
     # Who it is
 
@@ -142,12 +144,12 @@ class Station:
         if identity == self.identity and self.pipeline is not None:
             return None
         # Asked before anything is worked out: a calibration of 2048 taxels takes its time.
-        if not self._set_ups.allow(self._outlet.now()):
+        if not self._set_ups.allow(self._sink.now()):
             return Refusal(
                 f"{identity} describes itself anew again and again",
                 "power-cycle the board, and look for two boards on one line",
             )
-        choice = self._shelf.choose(identity)
+        choice = self._store.choose(identity)
         if isinstance(choice, Refusal):
             return choice
         same = self.choice is not None and self.choice.calibration.hash == choice.calibration.hash
@@ -159,7 +161,7 @@ class Station:
         """Use the board's calibration as its file now says; ValueError when it does not fit."""
         if self.identity is None:
             raise ValueError("no board has been identified yet")
-        choice = self._shelf.choose(self.identity)
+        choice = self._store.choose(self.identity)
         if isinstance(choice, Refusal):
             raise ValueError(f"{choice.problem}; {choice.remedy}")
         self._set_up(choice, self.identity)
@@ -190,7 +192,7 @@ class Station:
                 self.pipeline.restore_rest(seed)
             except ValueError as error:
                 self._say(logging.WARNING, f"{error}: tared anew")
-        self._maker = MessageMaker(calibration, self._outlet.wall)
+        self._maker = MessageMaker(calibration, self._sink.wall)
         self._picture = SkinPicture(calibration.geometry)
         self.chips = ChipWatch(calibration.geometry)
         if self.recorder is not None:
@@ -236,7 +238,7 @@ class Station:
     def send_geometry(self) -> None:
         """Publish where the taxels are; nothing before a board has been identified."""
         if self._maker is not None:
-            maker, now_ns = self._maker, self._outlet.wall.wall_ns(self._outlet.now())
+            maker, now_ns = self._maker, self._sink.wall.wall_ns(self._sink.now())
             self._publish(GEOMETRY, lambda: maker.geometry(now_ns), now_ns)
 
     # What happens
@@ -268,7 +270,7 @@ class Station:
             case FellSilent(seconds):
                 self.state = "silent"
                 self.counters["silences"] += 1
-                said = self._silences.fell(seconds, self._outlet.now())
+                said = self._silences.fell(seconds, self._sink.now())
                 if said is not None:
                     self._say(logging.WARNING, said)
             case Resumed(seconds):
@@ -438,15 +440,15 @@ class Station:
                 self._note_state()
 
     def _send(self, cycle: Cycle) -> None:
-        maker, outlet = self._maker, self._outlet
+        maker, sink = self._maker, self._sink
         if maker is None:
             return
-        stamp_ns = outlet.wall.wall_ns(cycle.captured)
+        stamp_ns = sink.wall.wall_ns(cycle.captured)
         if self.chips is not None:
             self.chips.observe(cycle.fault, cycle.captured)
         if cycle.features_due:
             self._publish(FEATURES, lambda: maker.features(cycle), stamp_ns)
-        self._latencies.append((outlet.now() - cycle.received) / NS_PER_S)
+        self._latencies.append((sink.now() - cycle.received) / NS_PER_S)
         self._publish(FORCES, lambda: maker.forces(cycle), stamp_ns)
         self._publish(FIELD, lambda: maker.field(cycle), stamp_ns)
         if cycle.ambient.method != "off":
@@ -461,27 +463,27 @@ class Station:
         try:
             parts = picture.draw(cycle, stamp_ns) if picture.due(cycle.captured) else []
             for part in parts:
-                self._outlet.send(CONTACTS, self.name, part, stamp_ns)
+                self._sink.send(CONTACTS, self.name, part, stamp_ns)
         except Exception as error:  # noqa: BLE001 - features go on without it
             self._note_unsent(CONTACTS, error)
 
     def _publish(self, topic: Topic, make: Callable[[], Any], stamp_ns: int) -> None:
         """Make a message and send it; one that cannot be is counted, and the next ones go on."""
         try:
-            self._outlet.send(topic, self.name, make(), stamp_ns)
+            self._sink.send(topic, self.name, make(), stamp_ns)
         except Exception as error:  # noqa: BLE001 - one message must not end the others
             self._note_unsent(topic, error)
 
     def _note_unsent(self, topic: Topic, error: Exception) -> None:
         kind = topic.template.rpartition("/")[2]
         self.counters[UNSENT + kind] += 1
-        if self._throttle(UNSENT + kind).allow(self._outlet.now()):
+        if self._throttle(UNSENT + kind).allow(self._sink.now()):
             log.error("%s: a message of %s cannot be sent: %s", self.name, kind, error)
 
     def spoilt(self, error: Exception) -> None:
         """What became of one event is not known: what the pipeline felt so far is over."""
         self.counters["spoilt_events"] += 1
-        if self._throttle("spoilt").allow(self._outlet.now()):
+        if self._throttle("spoilt").allow(self._sink.now()):
             log.error("%s: an event could not be worked off", self.name, exc_info=error)
         if self.pipeline is not None:
             self.pipeline.reset()
@@ -492,7 +494,7 @@ class Station:
 
     def _pass_on(self, level: int, captured: Instant, text: str) -> None:
         """Publish and log a text of the firmware, unless there are too many of them."""
-        now = self._outlet.now()
+        now = self._sink.now()
         if not self._firmware.allow(now):
             self.counters["texts_held_back"] += 1
             return
@@ -505,7 +507,7 @@ class Station:
 
     def _say(self, level: int, text: str, kind: str = "") -> None:
         """Announce ``text``; of a ``kind``, only if the last of that is some time ago."""
-        if not kind or self._repeats.tell(kind, text, level, self._outlet.now()):
+        if not kind or self._repeats.tell(kind, text, level, self._sink.now()):
             self._speak(level, text)
         else:
             self.counters["texts_held_back"] += 1
@@ -523,9 +525,9 @@ class Station:
     ) -> None:
         try:
             if firmware:
-                self._outlet.firmware_text(self.name, level, firmware, text, captured)
+                self._sink.firmware_text(self.name, level, firmware, text, captured)
             else:
-                self._outlet.announce(self.name, level, text)
+                self._sink.announce(self.name, level, text)
         except Exception as error:  # noqa: BLE001 - one text must not end the features
             self._note_unsent(LOG, error)
 

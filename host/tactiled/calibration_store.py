@@ -33,7 +33,7 @@ class Choice:
     warning: str = ""
 
 
-class Shelf:
+class CalibrationStore:
     """Calibration files by serial number.
 
     ``strict``: a board that no file belongs to is refused rather than run on nominal figures; so

@@ -28,15 +28,15 @@ from tactile_core.daemon import Service, StartError
 from tactile_core.log.recorder import Recorder, RecorderError
 from tactile_core.types import Instant, WallClock, after, monotonic_now, seconds_between
 from tactiled import diagnostics
-from tactiled.board_session import Station
+from tactiled.board_session import BoardSession
 from tactiled.boards.events import Identity, Refusal
 from tactiled.boards.line import SerialLine, bus_names, make_line
-from tactiled.calibration_store import Shelf
+from tactiled.calibration_store import CalibrationStore
 from tactiled.diagnostics import Alarms
 from tactiled.journal import Journal
 from tactiled.memory import Collector, return_large_buffers
 from tactiled.port import Port, Trouble
-from tactiled.publisher import Outlet
+from tactiled.publisher import MessagePublisher
 from tactiled.reader import MAX_AGE, Inbox, PortReader, Wake
 from tactiled.recordings import Recordings
 from tactiled.rerun import PORT_PREFIX, RecordedError, describe, recorded_port
@@ -90,7 +90,7 @@ class Daemon(Service):
         self._wake = Wake()
         self._calls: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._session: zenoh.Session | None = None
-        self._outlet: Outlet | None = None
+        self._publisher: MessagePublisher | None = None
         self._recordings: Recordings | None = None
         self._readers: list[PortReader] = []
         self._services: list[BoardServices] = []
@@ -101,12 +101,14 @@ class Daemon(Service):
         self._alarms = Alarms()
         self._thread = threading.Thread(target=self._run, name="pipeline", daemon=True)
         ports = len(settings.ports)
-        self._shelf = Shelf(settings.calibrations, strict=len(settings.calibrations) >= ports)
+        self._store = CalibrationStore(
+            settings.calibrations, strict=len(settings.calibrations) >= ports
+        )
 
     @property
-    def stations(self) -> list[Station]:
+    def boards(self) -> list[BoardSession]:
         """Boards known so far, in the order of their ports."""
-        return [station for port in self.ports for station in list(port.stations.values())]
+        return [board for port in self.ports for board in list(port.boards.values())]
 
     def _start(self) -> None:
         sys.setswitchinterval(SWITCH_INTERVAL)
@@ -122,30 +124,32 @@ class Daemon(Service):
         settings = self.settings
         transports = [_make_transport(port, settings.speed) for port in settings.ports]
         self._session = session = open_session(settings.bus)
-        self._outlet = outlet = Outlet(session, None, self._wall, self._prefix)
+        self._publisher = publisher = MessagePublisher(session, None, self._wall, self._prefix)
         self._recordings = Recordings(
-            outlet, settings.recorder, settings.log, self._call, lambda: self.stations
+            publisher, settings.recorder, settings.log, self._call, lambda: self.boards
         )
         for wanted, transport in zip(settings.ports, transports, strict=True):
-            self.ports.append(self._make_port(wanted, transport, outlet))
+            self.ports.append(self._make_port(wanted, transport, publisher))
         if settings.log is not None:
-            self.recorder = outlet.recorder = self._open_log(settings.log)
+            self.recorder = publisher.recorder = self._open_log(settings.log)
             self._alarms.watch(self.recorder)
         self._thread.start()
         for reader in self._readers:
             reader.start()
 
-    def _make_port(self, wanted: PortSettings, transport: Transport, outlet: Outlet) -> Port:
+    def _make_port(
+        self, wanted: PortSettings, transport: Transport, publisher: MessagePublisher
+    ) -> Port:
         settings = self.settings
         replay = wanted.medium == "log"
         inbox = Inbox(self._wake, max_age=None if replay else MAX_AGE)
-        reader = PortReader(transport, inbox, outlet, wanted.name, self.fail, paced=replay)
+        reader = PortReader(transport, inbox, publisher, wanted.name, self.fail, paced=replay)
         self._readers.append(reader)
         reader.open(settings.wait and not replay)
         name = wanted.name
         if isinstance(transport, McapTransport):
             name = reader.name = transport.board or "board0"
-            self._shelf.adopt_from_log(Path(wanted.spec), name)
+            self._store.adopt_from_log(Path(wanted.spec), name)
             wanted = _as_recorded(wanted, name, transport.metadata)
 
         def admit(node: int, identity: Identity) -> Refusal | None:
@@ -167,25 +171,25 @@ class Daemon(Service):
         def names(nodes: tuple[int, ...], late: bool) -> dict[int, str]:
             return bus_names(name, wanted.nodes, nodes, late)
 
-        journal = None if replay else Journal(outlet, name, transport.name)
-        port = Port(name, line, reader, inbox, names, self._open_station, not replay, journal)
+        journal = None if replay else Journal(publisher, name, transport.name)
+        port = Port(name, line, reader, inbox, names, self._open_board, not replay, journal)
         reader.identified = lambda: port.identified
         if isinstance(line, SerialLine):
-            port.add_station(0, name)
+            port.add_board(0, name)
             if port.trouble is not None:
                 raise StartError(str(port.trouble))
         return port
 
-    def _open_station(self, port: Port, node: int, name: str) -> Station | Trouble:
+    def _open_board(self, port: Port, node: int, name: str) -> BoardSession | Trouble:
         """Take a name on the bus; called from the pipeline's thread for boards on a CAN bus."""
-        session, outlet, recordings = self._session, self._outlet, self._recordings
+        session, publisher, recordings = self._session, self._publisher, self._recordings
         assert session is not None
-        assert outlet is not None
+        assert publisher is not None
         assert recordings is not None
-        station = Station(name, outlet, self._shelf, self.settings.pipeline)
+        board = BoardSession(name, publisher, self._store, self.settings.pipeline)
         if self._prefix:
             # A recording is nobody to be spoken to.
-            return station
+            return board
         if _is_taken(session, name):
             return Trouble(
                 f"another tactiled publishes for the name {name!r} already",
@@ -193,9 +197,9 @@ class Daemon(Service):
             )
         self._tokens.append(declare_alive(session, name))
         self._services.append(
-            BoardServices(session, self._call, self._shelf, port, node, station, recordings)
+            BoardServices(session, self._call, self._store, port, node, board, recordings)
         )
-        return station
+        return board
 
     def _open_log(self, destination: Path) -> Recorder:
         settings = self.settings
@@ -220,8 +224,8 @@ class Daemon(Service):
     def stop(self) -> bool:
         """End in order: boards, pipeline, readers, services, log (at most 1 s), bus.
 
-        Whatever produces ends before what it produces into, and the session is the last: from
-        `Outlet.end` on nothing is published, so that no thread meets a closed session. False when
+        Producers end before what they produce into, and the session last: after
+        `MessagePublisher.end` nothing is published, so no thread uses a closed session. False when
         a thread is still inside a driver, the disk or zenoh: it must be left behind.
         """
         self._stopping.set()
@@ -236,8 +240,8 @@ class Daemon(Service):
         for service in self._services:
             service.close()
         self._services.clear()
-        if self._outlet is not None:
-            self._outlet.end()
+        if self._publisher is not None:
+            self._publisher.end()
         if self._recordings is not None and not self._recordings.close():
             log.error("the recording was not closed in time; see `tactile log recover`")
             clean = False
@@ -247,8 +251,8 @@ class Daemon(Service):
         if self._thread.is_alive():  # the log could not wait for it; nothing it says goes out now
             self._thread.join(LEAVE_TIMEOUT)
             clean &= not self._thread.is_alive()
-        if self._outlet is not None:
-            self._outlet.close()
+        if self._publisher is not None:
+            self._publisher.close()
         if self._session is not None:
             clean &= close_session(self._session)
             self._session = None
@@ -261,7 +265,7 @@ class Daemon(Service):
                 continue
             if port.trouble is not None:
                 return str(port.trouble)
-            refusals = [station.refusal for station in list(port.stations.values())]
+            refusals = [board.refusal for board in list(port.boards.values())]
             first = refusals[0] if refusals else None
             if first is not None and None not in refusals:
                 return f"{first.problem}; {first.remedy}"
@@ -295,7 +299,7 @@ class Daemon(Service):
     def _part(self, port: Port) -> None:
         """Let a port take its leave; one that cannot does not keep the others from it."""
         try:
-            port.farewell(monotonic_now())
+            port.stop_streaming(monotonic_now())
         except Exception as error:
             log.error("%s: it could not be told to stop", port.name, exc_info=error)
 
@@ -325,8 +329,8 @@ class Daemon(Service):
     def _abandon_requests(self) -> None:
         """Answer everyone who still waits, so that zenoh can close at once."""
         self._abandon_calls()
-        for station in self.stations:
-            station.abandon_requests(STOPPING)
+        for board in self.boards:
+            board.abandon_requests(STOPPING)
 
     def _abandon_calls(self) -> None:
         """Answer those whom the pipeline has not heard yet; from any thread."""
@@ -340,32 +344,32 @@ class Daemon(Service):
             return None
 
     def _each_second(self, now: Instant) -> None:
-        outlet = self._outlet
-        if outlet is None:
+        publisher = self._publisher
+        if publisher is None:
             return
         if self._recordings is not None:
             self._recordings.each_second(now)
         for port in self.ports:
-            for node, station in port.stations.items():
+            for node, board in port.boards.items():
                 try:
-                    self._sum_up(outlet, port, node, station, now)
+                    self._sum_up(publisher, port, node, board, now)
                 except Exception as error:  # noqa: BLE001 - an account of the data, not the data
-                    station.spoilt(error)
+                    board.spoilt(error)
         self._watch_log()
         self._collector.each_second()
 
     def _sum_up(
-        self, outlet: Outlet, port: Port, node: int, station: Station, now: Instant
+        self, publisher: MessagePublisher, port: Port, node: int, board: BoardSession, now: Instant
     ) -> None:
-        station.each_second(now)
+        board.each_second(now)
         wall_ns = self._wall.wall_ns(now)
-        values = diagnostics.summary(port, node, station, now)
-        values["alarms"] = self._alarms.each_second(station, now)
+        values = diagnostics.summary(port, node, board, now)
+        values["alarms"] = self._alarms.each_second(board, now)
         if self._recordings is not None:
             values["recording"] = self._recordings.summary()
-        station.summary = values
-        message = diagnostics.message(station.name, values, self.recorder, wall_ns)
-        outlet.send(DIAGNOSTICS, station.name, message, wall_ns)
+        board.summary = values
+        message = diagnostics.message(board.name, values, self.recorder, wall_ns)
+        publisher.send(DIAGNOSTICS, board.name, message, wall_ns)
 
     def _watch_log(self) -> None:
         if self.recorder is None:
@@ -376,8 +380,8 @@ class Daemon(Service):
         self._log_state = stats.state
         good = stats.state == "recording"
         text = f"log {stats.path}: {stats.state}" + (f" ({stats.last_error})" if not good else "")
-        for station in self.stations:
-            station.say_of_log(logging.INFO if good else logging.ERROR, text)
+        for board in self.boards:
+            board.say_of_log(logging.INFO if good else logging.ERROR, text)
 
 
 def _as_recorded(

@@ -14,7 +14,7 @@ from tactile_core.log.recorder import Recorder
 from tactile_core.log.retention import DiskWatch
 from tactile_core.types import Instant, seconds_between
 from tactiled.blocks import TaxelHealth
-from tactiled.board_session import Station
+from tactiled.board_session import BoardSession
 from tactiled.boards.board import BoardLink
 from tactiled.port import Port
 
@@ -90,16 +90,16 @@ class Alarms:
         if self._disk is not None:
             self._disk.stop()
 
-    def each_second(self, station: Station, now: Instant) -> list[str]:
+    def each_second(self, board: BoardSession, now: Instant) -> list[str]:
         """Alarms of a board, in words that say what to do."""
-        watch = self._drift.setdefault(station.name, DriftWatch())
-        board = "" if station.identity is None else str(station.identity.serial_number)
-        taring = station.pipeline is not None and station.pipeline.taring
-        if taring or self._seen.get(station.name) != board:
+        watch = self._drift.setdefault(board.name, DriftWatch())
+        serial_number = "" if board.identity is None else str(board.identity.serial_number)
+        taring = board.pipeline is not None and board.pipeline.taring
+        if taring or self._seen.get(board.name) != serial_number:
             watch.forget()
-            self._seen[station.name] = board
-        elif station.last is not None and station.last.features.valid:
-            watch.add(station.last.features.peak_force, now)
+            self._seen[board.name] = serial_number
+        elif board.last is not None and board.last.features.valid:
+            watch.add(board.last.features.peak_force, now)
         disk = None if self._disk is None else self._disk.alarm(now)
         return [alarm for alarm in (disk, watch.alarm()) if alarm is not None]
 
@@ -114,46 +114,46 @@ LEVELS = {
     "unplugged": STALE,
     "refused": ERROR,
 }
-"""Severity of a station's state."""
+"""Severity of a board's state."""
 
 
-def summary(port: Port, node: int, station: Station, now: Instant) -> dict[str, Any]:
+def summary(port: Port, node: int, board: BoardSession, now: Instant) -> dict[str, Any]:
     """Everything worth knowing of one board, for the status service. s, Hz, N, µT."""
     link = port.line.links.get(node)
     values: dict[str, Any] = {
-        "state": station.state,
+        "state": board.state,
         "port": port.reader.transport.name,
         "bus_state": str(port.reader.transport.state),
         "node": node,
-        "rate_hz": round(station.rate, 2),
-        "latency_p50_s": _finite(station.latency.p50),
-        "latency_p99_s": _finite(station.latency.p99),
-        "cycles": station.sent,
+        "rate_hz": round(board.rate, 2),
+        "latency_p50_s": _finite(board.latency.p50),
+        "latency_p99_s": _finite(board.latency.p99),
+        "cycles": board.sent,
         "reopened": port.reader.reopened,
-        "calibration": station.calibration_summary(),
-        "taring": station.pipeline is not None and station.pipeline.taring,
-        "drops": drops(port, node, station),
-        "board": dict(station.board_status),
+        "calibration": board.calibration_summary(),
+        "taring": board.pipeline is not None and board.pipeline.taring,
+        "drops": drops(port, node, board),
+        "board": dict(board.board_status),
     }
-    if station.pipeline is not None:
-        doubt = station.pipeline.rest_reason
-        state = station.pipeline.rest_state.value
+    if board.pipeline is not None:
+        doubt = board.pipeline.rest_reason
+        state = board.pipeline.rest_state.value
         values["rest"] = {"state": state, "reason": "" if doubt is None else doubt.text}
-    if station.clock_problem:
-        values["clock_problem"] = station.clock_problem
-    identity = station.identity
+    if board.clock_problem:
+        values["clock_problem"] = board.clock_problem
+    identity = board.identity
     if identity is not None:
         values["serial_number"] = identity.serial_number
         values["model"] = identity.model
         values["firmware"] = identity.firmware
-    if station.refusal is not None:
-        values["refused"] = f"{station.refusal.problem}; {station.refusal.remedy}"
+    if board.refusal is not None:
+        values["refused"] = f"{board.refusal.problem}; {board.refusal.remedy}"
     if isinstance(link, BoardLink) and link.clock is not None:
         values["clock_synchronised"] = link.clock.synchronised
         values["clock_rate_error"] = _finite(link.clock.rate_error)
         values["clock_polls"] = dict(link.clock.counters)
         values["clock_trouble"] = link.clock_trouble
-    cycle = station.last
+    cycle = board.last
     if cycle is not None:
         ambient, features = cycle.ambient, cycle.features
         values |= {
@@ -171,10 +171,8 @@ def summary(port: Port, node: int, station: Station, now: Instant) -> dict[str, 
             "normal_force_bound_n": _finite(features.normal_force_bound),
             "unhealthy_taxels": health(cycle.health),
         }
-    if station.chips is not None and station.chips.masked:
-        values["masked_chips"] = {
-            f"{one.array}:{one.chip}": str(one) for one in station.chips.masked
-        }
+    if board.chips is not None and board.chips.masked:
+        values["masked_chips"] = {f"{one.array}:{one.chip}": str(one) for one in board.chips.masked}
     return values
 
 
@@ -184,9 +182,9 @@ def health(flags: np.ndarray[Any, np.dtype[np.uint8]]) -> dict[str, int]:
     return {name.lower(): n for name, n in reasons.items() if n}
 
 
-def drops(port: Port, node: int, station: Station) -> dict[str, int]:
+def drops(port: Port, node: int, board: BoardSession) -> dict[str, int]:
     """Everything lost on the way from the wire to the features of one board, by reason."""
-    counts = port.drops() | {k: n for k, n in station.drops().items() if n}
+    counts = port.drops() | {k: n for k, n in board.drops().items() if n}
     link = port.line.links.get(node)
     if isinstance(link, BoardLink):
         trackers = [array.tracker for array in link.arrays.values()]

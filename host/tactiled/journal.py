@@ -78,8 +78,8 @@ chunks back until then."""
 class Journal:
     """Of one port; used by the pipeline's thread alone. ``name``: that of its raw chunks."""
 
-    def __init__(self, outlet: Sink, name: str, port: str) -> None:
-        self._outlet = outlet
+    def __init__(self, sink: Sink, name: str, port: str) -> None:
+        self._sink = sink
         self._name = name
         self._port = port
         self._after = Instant(0)
@@ -101,7 +101,7 @@ class Journal:
     ) -> None:
         """Something of ``kind`` was acted on at ``now``; see ``PortEvent.msg``."""
         self._said = self._after
-        wall_ns = self._outlet.wall.wall_ns(now)
+        wall_ns = self._sink.wall.wall_ns(now)
         message = MSG.PortEvent(
             header=header(wall_ns, self._port),
             now_ns=now,
@@ -112,7 +112,7 @@ class Journal:
             value=value,
             text=text,
         )
-        self._outlet.send(PORT, self._name, message, wall_ns)
+        self._sink.send(PORT, self._name, message, wall_ns)
 
     def progress(self, now: Instant) -> None:
         """Say how far the chunks have been worked off, where that was not said for a while."""

@@ -1,4 +1,4 @@
-"""One port of the daemon: its reader, its line, and the stations of the boards behind it."""
+"""One port of the daemon: its reader, its line, and the boards behind it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tactile_core.throttle import Throttle
 from tactile_core.types import Instant, monotonic_now
 from tactiled import journal as kinds
 from tactiled.blocks import Chunk
-from tactiled.board_session import Station
+from tactiled.board_session import BoardSession
 from tactiled.boards.board import BoardLink
 from tactiled.boards.events import Diagnosed, Event, Found, Identity, Refusal, Waiting
 from tactiled.boards.line import Line, LineEvent
@@ -51,7 +51,7 @@ class Port:
     """Owned by the pipeline's thread.
 
     ``names``: of the boards at some nodes, and whether those came later than the others of their
-    bus. ``open_station``: makes the station of a board; `Trouble` when its name is taken.
+    bus. ``open_board``: opens the session of a board; `Trouble` when its name is taken.
     ``live`` False: a recording, whose time is that of its chunks. ``journal``: where it is noted
     what was acted on beside the bytes.
     """
@@ -63,7 +63,7 @@ class Port:
         source: Source,
         inbox: Inbox,
         names: Callable[[tuple[int, ...], bool], dict[int, str]],
-        open_station: Callable[[Port, int, str], Station | Trouble],
+        open_board: Callable[[Port, int, str], BoardSession | Trouble],
         live: bool = True,
         journal: Journal | None = None,
     ) -> None:
@@ -71,7 +71,7 @@ class Port:
         self.line = line
         self.reader = source
         self.inbox = inbox
-        self.stations: dict[int, Station] = {}
+        self.boards: dict[int, BoardSession] = {}
         self.ended = False
         self.trouble: Trouble | None = None
         """What keeps this port out of service, as far as is known."""
@@ -81,7 +81,7 @@ class Port:
         """Events that the journal could not hold."""
         self._complaints = Throttle(rate=0.1, burst=3)
         self._names = names
-        self._open_station = open_station
+        self._open_board = open_board
         self._live = live
         self._journal = journal
         self._clock = Instant(0)
@@ -89,14 +89,14 @@ class Port:
     @property
     def served(self) -> bool:
         """Whether any board of this port has ever streamed."""
-        return any(station.sent for station in self.stations.values())
+        return any(board.sent for board in self.boards.values())
 
     def admit(self, node: int, identity: Identity) -> Refusal | None:
         """Judge a board that introduced itself."""
-        station = self.stations.get(node)
-        if station is None:
+        board = self.boards.get(node)
+        if board is None:
             return Refusal(f"no name is free for {identity}", "see the message above")
-        return station.admit(identity)
+        return board.admit(identity)
 
     def pump(self, now: Instant, stopping: Callable[[], bool] = lambda: False) -> None:
         """Work off what the reader handed over, then what time demands, then write.
@@ -136,14 +136,14 @@ class Port:
         elif isinstance(item, PortLost):
             self.note(kinds.LOST, now, text=item.reason)
             self._handle(self.line.disconnect())
-            for station in self.stations.values():
-                station.port_lost(item.reason)
-            if not self.stations:
+            for board in self.boards.values():
+                board.port_lost(item.reason)
+            if not self.boards:
                 log.warning("%s: %s", self.name, item.reason)
         else:
             self.ended = True
-            for station in self.stations.values():
-                station.flush()
+            for board in self.boards.values():
+                board.flush()
 
     def tick(self, now: Instant) -> None:
         """Let the links do what time demands, and write what they want to say."""
@@ -176,26 +176,26 @@ class Port:
         elif link is not None:
             link.retry()
 
-    def farewell(self, now: Instant) -> None:
+    def stop_streaming(self, now: Instant) -> None:
         """Stop the boards, send what is under way."""
         self.note(kinds.ENDED, now)
         for node, link in self.line.links.items():
             if isinstance(link, BoardLink):
-                link.farewell()
-            if node in self.stations:
-                self.stations[node].flush()
+                link.stop_streaming()
+            if node in self.boards:
+                self.boards[node].flush()
         for payload in self.line.outgoing():
             self.reader.transport.write(payload)
 
-    def add_station(self, node: int, name: str) -> None:
+    def add_board(self, node: int, name: str) -> None:
         """Make room for a board under ``name``."""
-        station = self._open_station(self, node, name)
-        if isinstance(station, Trouble):
-            self.trouble = station
-            log.error("%s: %s", self.name, station)
+        board = self._open_board(self, node, name)
+        if isinstance(board, Trouble):
+            self.trouble = board
+            log.error("%s: %s", self.name, board)
         else:
-            station.node = node
-            self.stations[node] = station
+            board.node = node
+            self.boards[node] = board
 
     def drops(self) -> dict[str, int]:
         """What this port lost or refused before any board's pipeline, by reason."""
@@ -211,32 +211,32 @@ class Port:
     @property
     def identified(self) -> bool:
         """Whether any board of this port has ever said who it is."""
-        return any(station.identity is not None for station in list(self.stations.values()))
+        return any(board.identity is not None for board in list(self.boards.values()))
 
     def _spoilt(self, error: Exception) -> None:
         self.spoilt += 1
         if self._complaints.allow(monotonic_now()):
             log.error("%s: data could not be worked off", self.name, exc_info=error)
 
-    def _hand_over(self, station: Station, event: Event) -> None:
+    def _hand_over(self, board: BoardSession, event: Event) -> None:
         if not self._live:
-            station.handle(event)  # a recording is judged by whether it comes out the same
+            board.handle(event)  # a recording is judged by whether it comes out the same
             return
         try:
-            station.handle(event)
+            board.handle(event)
         except Exception as error:  # noqa: BLE001 - one event must not end the others
-            station.spoilt(error)
+            board.spoilt(error)
 
     def _handle(self, events: list[LineEvent]) -> None:
         for happened in events:
             event = happened.event
             if happened.node is not None:
-                station = self.stations.get(happened.node)
-                if station is not None:
-                    self._hand_over(station, event)
+                board = self.boards.get(happened.node)
+                if board is not None:
+                    self._hand_over(board, event)
             elif isinstance(event, Found):
                 for node, name in self._names(event.nodes, event.late).items():
-                    self.add_station(node, name)
+                    self.add_board(node, name)
             elif isinstance(event, Waiting):
                 log.info("%s", event.text)
             elif isinstance(event, Diagnosed):

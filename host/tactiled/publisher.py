@@ -212,7 +212,7 @@ class Sink(Protocol):
         """``rcl_interfaces/Log`` on the bus and into the log alone."""
 
 
-class Outlet:
+class MessagePublisher:
     """Bus and log behind one call. ``recorder`` None: nothing is logged.
 
     After `end` nothing is published any more, whichever thread asks for it. ``late`` counts what

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from tactile_core.types import monotonic_now, seconds_between
 from tactiled.blocks import Chunk
-from tactiled.publisher import Outlet
+from tactiled.publisher import MessagePublisher
 from tactiled.transports import EndOfLog, PortClosed, PortGone, Transport, TransportError
 from tactiled.transports.serial_port import SerialTransport
 
@@ -175,7 +175,7 @@ class PortReader:
         self,
         transport: Transport,
         inbox: Inbox,
-        outlet: Outlet,
+        publisher: MessagePublisher,
         name: str,
         failed: Callable[[BaseException], None],
         paced: bool = False,
@@ -190,7 +190,7 @@ class PortReader:
         self._resolve_at = 0.0
         self.beat = monotonic_now()  # when its thread was last seen to go on
         self._inbox = inbox
-        self._outlet = outlet
+        self._publisher = publisher
         self.name = name
         self._failed = failed
         self._paced = paced
@@ -277,7 +277,7 @@ class PortReader:
     def _log_waiting(self) -> None:
         while self._waiting:
             try:
-                self._outlet.raw(self.name, self.transport.name, self._waiting.popleft())
+                self._publisher.raw(self.name, self.transport.name, self._waiting.popleft())
             except (ValueError, TypeError) as error:  # the log goes on without this chunk
                 self.unlogged += 1
                 log.debug("%s: a chunk cannot be logged: %s", self.name, error)

@@ -23,8 +23,8 @@ from tactile_core.bus.services import ServiceError
 from tactile_core.cli import DEFAULT_LOG
 from tactile_core.log.recorder import Recorder, RecorderError, RecorderSettings
 from tactile_core.types import Instant, WallClock, after, monotonic_now, seconds_between, utc_text
-from tactiled.board_session import Station
-from tactiled.publisher import Outlet
+from tactiled.board_session import BoardSession
+from tactiled.publisher import MessagePublisher
 
 log = logging.getLogger(__name__)
 
@@ -55,23 +55,23 @@ class RecordRequest(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 class Recordings:
     """One recording at a time for the whole daemon. Thread-safe.
 
-    ``run``: carries a function out on the pipeline's thread. ``stations``: the boards known now.
+    ``run``: carries a function out on the pipeline's thread. ``boards``: the boards known now.
     """
 
     def __init__(
         self,
-        outlet: Outlet,
+        publisher: MessagePublisher,
         settings: RecorderSettings,
         destination: Path | None,
         run: Callable[[Callable[[], Any]], Future[Any]],
-        stations: Callable[[], list[Station]],
+        boards: Callable[[], list[BoardSession]],
     ) -> None:
-        self._outlet = outlet
+        self._publisher = publisher
         # Whoever asks for a recording wants all of it: nothing is deleted to make room.
         self._settings = msgspec.structs.replace(settings, max_files=None, max_bytes=None)
         self._folder = _folder_of(destination)
         self._run = run
-        self._stations = stations
+        self._boards = boards
         self._lock = threading.Lock()
         self._recorder: Recorder | None = None
         self._started = monotonic_now()
@@ -119,12 +119,12 @@ class Recordings:
                     f"already recording to {self._recorder.stats.path}: stop that first"
                 )
             try:
-                recorder = Recorder(path, self._settings, clock=self._outlet.wall)
+                recorder = Recorder(path, self._settings, clock=self._publisher.wall)
             except RecorderError as error:
                 raise ServiceError(str(error)) from error
             recorder.metadata("recording", {"name": path.stem, "limit_s": f"{limit_s:g}"})
             self._started, self._limit_s = monotonic_now(), limit_s
-            self._recorder = self._outlet.recording = recorder
+            self._recorder = self._publisher.recording = recorder
         self._describe_boards()
         return self.summary()
 
@@ -144,15 +144,15 @@ class Recordings:
     def _detach(self) -> Recorder | None:
         with self._lock:
             recorder, self._recorder = self._recorder, None
-            self._outlet.recording = None
+            self._publisher.recording = None
         return recorder
 
     def _describe_boards(self) -> None:
         """Put geometry and calibration of every board into the new file."""
 
         def describe() -> None:
-            for station in self._stations():
-                station.describe_to(self._recorder)
+            for board in self._boards():
+                board.describe_to(self._recorder)
 
         try:
             self._run(describe).result(GEOMETRY_TIMEOUT_S)

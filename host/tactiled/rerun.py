@@ -24,11 +24,11 @@ from tactile_core.can_bus import CanSpec
 from tactile_core.types import Instant
 from tactiled import journal as kinds
 from tactiled.blocks import Chunk
-from tactiled.board_session import Station
+from tactiled.board_session import BoardSession
 from tactiled.boards.board import BoardLink
 from tactiled.boards.events import Identity, Refusal
 from tactiled.boards.line import bus_names, make_line
-from tactiled.calibration_store import Shelf
+from tactiled.calibration_store import CalibrationStore
 from tactiled.journal import RecordedState
 from tactiled.port import Port, Trouble
 from tactiled.publisher import RAW_PART, Sink
@@ -180,7 +180,7 @@ class Rerun:
     def __init__(
         self,
         recorded: RecordedPort,
-        shelf: Shelf,
+        store: CalibrationStore,
         settings: PipelineSettings,
         sink: ClockedSink,
         *,
@@ -192,7 +192,7 @@ class Rerun:
         self._follow: bool | None = None if journal else False  # the journal's instants; not known
         self._spoilt = False
         self._recorded = recorded
-        self._shelf = shelf
+        self._store = store
         self._settings = settings
         self._sink = sink
         self._versions = versions
@@ -210,9 +210,9 @@ class Rerun:
         return bool(self._follow) and not self._spoilt
 
     @property
-    def stations(self) -> list[Station]:
+    def boards(self) -> list[BoardSession]:
         """Boards found so far."""
-        return [] if self._port is None else list(self._port.stations.values())
+        return [] if self._port is None else list(self._port.boards.values())
 
     def chunk(self, chunk: Chunk) -> None:
         """Take the next chunk; parts of one that was too long for a message are put together."""
@@ -283,30 +283,30 @@ class Rerun:
                 self._held.clear()
                 self._over = True
                 if port is not None:
-                    port.farewell(now)
+                    port.stop_streaming(now)
             case _ if port is not None:
                 self._act_on_board(port, event, now)
 
     def _act_on_board(self, port: Port, event: Any, now: Instant) -> None:
-        station = port.stations.get(event.node)
+        board = port.boards.get(event.node)
         match event.kind:
             case kinds.LOST:
                 port.work(PortLost(event.text), now)
             case kinds.TICK if self._follow:
                 port.tick(now)
-            case kinds.TARE if station is not None:
-                station.tare(bool(event.value))
+            case kinds.TARE if board is not None:
+                board.tare(bool(event.value))
             case kinds.SET_RATE:
                 link = port.line.links.get(event.node)
                 if isinstance(link, BoardLink) and self._follow:
                     mhz = round(event.value * 1000)
                     link.request(lambda number: SetRate(number, mhz), now)
-            case kinds.RECALIBRATE if station is not None:
+            case kinds.RECALIBRATE if board is not None:
                 calibration = self._versions.get(event.text)
                 if calibration is not None:
-                    self._shelf.add(LOG, calibration)
+                    self._store.add(LOG, calibration)
                 port.retry(event.node, now)
-                station.recalibrate()
+                board.recalibrate()
 
     def _work(self, chunk: Chunk) -> None:
         self._sink.set(chunk.received)
@@ -349,21 +349,21 @@ class Rerun:
         def names(nodes: tuple[int, ...], late: bool) -> dict[int, str]:
             return bus_names(recorded.name, dict(recorded.nodes or {}), nodes, late)
 
-        def open_station(_: Port, node: int, name: str) -> Station | Trouble:
+        def open_board(_: Port, node: int, name: str) -> BoardSession | Trouble:
             del node
-            station = Station(name, self._sink, self._shelf, self._settings)
+            board = BoardSession(name, self._sink, self._store, self._settings)
             if first is not None and name in self._states:
-                station.rest_seed = self._states[name].rest
-            return station
+                board.rest_seed = self._states[name].rest
+            return board
 
         line = make_line(
             source.name, admit, medium, kind=recorded.kind, rate=recorded.rate, baud=recorded.baud,
             fd=recorded.fd, nodes=frozenset(recorded.nodes or ()) or None, listen_only=listen_only,
             arrays=recorded.arrays,
         )  # fmt: skip
-        port = self._port = Port(recorded.name, line, source, Inbox(Wake()), names, open_station)
+        port = self._port = Port(recorded.name, line, source, Inbox(Wake()), names, open_board)
         if medium is Medium.SERIAL:
-            port.add_station(0, recorded.name)
+            port.add_board(0, recorded.name)
         return port
 
 

@@ -21,10 +21,10 @@ from tactile_core.bus.topics import service_key
 from tactile_core.calibration import CalibrationError
 from tactile_core.types import monotonic_now
 from tactiled import journal
-from tactiled.board_session import Station
+from tactiled.board_session import BoardSession
 from tactiled.boards.board import BoardLink
 from tactiled.boards.events import Answered, Event
-from tactiled.calibration_store import Shelf
+from tactiled.calibration_store import CalibrationStore
 from tactiled.diagnostics import log_summary, summary
 from tactiled.port import Port
 from tactiled.recordings import Recordings, RecordRequest
@@ -73,19 +73,19 @@ class BoardServices:
         self,
         session: zenoh.Session,
         run: Callable[[Callable[[], Any]], Future[Any]],
-        shelf: Shelf,
+        store: CalibrationStore,
         port: Port,
         node: int,
-        station: Station,
+        board: BoardSession,
         recordings: Recordings,
         prefix: str = "",
     ) -> None:
         self._run = run
         self._recordings = recordings
-        self._shelf = shelf
+        self._store = store
         self._port = port
         self._node = node
-        self._station = station
+        self._board = board
         handlers: dict[str, tuple[Callable[[Any], object], type]] = {
             "status": (self._status, Nothing),
             "tare": (self._tare, TareRequest),
@@ -96,7 +96,7 @@ class BoardServices:
         }
         lead = f"{prefix}/" if prefix else ""
         self._services: list[Service] = [
-            declare_service(session, lead + service_key(station.name, name), handler, request)
+            declare_service(session, lead + service_key(board.name, name), handler, request)
             for name, (handler, request) in handlers.items()
         ]
 
@@ -107,9 +107,9 @@ class BoardServices:
 
     def _status(self, _: Nothing) -> dict[str, Any]:
         def sum_up() -> dict[str, Any]:
-            values = summary(self._port, self._node, self._station, monotonic_now())
-            recorder = self._station.recorder
-            values["alarms"] = self._station.summary.get("alarms", [])
+            values = summary(self._port, self._node, self._board, monotonic_now())
+            recorder = self._board.recorder
+            values["alarms"] = self._board.summary.get("alarms", [])
             values["recording"] = self._recordings.summary()
             return values | {"log": None if recorder is None else log_summary(recorder)}
 
@@ -118,14 +118,14 @@ class BoardServices:
 
     def _tare(self, request: TareRequest) -> dict[str, Any]:
         def begin() -> Future[dict[str, Any]]:
-            ending = self._station.tare(request.force)
+            ending = self._board.tare(request.force)
             value = float(request.force)
             self._port.note(journal.TARE, monotonic_now(), node=self._node, value=value)
             return ending
 
         future: Future[dict[str, Any]] = self._do(begin)
         stuck = "the tare did not end: no samples are coming"
-        timeout = TARE_TIMEOUT + TARE_CYCLES / max(self._station.rate, SLOWEST_HZ)
+        timeout = TARE_TIMEOUT + TARE_CYCLES / max(self._board.rate, SLOWEST_HZ)
         report: dict[str, Any] = self._await(future, timeout, stuck)
         if not report["accepted"]:
             raise ServiceError(report["message"])
@@ -146,9 +146,9 @@ class BoardServices:
     def _ask_rate(self, rate: float) -> Future[Event]:
         link = self._port.line.links.get(self._node)
         if not isinstance(link, BoardLink):
-            what = "the board" if link is None else f"the {self._station.identity}"
+            what = "the board" if link is None else f"the {self._board.identity}"
             raise ServiceError(f"{what} takes no commands: its rate cannot be set")
-        identity = self._station.identity
+        identity = self._board.identity
         if identity is not None and identity.max_rate is not None and rate > identity.max_rate:
             raise ServiceError(
                 f"rate_hz is {rate:g}; the board takes {identity.max_rate:g} at most"
@@ -159,14 +159,14 @@ class BoardServices:
         now = monotonic_now()
         request = link.request(lambda n: SetRate(n, mhz), now)
         self._port.note(journal.SET_RATE, now, node=self._node, value=rate)
-        return self._station.await_answer(request)
+        return self._board.await_answer(request)
 
     def _recalibrate(self, _: Nothing) -> dict[str, Any]:
         def reload() -> dict[str, Any]:
-            self._shelf.reload()
+            self._store.reload()
             now = monotonic_now()
             self._port.retry(self._node, now)
-            told = self._station.recalibrate()
+            told = self._board.recalibrate()
             self._port.note(journal.RECALIBRATE, now, node=self._node, text=told["hash"])
             return told
 
@@ -175,10 +175,10 @@ class BoardServices:
 
     def _geometry(self, _: Nothing) -> dict[str, Any]:
         def publish() -> dict[str, Any]:
-            choice = self._station.choice
+            choice = self._board.choice
             if choice is None:
                 raise ServiceError("no board has been identified yet")
-            self._station.send_geometry()
+            self._board.send_geometry()
             geometry = choice.calibration.geometry
             return {
                 "model": geometry.model,

@@ -18,7 +18,7 @@ from tactile_core.geometry import Side
 from tactile_core.log.recorder import Recorder
 from tactile_core.types import Instant, monotonic_now, seconds_between
 from tactiled.blocks import Features
-from tactiled.board_session import Station
+from tactiled.board_session import BoardSession
 from tactiled.port import Port
 
 REFRESH = 0.2
@@ -65,11 +65,11 @@ class Glimpse:
     alarms: tuple[str, ...] = ()
 
 
-def glimpse(station: Station, now: Instant) -> Glimpse:
+def glimpse(board: BoardSession, now: Instant) -> Glimpse:
     """What there is to be seen of a board at ``now``."""
-    cycle, limit = station.last, STALE_AFTER
-    if station.rate > 0:
-        limit = max(limit, STALE_PERIODS / station.rate)
+    cycle, limit = board.last, STALE_AFTER
+    if board.rate > 0:
+        limit = max(limit, STALE_PERIODS / board.rate)
     forces: dict[Side, float] = {}
     reasons: tuple[str, ...] = ()
     valid, bound = False, math.inf
@@ -79,13 +79,13 @@ def glimpse(station: Station, now: Instant) -> Glimpse:
         if cycle.calibrated:  # nominal figures are right to a factor of two, which says little
             bound = features.normal_force_bound
         reasons = tuple(reason.text for reason in features.reasons)
-        if station.choice is not None:
-            arrays = station.choice.calibration.geometry.arrays
+        if board.choice is not None:
+            arrays = board.choice.calibration.geometry.arrays
             forces = side_forces(features, list(dict.fromkeys(a.side for a in arrays)))
-    drops = sum(station.summary.get("drops", {}).values())
+    drops = sum(board.summary.get("drops", {}).values())
     return Glimpse(
-        station.name, station.state, forces, valid, reasons, station.rate, drops,
-        station.latency.p50, bound, tuple(station.summary.get("alarms", ())),
+        board.name, board.state, forces, valid, reasons, board.rate, drops,
+        board.latency.p50, bound, tuple(board.summary.get("alarms", ())),
     )  # fmt: skip
 
 
@@ -153,21 +153,21 @@ class StatusLines(LiveLines):
         self._ports = ports
         self._console = console
 
-    def _boards(self) -> list[Station]:
-        return [station for port in self._ports for station in list(port.stations.values())]
+    def _boards(self) -> list[BoardSession]:
+        return [board for port in self._ports for board in list(port.boards.values())]
 
     def table(self) -> Table:
         """A row for each board."""
         table, now, boards = Table.grid(), monotonic_now(), self._boards()
-        names = max((len(station.name) for station in boards), default=0)
-        for station in boards:
-            table.add_row(line(glimpse(station, now), self._console.width, names))
+        names = max((len(board.name) for board in boards), default=0)
+        for board in boards:
+            table.add_row(line(glimpse(board, now), self._console.width, names))
         return table
 
     def lines(self) -> list[str]:
         """A line for each board."""
         now = monotonic_now()
-        return [line(glimpse(station, now)).plain.rstrip() for station in self._boards()]
+        return [line(glimpse(board, now)).plain.rstrip() for board in self._boards()]
 
 
 def _duration(seconds: float) -> str:

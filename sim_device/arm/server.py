@@ -132,7 +132,7 @@ class _World:
 
 
 class ArmServer:
-    """`sim_device.runner.Station`: call `service` every millisecond. BusError from `open`.
+    """`sim_device.runner.PortServer`: call `service` every millisecond. BusError from `open`.
 
     ``load``: scene for another seed, SceneError if there is none. ``make_world``: builds its world.
     Services run on zenoh's threads; a lock guards the cupboard.

@@ -13,8 +13,8 @@ from armd.config import ArmConfig, load_config, plane_of
 from sim_device.ports_plan import BoardsRequest, Planned, plan_boards
 from sim_device.robots import ur, xarm
 from sim_device.robots.plant import Mount, Plant
+from sim_device.robots.robot_server import Emulated, RobotServer, TruthFile, WorldOnBus
 from sim_device.robots.sockets import Network, Servers
-from sim_device.robots.station import Emulated, RobotStation, TruthFile, WorldOnBus
 from sim_device.world.base import World
 from sim_device.world.engines import world_maker
 from sim_device.world.scene_loading import load_scene
@@ -72,14 +72,14 @@ def plan_robot(request: RobotRequest) -> list[Planned]:
     on_bus = None
     if world is not None and request.bus is not None:
         on_bus = WorldOnBus(world, request.world, request.bus)
-    station = RobotStation(robot, servers, truth, on_bus, control=request.control)
+    server = RobotServer(robot, servers, truth, on_bus, control=request.control)
     boards: list[Planned] = []
     if request.boards.ptys or request.boards.slcans:
         boards = plan_boards(replace(request.boards, touched=plant.contacts, heading=plant.yaw))
     where = "in free air" if world is None else f"in {request.scene} {request.seed}{goal}"
     line = f"emulated robot at {request.address}, {where}"
     connect = f"armd --driver {request.kind} --config {request.config}"
-    return [Planned(station, request.kind, connect, (line,)), *boards]
+    return [Planned(server, request.kind, connect, (line,)), *boards]
 
 
 def _controller(

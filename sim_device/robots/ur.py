@@ -507,7 +507,7 @@ def ports(controller: UrController) -> dict[int, Callable[[], Any]]:
 
 
 class EmulatedUr(UrController):
-    """What a `sim_device.robots.station.RobotStation` drives."""
+    """What a `sim_device.robots.robot_server.RobotServer` drives."""
 
     faults = (
         "protective_stop", "estop", "safeguard", "release", "unlock_after S", "stop_program",

@@ -55,7 +55,7 @@ class Setup:
 
 
 class EmulatedXarm:
-    """Modes, states and errors of one robot; driven by a `RobotStation`."""
+    """Modes, states and errors of one robot; driven by a `RobotServer`."""
 
     faults = ("protective_stop", "estop", "release", "stop_program", "nan", "numbers")
 

@@ -59,7 +59,7 @@ class TactiledLab:
         return program
 
 
-class Ear:
+class FeatureListener:
     """Every features message of a board, with the instant at which it came."""
 
     def __init__(self, session: zenoh.Session, name: str = "board0", prefix: str = "") -> None:

@@ -1,4 +1,4 @@
-"""tactiled's own port, line and station round a simulated board, on virtual time, into a log."""
+"""tactiled's own port, line and session round a simulated board, on virtual time, into a log."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from tactile_core.log.recorder import Recorder, RecorderSettings
 from tactile_core.types import NS_PER_S, Instant, WallClock
 from tactiled import journal as kinds
 from tactiled.blocks import Chunk
-from tactiled.board_session import Station
+from tactiled.board_session import BoardSession
 from tactiled.boards.board import BoardLink
 from tactiled.boards.events import Identity, Refusal
 from tactiled.boards.line import bus_names, make_line
-from tactiled.calibration_store import Shelf
+from tactiled.calibration_store import CalibrationStore
 from tactiled.journal import Journal
 from tactiled.port import Port
 from tactiled.publisher import split
@@ -49,7 +49,7 @@ def press(seconds: float) -> list[Contact]:
 
 
 class LogSink:
-    """`tactiled.publisher.Outlet` without a bus."""
+    """`tactiled.publisher.MessagePublisher` without a bus."""
 
     def __init__(self, recorder: Recorder) -> None:
         self.wall = WALL
@@ -106,10 +106,10 @@ class VirtualDaemon:
         self.recorder.metadata(PIPELINE, _pipeline(settings))
         self.recorder.metadata(PORT_PREFIX + "finger", _port(can, rate))
         self.sink = LogSink(self.recorder)
-        shelf = Shelf((), strict=False)
+        store = CalibrationStore((), strict=False)
         for calibration in calibrations:
-            shelf.add(Path(calibration.serial_number), calibration)
-        self.shelf = shelf
+            store.add(Path(calibration.serial_number), calibration)
+        self.store = store
         self.source = Source(medium)
         self.inbox = Inbox(Wake(), limit=inbox)
         self.line = make_line(
@@ -118,11 +118,11 @@ class VirtualDaemon:
         )  # fmt: skip
         self.port = Port(
             "finger", self.line, self.source, self.inbox, self._names,
-            lambda _, node, name: Station(name, self.sink, shelf, settings),
+            lambda _, node, name: BoardSession(name, self.sink, store, settings),
             True, Journal(self.sink, "finger", "virtual"),
         )  # fmt: skip
         if not can:
-            self.port.add_station(0, "finger")
+            self.port.add_board(0, "finger")
         self.now = POWER_ON
         self.plugged = True
         self.stalled = False
@@ -143,8 +143,8 @@ class VirtualDaemon:
         self.plugged = False
 
     def tare(self) -> Future[dict[str, Any]]:
-        station = self.port.stations[0]
-        done = station.tare()
+        session = self.port.boards[0]
+        done = session.tare()
         self.port.note(kinds.TARE, self.now)
         return done
 
@@ -155,9 +155,9 @@ class VirtualDaemon:
         self.port.note(kinds.SET_RATE, self.now, value=rate)
 
     def recalibrate(self, calibration: BoardCalibration) -> None:
-        self.shelf.add(Path("new"), calibration)
+        self.store.add(Path("new"), calibration)
         self.port.retry(0, self.now)
-        told = self.port.stations[0].recalibrate()
+        told = self.port.boards[0].recalibrate()
         self.port.note(kinds.RECALIBRATE, self.now, text=told["hash"])
 
     def run(self, seconds: float) -> None:
@@ -180,7 +180,7 @@ class VirtualDaemon:
                 self.port.pump(Instant(self.now + 100_003))
 
     def close(self) -> None:
-        self.port.farewell(self.now)
+        self.port.stop_streaming(self.now)
         assert self.recorder.close(30)
 
     def _log_raw(self, chunk: Chunk) -> None:

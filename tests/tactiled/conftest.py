@@ -18,7 +18,7 @@ from tactile_core.bus.topics import service_key
 from tactile_core.types import Instant
 from tests.support.processes import Program
 from tests.support.scripted_board import DESCRIPTOR, ScriptedBoard, at
-from tests.support.tactiled_lab import Ear, TactiledLab, tactiled_lab
+from tests.support.tactiled_lab import FeatureListener, TactiledLab, tactiled_lab
 from tests.support.waiting import PATIENCE_S
 
 
@@ -63,7 +63,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Tactiled
             "--calibration", "board0.cal.toml", "--log", "run.mcap",
         )  # fmt: skip
         session = lab.listen()
-        Ear(session).wait(20)
+        FeatureListener(session).wait(20)
         yield lab, daemon, session
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tactile_tools.cli import main
-from tests.support.tactiled_lab import Ear
+from tests.support.tactiled_lab import FeatureListener
 from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.timeout(300)
@@ -42,8 +42,8 @@ def test_tare_under_a_press_is_refused_and_can_be_forced(
     (tmp_path / "press.toml").write_text(PRESS)
     lab.boards("--board", "anyskin", "--pty", "skin0", "--press", "press.toml", link="skin0")
     daemon = lab.tactiled("--port", "skin0", "--no-log")
-    ear = Ear(lab.listen())
-    wait_until(lambda: any(m.normal_force > 2.0 for _, m in list(ear.heard)))
+    listener = FeatureListener(lab.listen())
+    wait_until(lambda: any(m.normal_force > 2.0 for _, m in list(listener.heard)))
     words = ["--connect", lab.endpoint]
     assert main(["tare", *words]) == 3
     error = capsys.readouterr().err
@@ -52,7 +52,7 @@ def test_tare_under_a_press_is_refused_and_can_be_forced(
     assert len(error.splitlines()) == 1
     assert main(["tare", "board0", "--force", *words]) == 0
     assert "tared over" in capsys.readouterr().out
-    wait_until(lambda: abs(ear.heard[-1][1].normal_force) < 0.5)
+    wait_until(lambda: abs(listener.heard[-1][1].normal_force) < 0.5)
     assert "tare refused" in daemon.said
 
 

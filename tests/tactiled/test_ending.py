@@ -19,9 +19,9 @@ from tactile_core.bus.session import BusConfig, close_session, open_session
 from tactile_core.bus.topics import LOG
 from tactile_core.log.info import info
 from tactile_core.types import NS_PER_S, WallClock
-from tactiled.publisher import Outlet
+from tactiled.publisher import MessagePublisher
 from tests.support.network import free_endpoint
-from tests.support.tactiled_lab import Ear
+from tests.support.tactiled_lab import FeatureListener
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -30,40 +30,40 @@ BURN = "while True: sum(range(10000))"
 
 def test_closed_publisher_publishes_nothing() -> None:
     session = open_session(BusConfig(listen=(), connect=()))
-    outlet = Outlet(session, None, WallClock.take())
+    publisher = MessagePublisher(session, None, WallClock.take())
     going, failed = threading.Event(), []
 
     def produce() -> None:
         try:
-            while not going.is_set() or outlet.late < 1000:
-                outlet.send(LOG, "b0", log_message(1, 20, "b0", "x"), 1)
+            while not going.is_set() or publisher.late < 1000:
+                publisher.send(LOG, "b0", log_message(1, 20, "b0", "x"), 1)
         except BaseException as error:  # noqa: BLE001 - what a thread dies of is what is tested
             failed.append(error)
 
     threads = [threading.Thread(target=produce) for _ in range(3)]
     for thread in threads:
         thread.start()
-    outlet.end()
-    outlet.close()
+    publisher.end()
+    publisher.close()
     assert close_session(session)
     going.set()
     for thread in threads:
         thread.join(60)
     assert failed == []
-    assert outlet.late >= 1000
-    assert outlet.refused == 0
+    assert publisher.late >= 1000
+    assert publisher.refused == 0
 
 
 def test_unexpected_bus_closure_costs_only_the_bus() -> None:
     session = open_session(BusConfig(listen=(), connect=()))
-    outlet = Outlet(session, None, WallClock.take())
+    publisher = MessagePublisher(session, None, WallClock.take())
     message = log_message(1, 20, "b0", "x")
-    outlet.send(LOG, "b0", message, 1)
+    publisher.send(LOG, "b0", message, 1)
     close_session(session)
     for _ in range(10):
-        outlet.send(LOG, "b0", message, 1)
-    assert outlet.refused == 10
-    outlet.close()
+        publisher.send(LOG, "b0", message, 1)
+    assert publisher.refused == 10
+    publisher.close()
 
 
 def test_sigterm_under_load_shuts_down_cleanly(lab: Any) -> None:
@@ -109,7 +109,7 @@ def test_tactiled_runs_at_any_system_time(
     daemon = lab.tactiled("--port", "board0", "--log", "run.mcap")
     monkeypatch.delenv("PYTHONPATH")
     session = lab.listen()
-    features = Ear(session).wait(30)
+    features = FeatureListener(session).wait(30)
     assert (features.header.stamp.sec == 0) == (wall_s > 0)  # no stamp rather than a wrong one
     assert says in ask(session, "status").get("clock_problem", "")
     daemon.process.send_signal(signal.SIGTERM)
@@ -125,12 +125,12 @@ def test_tactiled_runs_at_any_system_time(
 def test_failed_log_gives_a_failing_exit_status(lab: Any) -> None:
     lab.boards("--pty", "board0", "--seed", "1", link="board0")
     daemon = lab.tactiled("--port", "board0", "--log", "logs")
-    ear = Ear(lab.listen())
-    ear.wait(10)
+    listener = FeatureListener(lab.listen())
+    listener.wait(10)
     (lab.folder / "logs").rename(lab.folder / "gone")
     (lab.folder / "logs").touch()  # where there was a folder: no file can be opened there
     daemon.wait_for_text("deleted or moved")
-    ear.wait(20)
+    listener.wait(20)
     daemon.process.send_signal(signal.SIGTERM)
     assert daemon.wait() == 1, daemon.said
     assert "tactiled: the log failed" in daemon.said
@@ -148,12 +148,12 @@ def test_changed_symlink_is_followed_until_a_board_is_found(lab: Any) -> None:
         session = lab.listen()
         lab.boards("--pty", "right", "--seed", "1", link="right")
         _relink(link, os.path.realpath(lab.folder / "right"))
-        ear = Ear(session)
-        ear.wait(10)
+        listener = FeatureListener(session)
+        listener.wait(10)
         assert "board leads to another device now" in daemon.said
         # With a board found, the port is that board's: the path is not looked at any more.
         _relink(link, os.ttyname(slave))
-        ear.wait(100, after=ear.heard[-1][0])
+        listener.wait(100, after=listener.heard[-1][0])
         assert daemon.process.poll() is None
     finally:
         os.close(master)

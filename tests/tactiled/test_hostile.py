@@ -41,10 +41,10 @@ from tactile_core.log.recorder import Recorder, RecorderSettings
 from tactile_core.throttle import Throttle
 from tactile_core.types import NS_PER_S, Instant, WallClock, after
 from tactiled.blocks import Chunk, Patch
-from tactiled.board_session import FIRMWARE_BURST, SET_UP_BURST, Station
+from tactiled.board_session import FIRMWARE_BURST, SET_UP_BURST, BoardSession
 from tactiled.boards.events import BoardLog
 from tactiled.boards.line import SerialLine
-from tactiled.calibration_store import Shelf
+from tactiled.calibration_store import CalibrationStore
 from tactiled.journal import Journal
 from tactiled.port import Port
 from tactiled.publisher import MAX_PATCHES, MessageMaker
@@ -68,7 +68,7 @@ BOARD = Descriptor(1, 0, bytes(7) + b"\xaa", "pad", "1", TICK_HZ, 493_000, (arra
 
 
 class Ends:
-    """Where a station's messages go, without a bus: encoded, kept by topic, and into a log."""
+    """Where a session's messages go, without a bus: encoded, kept by topic, and into a log."""
 
     def __init__(self, recorder: Recorder | None = None) -> None:
         self.wall = WallClock(1_700_000_000 * NS_PER_S)
@@ -114,7 +114,7 @@ class Asked(RecordedSource):
 
 
 class Rig:
-    """A board on a line, with its port and station, in time of its own."""
+    """A board on a line, with its port and session, in time of its own."""
 
     def __init__(
         self, descriptor: Descriptor = BOARD, recorder: Recorder | None = None, settle: bool = True
@@ -123,23 +123,23 @@ class Rig:
         self.ends = Ends(recorder)
         self.sequence = 0
         self._second = self.ends.at
-        shelf = Shelf((), strict=False)
+        store = CalibrationStore((), strict=False)
         line = SerialLine("p", lambda node, identity: self.port.admit(node, identity))
         self.inbox = Inbox(Wake(), limit=100_000)
         self.source = Asked()
         self.port = Port(
             "p", line, self.source, self.inbox, lambda nodes, late: {},
-            lambda port, node, name: Station(name, self.ends, shelf, PipelineSettings()),
+            lambda port, node, name: BoardSession(name, self.ends, store, PipelineSettings()),
             True, Journal(self.ends, "b0", "p"),
         )  # fmt: skip
-        self.port.add_station(0, "b0")
-        self.station = self.port.stations[0]
+        self.port.add_board(0, "b0")
+        self.session = self.port.boards[0]
         line.connect(self.ends.at)
         if settle:
             for _ in range(120):  # identified, tared
                 self.cycle()
-            assert self.station.features is not None
-            assert self.station.features.valid, self.station.features.reasons
+            assert self.session.features is not None
+            assert self.session.features.valid, self.session.features.reasons
 
     def ticks(self) -> int:
         return self.ends.at * TICK_HZ // NS_PER_S % (1 << 32)
@@ -156,7 +156,7 @@ class Rig:
                 break
         if self.ends.at >= self._second:
             self._second = after(self.ends.at, 1.0)
-            self.station.each_second(self.ends.at)
+            self.session.each_second(self.ends.at)
 
     def cycle(self, press: float = 0.0, seconds: float = 0.01) -> None:
         """One sampling cycle, and answers to what the host asked; ``press``: counts along z."""
@@ -241,13 +241,13 @@ def test_pipeline_and_log_survive_many_hostile_items(
         if k % 40 == 0:
             rig.cycle()
     rig.send(b"\0", seconds=60.0)
-    before = rig.station.sent
+    before = rig.session.sent
     for _ in range(600):  # the board as it was at first
         rig.cycle()
-    assert rig.station.sent > before + 300
-    assert rig.station.features is not None
-    assert rig.station.features.valid, rig.station.features.reasons
-    drops = rig.station.drops() | rig.port.drops()
+    assert rig.session.sent > before + 300
+    assert rig.session.features is not None
+    assert rig.session.features.valid, rig.session.features.reasons
+    drops = rig.session.drops() | rig.port.drops()
     # All of it is of a known kind: nothing went wrong that nobody foresaw.
     lost = {reason for reason, n in drops.items() if n}
     assert not {reason for reason in lost if reason.startswith(("unsent", "spoilt"))}, drops
@@ -289,7 +289,7 @@ def test_largest_boards_work_with_every_other_taxel_pressed(
     starts = [i for i, part in enumerate(parts) if part[0].action == 3]
     whole = [marker for part in parts[starts[-2] : starts[-1]] for marker in part]
     assert sum(len(m.points) for m in whole if m.ns == "taxels") == count * 128
-    drops = rig.station.drops()
+    drops = rig.session.drops()
     assert not {reason: n for reason, n in drops.items() if n and reason != "patches_cut"}
     assert recorder.close(30)
     assert info(tmp_path / "a.mcap").whole
@@ -297,8 +297,8 @@ def test_largest_boards_work_with_every_other_taxel_pressed(
 
 def test_excess_patches_are_cut_to_the_strongest_and_counted() -> None:
     rig = Rig()
-    maker = rig.station._maker
-    cycle = rig.station.last
+    maker = rig.session._maker
+    cycle = rig.session.last
     assert maker is not None
     assert cycle is not None
     zero = np.zeros(3)
@@ -308,7 +308,7 @@ def test_excess_patches_are_cut_to_the_strongest_and_counted() -> None:
     assert len(codec().encode(FEATURES, message)) < MAX_PAYLOAD
     forces = [patch.normal_force for patch in message.patches]
     assert forces == [float(n) for n in range(1024 - MAX_PATCHES, 1024)]
-    assert rig.station.drops()["patches_cut"] == 1024 - MAX_PATCHES
+    assert rig.session.drops()["patches_cut"] == 1024 - MAX_PATCHES
 
 
 def test_failed_markers_do_not_stop_features(
@@ -327,7 +327,7 @@ def test_failed_markers_do_not_stop_features(
     for _ in range(50):
         rig.cycle()
     assert rig.ends.sent["features"] == before + 100
-    assert rig.station.drops()["unsent_contacts"] == pytest.approx(10, abs=3)
+    assert rig.session.drops()["unsent_contacts"] == pytest.approx(10, abs=3)
     assert "a mistake in a picture" in caplog.text
 
 
@@ -349,7 +349,7 @@ def test_unencodable_message_costs_only_itself(kind: str, monkeypatch: pytest.Mo
         rig.cycle()
     for other in ("features", "forces", "field"):
         assert rig.ends.sent[other] - before[other] == (5 if other == kind else 10)
-    assert rig.station.drops()[f"unsent_{kind}"] == 5
+    assert rig.session.drops()[f"unsent_{kind}"] == 5
 
 
 def test_unexpected_event_costs_only_itself_and_is_reported(
@@ -370,7 +370,7 @@ def test_unexpected_event_costs_only_itself_and_is_reported(
     for _ in range(100):
         rig.cycle()
     assert rig.ends.sent["features"] >= before + 70
-    assert rig.station.drops()["spoilt_events"] == 10
+    assert rig.session.drops()["spoilt_events"] == 10
     assert "a mistake in the pipeline" in caplog.text
 
 
@@ -382,8 +382,8 @@ def test_text_with_impossible_stamp_is_stamped_on_arrival(
         (Instant(rig.ends.at - 2147483000 * NS_PER_S), "hello from 1955"),
         (Instant(rig.ends.at - NS_PER_S), "hello"),
     ):
-        rig.station.handle(BoardLog(20, captured, text))
-    assert rig.station.drops()["texts_without_time"] == 1
+        rig.session.handle(BoardLog(20, captured, text))
+    assert rig.session.drops()["texts_without_time"] == 1
     assert recorder.close(30)
     spoken = [
         (codec().decode(LOG, m.data), m)
@@ -406,7 +406,7 @@ def test_flood_of_serial_numbers_is_throttled_and_counted() -> None:
         rig.send(stranger, seconds=0.001)
     told = rig.ends.texts[said:]
     assert 1 <= len(told) <= 10
-    held = rig.station.drops()["texts_held_back"]
+    held = rig.session.drops()["texts_held_back"]
     assert held >= 2900
     rig.send(b"\0", seconds=10.0)
     rig.send(b"\0", seconds=10.0)
@@ -418,7 +418,7 @@ def test_flood_of_firmware_texts_is_throttled_and_counted() -> None:
     before = rig.ends.sent["log"]
     rig.send(*(Log(40, rig.ticks(), f"flood {k}") for k in range(5000)))
     assert rig.ends.sent["log"] == before + FIRMWARE_BURST
-    assert rig.station.drops()["texts_held_back"] == 5000 - FIRMWARE_BURST
+    assert rig.session.drops()["texts_held_back"] == 5000 - FIRMWARE_BURST
     rig.send(b"\0", seconds=2.0)
     assert f"{5000 - FIRMWARE_BURST} texts held back, too many: firmware" in rig.ends.texts
 

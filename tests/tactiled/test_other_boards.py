@@ -10,7 +10,7 @@ import pytest
 from tactile_core.bus.messages import codec
 from tactile_core.bus.topics import GEOMETRY
 from tactile_core.log.info import info
-from tests.support.tactiled_lab import Ear
+from tests.support.tactiled_lab import FeatureListener
 from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.timeout(300)
@@ -37,9 +37,9 @@ def test_text_board_declared_board_and_silent_adapter_stream_and_replay(lab: Any
         GEOMETRY.key("jaws"),
         lambda sample: shapes.append(codec().decode(GEOMETRY, sample.payload.to_bytes())),
     )
-    ears = {name: Ear(session, name) for name in ("jaws", "pad", "hand")}
-    for ear in ears.values():
-        ear.wait(20)
+    listeners = {name: FeatureListener(session, name) for name in ("jaws", "pad", "hand")}
+    for listener in listeners.values():
+        listener.wait(20)
     wait_until(lambda: "read as text:10txyz" in daemon.said)
     assert "answers no command" in daemon.said
     daemon.process.send_signal(signal.SIGINT)

@@ -19,7 +19,7 @@ from tactile_core.bus.services import ServiceError
 from tactile_core.log.info import info
 from tactiled.cli import main
 from tactiled.port import Port
-from tests.support.tactiled_lab import Ear
+from tests.support.tactiled_lab import FeatureListener
 from tests.support.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.timeout(300)
@@ -29,21 +29,21 @@ def test_ctrl_c_leaves_a_complete_log_that_replays_on_its_own_keys(lab: Any) -> 
     lab.boards("--pty", "board0", "--seed", "1", link="board0")
     daemon = lab.tactiled("--port", "board0", "--log", "run.mcap")
     session = lab.listen()
-    ear = Ear(session)
-    ear.wait(50)
+    listener = FeatureListener(session)
+    listener.wait(50)
     daemon.process.send_signal(signal.SIGINT)
     assert daemon.wait() == 0, daemon.said
     told = info(lab.folder / "run.mcap")
     assert told.closed
     logged = {c.topic: c.messages for c in told.channels}
-    assert logged["/tactile/board0/features"] >= len(ear.heard)
+    assert logged["/tactile/board0/features"] >= len(listener.heard)
     replay = lab.tactiled("--mcap", "run.mcap", "--speed", "inf", "--log", "again.mcap")
     assert replay.wait() == 0, replay.said
     again = {c.topic: c.messages for c in info(lab.folder / "again.mcap").channels}
     # All of it again, and at most the cycles that were in hand when Ctrl-C came.
     ahead = again["/tactile/board0/features"] - logged["/tactile/board0/features"]
     assert 0 <= ahead <= 3
-    live, replayed = Ear(session), Ear(session, prefix="replay")
+    live, replayed = FeatureListener(session), FeatureListener(session, prefix="replay")
     lab.tactiled("--mcap", "run.mcap", "--speed", "0.5")
     replayed.wait(5)
     assert not live.heard
@@ -53,7 +53,7 @@ def test_pending_requests_are_told_that_the_daemon_stops(lab: Any, ask: Any) -> 
     board = lab.boards("--pty", "board0", "--seed", "1", link="board0")
     daemon = lab.tactiled("--port", "board0", "--no-log")
     session = lab.listen()
-    Ear(session).wait(10)
+    FeatureListener(session).wait(10)
     board.process.send_signal(signal.SIGSTOP)
     answers: list[str] = []
 
@@ -76,29 +76,29 @@ def test_pending_requests_are_told_that_the_daemon_stops(lab: Any, ask: Any) -> 
 def test_silence_ends_features_without_repeating_one(lab: Any) -> None:
     board = lab.boards("--pty", "board0", "--seed", "1", link="board0")
     daemon = lab.tactiled("--port", "board0", "--no-log")
-    ear = Ear(lab.listen())
-    ear.wait(10)
+    listener = FeatureListener(lab.listen())
+    listener.wait(10)
     board.process.send_signal(signal.SIGSTOP)
     daemon.wait_for_text("no samples for")
     time.sleep(1.2)
     board.process.send_signal(signal.SIGCONT)
-    ear.wait(20, after=time.monotonic())
-    numbers = [m.sequence for _, m in ear.heard]
+    listener.wait(20, after=time.monotonic())
+    numbers = [m.sequence for _, m in listener.heard]
     assert numbers == sorted(set(numbers))
-    pauses = [b - a for (a, _), (b, _) in zip(ear.heard, ear.heard[1:], strict=False)]
+    pauses = [b - a for (a, _), (b, _) in zip(listener.heard, listener.heard[1:], strict=False)]
     assert max(pauses) > 1.0
 
 
 def test_replugged_board_is_resumed_and_another_in_its_place_refused(lab: Any) -> None:
     board = lab.boards("--pty", "board0", "--seed", "1", link="board0")
     daemon = lab.tactiled("--port", "board0", "--log", "run.mcap")
-    ear = Ear(lab.listen())
-    ear.wait(10)
+    listener = FeatureListener(lab.listen())
+    listener.wait(10)
     board.end()
     daemon.wait_for_text("waiting for it to come back")
     (lab.folder / "board0").unlink(missing_ok=True)
     board = lab.boards("--pty", "board0", "--seed", "1", link="board0")
-    ear.wait(10, after=time.monotonic())
+    listener.wait(10, after=time.monotonic())
     board.end()
     (lab.folder / "board0").unlink(missing_ok=True)
     lab.boards("--pty", "board0", "--seed", "2", link="board0")
@@ -110,12 +110,12 @@ def test_killed_daemon_restarts_and_its_log_is_readable(lab: Any) -> None:
     lab.boards("--pty", "board0", "--seed", "1", link="board0")
     daemon = lab.tactiled("--port", "board0", "--log", "run.mcap")
     session = lab.listen()
-    ear = Ear(session)
-    ear.wait(60)
+    listener = FeatureListener(session)
+    listener.wait(60)
     daemon.process.kill()
     daemon.wait()
     lab.tactiled("--port", "board0", "--log", "next.mcap")
-    ear.wait(20, after=time.monotonic())
+    listener.wait(20, after=time.monotonic())
     told = info(lab.folder / "run.mcap")
     assert not told.closed
     assert {c.topic: c.messages for c in told.channels}["/tactile/board0/features"] > 20
@@ -128,7 +128,7 @@ def test_dead_thread_ends_the_daemon_and_the_log_is_complete(
     real, log = Port.pump, lab.folder / "run.mcap"
 
     def fail_at_last(port: Port, *words: Any) -> None:
-        if any(station.sent >= 100 for station in port.stations.values()):
+        if any(session.sent >= 100 for session in port.boards.values()):
             raise ZeroDivisionError("a mistake in the pipeline")
         real(port, *words)
 
@@ -152,7 +152,7 @@ def test_boards_on_a_can_bus_are_named_by_node(lab: Any) -> None:
     daemon = lab.tactiled("--can", "slcan:can0@1000000", "--name", "hand", "--no-log")
     session = lab.listen()
     for name in ("hand-3", "hand-5"):
-        Ear(session, name).wait(5)
+        FeatureListener(session, name).wait(5)
     daemon.process.terminate()
     assert daemon.wait() == 0, daemon.said
 

@@ -62,7 +62,7 @@ class ScriptedTransport:
 
 
 class RawLog:
-    """Stands in for the outlet: keeps what a reader logs."""
+    """Stands in for the publisher: keeps what a reader logs."""
 
     def __init__(self) -> None:
         self.chunks: list[Chunk] = []
@@ -77,9 +77,9 @@ class Rig:
         self.inbox = Inbox(Wake(), limit)
         self.log = RawLog()
         self.failures: list[BaseException] = []
-        outlet: Any = self.log
+        publisher: Any = self.log
         self.reader = PortReader(
-            self.transport, self.inbox, outlet, "b", self.failures.append, paced
+            self.transport, self.inbox, publisher, "b", self.failures.append, paced
         )
 
     def next(self) -> Any:

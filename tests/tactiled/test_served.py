@@ -11,7 +11,7 @@ from tactile_core.bus.services import ServiceError
 from tactile_core.bus.streams import latest
 from tactile_core.bus.topics import FORCES
 from tests.support.network import free_endpoint
-from tests.support.tactiled_lab import Ear
+from tests.support.tactiled_lab import FeatureListener
 from tests.support.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.timeout(300)
@@ -19,9 +19,9 @@ pytestmark = pytest.mark.timeout(300)
 
 def test_one_daemon_serves_two_kinds_of_board(running: tuple[Any, Any, Any]) -> None:
     _, daemon, session = running
-    features = Ear(session, "board0").wait(5)
+    features = FeatureListener(session, "board0").wait(5)
     assert features.calibrated
-    features = Ear(session, "skin0").wait(5)
+    features = FeatureListener(session, "skin0").wait(5)
     assert not features.calibrated
     assert "anyskin board without a serial number found" in daemon.said
     forces = latest(session, FORCES.key("skin0")).wait(PATIENCE_S)
@@ -54,11 +54,11 @@ def test_tare_replies_when_done_with_a_report(running: tuple[Any, Any, Any], ask
 def test_rate_is_set_and_bad_rates_are_refused(running: tuple[Any, Any, Any], ask: Any) -> None:
     _, _, session = running
     assert ask(session, "set_rate", {"rate_hz": 50.0}, timeout=PATIENCE_S) == {"rate_hz": 50.0}
-    ear = Ear(session)
-    ear.wait(60)
+    listener = FeatureListener(session)
+    listener.wait(60)
     steps = [
         b.captured_ns - a.captured_ns
-        for (_, a), (_, b) in zip(ear.heard, ear.heard[1:], strict=False)
+        for (_, a), (_, b) in zip(listener.heard, listener.heard[1:], strict=False)
     ]
     assert sorted(steps)[len(steps) // 2] == pytest.approx(20e6, rel=0.1)
     for rate in (0, -1, 1e6):

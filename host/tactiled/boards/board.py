@@ -375,7 +375,7 @@ class BoardLink:
             raise ValueError(f"the board is {self.state.name.lower()}, not in service")
         return self._commands.push(make, now, own=False)
 
-    def farewell(self) -> None:
+    def stop_streaming(self) -> None:
         """Ask the board to cease streaming; no answer is awaited."""
         if self.state in (State.CONFIGURING, State.STREAMING):
             self._out.append(Stop(self._commands.next_request()))

@@ -224,7 +224,7 @@ def test_workers_are_single_threaded_and_the_parent_is_unchanged(
     from tactile_tools.experiments import backends
 
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    worker = backends._hire()
+    worker = backends._start_worker()
     try:
         assert "OMP_NUM_THREADS" not in os.environ
         environment: dict[str, str] = {}

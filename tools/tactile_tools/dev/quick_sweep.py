@@ -88,7 +88,7 @@ def _compared(
         if not found:
             continue
         arrived = {r["scene_seed"]: r["success"] for r in found if r["error"] is None}
-        entry = {"variant": variant.meaning, "strategy": variant.strategy}
+        entry: dict[str, Any] = {"variant": variant.meaning, "strategy": variant.strategy}
         entry |= {"parameters": dict(variant.parameters)} | summary_of(found)
         if number == 0:
             wholes = arrived

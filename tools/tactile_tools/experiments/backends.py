@@ -113,7 +113,7 @@ class Processes:
 
     def __init__(self, jobs: int) -> None:
         self.workers = jobs
-        self._crew: list[_Worker] = []
+        self._workers: list[_Worker] = []
 
     def __enter__(self) -> Self:
         """Start nothing yet: processes are started as they are needed."""
@@ -126,9 +126,9 @@ class Processes:
         trace: TracebackType | None,
     ) -> None:
         """End all processes."""
-        for worker in self._crew:
+        for worker in self._workers:
             worker.end()
-        self._crew.clear()
+        self._workers.clear()
 
     def run(self, specs: Sequence[TrialSpec]) -> Iterator[Row]:
         """Rows of ``specs`` as they are finished, in any order; BackendError."""
@@ -136,14 +136,14 @@ class Processes:
         size = max(1, min(BATCH, len(specs) // (4 * self.workers)))
         waiting = deque(batches(specs, size))
         deaths: dict[TrialSpec, int] = {}
-        while len(self._crew) < min(self.workers, len(waiting)):
-            self._crew.append(_hire())
-        idle = list(self._crew)
+        while len(self._workers) < min(self.workers, len(waiting)):
+            self._workers.append(_start_worker())
+        idle = list(self._workers)
         fruitless = 0
         while True:
             while idle and waiting:
                 idle.pop().ask(waiting.popleft())
-            busy = {worker.pipe: worker for worker in self._crew if worker.asked}
+            busy = {worker.pipe: worker for worker in self._workers if worker.asked}
             if not busy:
                 return
             for pipe in wait(list(busy)):
@@ -153,16 +153,16 @@ class Processes:
                     row: Row = pipe.recv()
                 except (EOFError, OSError):
                     fruitless += 1
-                    yield from self._bury(worker, waiting, deaths)
+                    yield from self._handle_death(worker, waiting, deaths)
                     if fruitless == FRUITLESS:
                         raise BackendError(
                             f"{FRUITLESS} worker processes in a row died "
                             f"({_how(worker.process)}); is there enough memory? "
                             "Finished trials are kept, and the same command runs the rest"
                         ) from None
-                    self._crew.remove(worker)
-                    self._crew.append(_hire())
-                    idle.append(self._crew[-1])
+                    self._workers.remove(worker)
+                    self._workers.append(_start_worker())
+                    idle.append(self._workers[-1])
                     continue
                 fruitless = 0
                 worker.asked.popleft()
@@ -170,7 +170,7 @@ class Processes:
                     idle.append(worker)
                 yield row
 
-    def _bury(
+    def _handle_death(
         self, worker: _Worker, waiting: deque[list[TrialSpec]], deaths: dict[TrialSpec, int]
     ) -> Iterator[Row]:
         """Requeue what a dead worker did not do; a trial that killed two workers is lost."""
@@ -195,7 +195,7 @@ def _how(process: BaseProcess) -> str:
     return signal.Signals(-code).name if code < 0 else f"exit code {code}"
 
 
-def _hire() -> _Worker:
+def _start_worker() -> _Worker:
     """Start a worker with its own environment."""
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
     os.environ.update(_ENVIRONMENT)

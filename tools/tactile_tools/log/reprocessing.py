@@ -32,7 +32,7 @@ from tactile_tools.log.sources import FILE, Series
 from tactile_tools.log.stream import Attachment, Reading, Record, Stream, read_series
 from tactile_tools.log.terminal import FAULTY, ToolError
 from tactile_tools.log.writing import LogOutput
-from tactiled.calibration_store import Shelf
+from tactiled.calibration_store import CalibrationStore
 from tactiled.journal import STATE_PREFIX, RecordedState, recorded_state
 from tactiled.rerun import (
     PIPELINE,
@@ -216,18 +216,18 @@ class Reprocessing:
         self._settings = settings
         ports = max(1, len(known.ports))
         strict = any(port.strict for port in known.ports.values()) or len(given) >= ports
-        shelf = Shelf((), strict=strict)
+        store = CalibrationStore((), strict=strict)
         own = {calibration.serial_number for calibration in given}
         for name, calibration in known.first.items():
             if calibration.serial_number not in own:
-                shelf.add(Path(f"{name}{SUFFIX} of the log"), calibration)
+                store.add(Path(f"{name}{SUFFIX} of the log"), calibration)
         for calibration in given:
-            shelf.add(Path(f"calibration of {calibration.serial_number}"), calibration)
+            store.add(Path(f"calibration of {calibration.serial_number}"), calibration)
         versions = {h: c for h, c in known.versions.items() if c.serial_number not in own}
         for name in sorted(known.raw):
             self.reruns[name] = Rerun(
                 known.ports.get(name, RecordedPort(name)),
-                shelf,
+                store,
                 settings,
                 self.sink,
                 journal=name in known.journals,
@@ -253,11 +253,11 @@ class Reprocessing:
         """Process what is held back, and attach the given calibrations that were used."""
         for rerun in self.reruns.values():
             rerun.end()
-            for station in rerun.stations:
-                choice = station.choice
+            for board in rerun.boards:
+                choice = board.choice
                 if choice is not None and choice.calibration.serial_number in self._given:
                     data = saves(choice.calibration).encode()
-                    name = f"{station.name}{SUFFIX}"
+                    name = f"{board.name}{SUFFIX}"
                     now = self.sink.wall.wall_ns(self.sink.now())
                     output.attach(Attachment.of(name, "application/toml", now, now, data))
 
@@ -269,7 +269,7 @@ class Reprocessing:
                 for topic in self.sink.compare.before
                 if (found := find_topic(topic)) is not None and self._belongs(found[1], name)
             }
-            made = any(station.sent for station in rerun.stations)
+            made = any(board.sent for board in rerun.boards)
             if rerun.chunks and not made and (boards or not rerun.exact):
                 raise ToolError(
                     f"{series.name}: nothing can be made of the raw bytes of {name}: the file does "

@@ -29,10 +29,10 @@ from tactile_core.bus.topics import FEATURES, Topic
 from tactile_core.types import NS_PER_S, Instant, WallClock
 from tactile_tools.dev.fuzzers.messages import random_messages
 from tactiled.blocks import Chunk
-from tactiled.board_session import Station
+from tactiled.board_session import BoardSession
 from tactiled.boards.events import Identity, Refusal
 from tactiled.boards.line import bus_names, make_line
-from tactiled.calibration_store import Shelf
+from tactiled.calibration_store import CalibrationStore
 from tactiled.port import Port
 from tactiled.reader import Inbox, PortLost, PortOpened, Wake
 from tactiled.rerun import RecordedSource
@@ -56,7 +56,7 @@ MUTATED_SHARE = 0.5
 EXTREMES = (0x00, 0xFF, 0x7F, 0x80, 0x01)
 FLOATS = (math.nan, math.inf, -math.inf, 3.4e38, -3.4e38, 1e-40, -0.0, 0.0, 65535.0, -32768.0, 1e9)
 NODE = 5
-MAX_STATIONS = 128
+MAX_BOARDS = 128
 """Most boards of a port: the addresses of a CAN bus. A larger table grows without bound."""
 
 
@@ -128,9 +128,9 @@ class PipelineFuzzer:
         calibrations = []
         if kind != "floats":
             calibrations.append(factory_calibration("finger", self._seed))
-        shelf = Shelf((), strict=False)
+        store = CalibrationStore((), strict=False)
         for calibration in calibrations:
-            shelf.add(Path(calibration.serial_number), calibration)
+            store.add(Path(calibration.serial_number), calibration)
         self._source = Source(medium)
         self._inbox = Inbox(Wake(), limit=1024)
         line = make_line(
@@ -150,12 +150,12 @@ class PipelineFuzzer:
             self._source,
             self._inbox,
             lambda nodes, late: bus_names("fuzz", {}, nodes, late),
-            lambda _port, _node, name: Station(name, self.sink, shelf, PipelineSettings()),
+            lambda _port, _node, name: BoardSession(name, self.sink, store, PipelineSettings()),
             True,
             None,
         )
         if kind != "can":
-            self.port.add_station(0, "fuzz")
+            self.port.add_board(0, "fuzz")
         self._pool = [(m, pack(m, NODE)) for m in random_messages(rng, 300)]
         self._transfers: Counter[int] = Counter()
         self._texts = 0
@@ -198,15 +198,15 @@ class PipelineFuzzer:
         for _ in range(round(RECOVERY_S)):
             before = self.sink.features
             self._run(1.0, hostile=False)
-            served = [s for s in self.port.stations.values() if s.state == "streaming"]
+            served = [s for s in self.port.boards.values() if s.state == "streaming"]
             if served and self.sink.features > before:
                 return
-        states = {node: station.state for node, station in self.port.stations.items()}
+        states = {node: board.state for node, board in self.port.boards.items()}
         raise PipelineFailure(f"no honest board in service after {RECOVERY_S:g} s: {states}")
 
     def _check_bounds(self) -> None:
-        if len(self.port.stations) > MAX_STATIONS:
-            raise PipelineFailure(f"{len(self.port.stations)} boards on one port")
+        if len(self.port.boards) > MAX_BOARDS:
+            raise PipelineFailure(f"{len(self.port.boards)} boards on one port")
 
     def _step(self, *, hostile: bool) -> None:
         self.now = self.sink.moment = Instant(self.now + STEP_NS)
@@ -220,8 +220,8 @@ class PipelineFuzzer:
             self._inbox.put(Chunk(self.now, payload))
         self.port.pump(Instant(self.now + 100_003))
         if self.now % NS_PER_S < STEP_NS:
-            for station in list(self.port.stations.values()):
-                station.each_second(self.now)
+            for board in list(self.port.boards.values()):
+                board.each_second(self.now)
 
     # Mutations of a frame
 

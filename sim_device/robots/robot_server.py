@@ -37,7 +37,7 @@ class FaultError(ValueError):
 
 
 class Emulated(Protocol):
-    """A vendor's controller, as a station drives it."""
+    """A vendor's controller, as a server drives it."""
 
     plant: Plant
 
@@ -93,8 +93,8 @@ class WorldOnBus:
         self._publisher.put(self._codec.encode(WORLD, markers), wall_ns)
 
 
-class RobotStation:
-    """A `sim_device.runner.Station`. ``control``: take faults from standard input, a line each."""
+class RobotServer:
+    """A `sim_device.runner.PortServer`. ``control``: take faults from standard input, by line."""
 
     def __init__(
         self,

@@ -293,7 +293,7 @@ def test_board_refusing_the_rate_is_refused(
 
 def test_closing_the_link_stops_the_board(rig: Rig) -> None:
     rig.run(1.0)
-    rig.link.farewell()
+    rig.link.stop_streaming()
     rig.run(0.01)
     assert any(isinstance(m, Stop) for m in rig.board.heard)
     assert not rig.board.streaming

@@ -17,7 +17,7 @@ from sensor_proto.slcan import SlcanDecoder, encode_frame
 from sim_device.board.catalogue import identity
 from sim_device.faults import Window
 from sim_device.ports_plan import BoardsRequest, Planned, parse_serial, parse_window, plan_boards
-from sim_device.runner import CanStation, Runner, SerialStation
+from sim_device.runner import CanServer, Runner, SerialServer
 from sim_device.skin.indenter import load_script
 from sim_device.status import StatusLine
 from tactile_core.can_bus import CanSpec
@@ -61,9 +61,9 @@ def test_press_and_rotation_continue_while_board_is_unplugged(
     script = tmp_path / "press.toml"
     script.write_text(PRESS)
     (plan, _) = plan_boards(replace(request_of, press=script, rotate="90deg/10s@z"))
-    assert isinstance(plan.station, SerialStation)
-    board: Any = plan.station.board
-    replugged: Any = plan.station._make_board(4.0)
+    assert isinstance(plan.server, SerialServer)
+    board: Any = plan.server.board
+    replugged: Any = plan.server._make_board(4.0)
     expected = load_script(script)
     for seconds in (0.0, 5.25, 6.0):
         forces = [c.force for c in board.contacts(seconds)]
@@ -79,16 +79,16 @@ def test_press_and_rotation_continue_while_board_is_unplugged(
 def test_unpowered_board_disappears_and_reboots(request_of: BoardsRequest) -> None:
     wanted = replace(request_of, ptys=request_of.ptys[:1], unplugged=(Window(1.0, 0.5),))
     (plan,) = plan_boards(wanted)
-    station = plan.station
-    assert isinstance(station, SerialStation)
-    station.open()
+    server = plan.server
+    assert isinstance(server, SerialServer)
+    server.open()
     boards = []
     for step in range(20):
-        station.service(after(START, 0.1 * step))
-        boards.append(station.board if station.port.is_open else None)
+        server.service(after(START, 0.1 * step))
+        boards.append(server.board if server.port.is_open else None)
     assert [k for k, board in enumerate(boards) if board is None] == [10, 11, 12, 13, 14]
     assert boards[9] is not boards[15]
-    station.close()
+    server.close()
 
 
 def stepped(plan: Planned, host: SerialTransport, seconds: float, ask: bytes) -> tuple[Any, Any]:
@@ -97,7 +97,7 @@ def stepped(plan: Planned, host: SerialTransport, seconds: float, ask: bytes) ->
     for step in range(round(seconds / 0.001)):
         if step == 300:
             host.write(ask)
-        plan.station.service(after(START, 0.001 * step))
+        plan.server.service(after(START, 0.001 * step))
         chunk = host.read(0)
         if chunk is not None:
             assert isinstance(chunk.payload, bytes)
@@ -111,8 +111,8 @@ def ask_can(node: int) -> bytes:
 
 def test_overloaded_bus_loses_whole_cycles_and_corrupts_no_message(tmp_path: Path) -> None:
     (plan,) = plan_boards(BoardsRequest(slcans=(tmp_path / "can0",)))
-    assert isinstance(plan.station, CanStation)
-    plan.station.open()
+    assert isinstance(plan.server, CanServer)
+    plan.server.open()
     host = SerialTransport(str(tmp_path / "can0"))
     host.open()
     host.write(b"S6\rO\r")  # 500 kbit/s for a board that makes 1.3 Mbit/s
@@ -122,41 +122,41 @@ def test_overloaded_bus_loses_whole_cycles_and_corrupts_no_message(tmp_path: Pat
     assert 20 < len(cycles) < 80  # of 170; 500 kbit/s carry some 33 a second
     assert all(sequences.count(s) == 3 for s in cycles[:-1])
     assert {name: count for name, count in counters.items() if count} == {"accepted": len(received)}
-    losses = plan.station.losses
+    losses = plan.server.losses
     assert losses["bus_overrun"] == 0
-    made = plan.station.boards[0].counters["cycles"]
+    made = plan.server.boards[0].counters["cycles"]
     assert 0 <= made - len(cycles) - losses["overruns"] < 16  # those are still on their way
     host.close()
-    plan.station.close()
+    plan.server.close()
 
 
 def test_bus_off_of_a_board_reaches_the_adapter(tmp_path: Path) -> None:
     (plan,) = plan_boards(BoardsRequest(slcans=(tmp_path / "can0",), faults="busoff@0.5s+0.2s"))
-    station = plan.station
-    assert isinstance(station, CanStation)
-    station.open()
+    server = plan.server
+    assert isinstance(server, CanServer)
+    server.open()
     host = SerialTransport(str(tmp_path / "can0"))
     host.open()
     host.write(b"S8\rO\r")
-    adapter: Any = station.port
+    adapter: Any = server.port
     states = []
     for step in range(900):
-        station.service(after(START, 0.001 * step))
+        server.service(after(START, 0.001 * step))
         host.read(0)
         states.append(adapter.adapter.state)
     assert states[490] is BusState.ACTIVE
     assert states[510] is BusState.BUS_OFF
     assert states[-1] is BusState.BUS_OFF  # until the host opens the channel again
     host.write(b"C\rO\r")
-    station.service(after(START, 1.0))
+    server.service(after(START, 1.0))
     assert adapter.adapter.state is BusState.ACTIVE
     host.close()
-    station.close()
+    server.close()
 
 
 def test_failed_port_closes_all_other_ports(request_of: BoardsRequest) -> None:
     request_of.ptys[1].write_text("in the way")
-    runner = Runner([plan.station for plan in plan_boards(request_of)])
+    runner = Runner([plan.server for plan in plan_boards(request_of)])
     with pytest.raises(Exception, match="exists and is not a link"):
         runner.open()
     assert not request_of.ptys[0].is_symlink()
@@ -177,29 +177,29 @@ def test_serial_numbers_are_padded_and_validated() -> None:
 
 
 def test_virtual_buses_can_be_served() -> None:
-    spec = CanSpec.parse("virtual:stations+fd")
+    spec = CanSpec.parse("virtual:servers+fd")
     (plan,) = plan_boards(BoardsRequest(cans=(spec,), nodes=(7,)))
-    assert plan.connect == "tactiled --can virtual:stations+fd"
-    plan.station.open()
+    assert plan.connect == "tactiled --can virtual:servers+fd"
+    plan.server.open()
     for step in range(400):
-        plan.station.service(after(START, 0.001 * step))
-    assert plan.station.sent > 0  # its log line and status
-    plan.station.close()
+        plan.server.service(after(START, 0.001 * step))
+    assert plan.server.sent > 0  # its log line and status
+    plan.server.close()
 
 
 def test_status_line_is_shown_only_on_a_terminal(
     request_of: BoardsRequest, capsys: pytest.CaptureFixture[str]
 ) -> None:
     planned = plan_boards(replace(request_of, ptys=request_of.ptys[:1]))
-    station: Any = planned[0].station
+    server: Any = planned[0].server
     terminal, pipe = io.StringIO(), io.StringIO()
     for stream, terminal_like in ((terminal, True), (pipe, False)):
-        station.sent = 0
+        server.sent = 0
         console = Console(file=stream, force_terminal=terminal_like, width=160)
         with StatusLine(planned, console) as status:
             status.show_at(0.0)
-            station.sent = 50
-            station.port.send(b"abc")  # it is closed: lost
+            server.sent = 50
+            server.port.send(b"abc")  # it is closed: lost
             status.show_at(0.5)
     status.sum_up()
     name = str(request_of.ptys[0])
