@@ -168,7 +168,7 @@ def replay(arguments: argparse.Namespace) -> int:
     from sim_device.faults import FaultPlan
     from sim_device.ports import PtyPort
     from sim_device.ports_plan import Planned
-    from sim_device.runner import ReplayServer
+    from sim_device.runner import ReplayPortServer
 
     try:
         recording = load(arguments.recording)
@@ -187,7 +187,7 @@ def replay(arguments: argparse.Namespace) -> int:
         "begins when a host reads"
     )
     link = arguments.pty
-    server = ReplayServer(PtyPort(link), board)
+    server = ReplayPortServer(PtyPort(link), board)
     plan = Planned(server, str(link), f"tactiled --port {link} --kind anyskin", (line,))
     return _serve([plan], arguments)
 

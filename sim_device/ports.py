@@ -64,7 +64,7 @@ class PtyPort:
 
     def __init__(self, link: str | Path) -> None:
         self.link = Path(link)
-        self._claim: socket.socket | None = None
+        self._reservation: socket.socket | None = None
         self._master = self._slave = -1
         self._backlog: deque[bytes] = deque()
         self._backlog_bytes = 0
@@ -89,7 +89,7 @@ class PtyPort:
     @property
     def unread(self) -> int:
         """Bytes that no host has read yet."""
-        return self._backlog_bytes + (_waiting(self._slave) if self.is_open else 0)
+        return self._backlog_bytes + (_unread_bytes(self._slave) if self.is_open else 0)
 
     def fileno(self) -> int:
         """Descriptor that is readable when a host has written; −1 while closed."""
@@ -97,7 +97,7 @@ class PtyPort:
 
     def open(self) -> None:
         """Make the terminal and the link. Raises `LinkRefused`, or OSError (no such folder)."""
-        self._claim = _claim(self.link)
+        self._reservation = _reserve(self.link)
         try:
             _check_replaceable(self.link)
             self._master, self._slave = os.openpty()
@@ -117,9 +117,9 @@ class PtyPort:
             os.close(self._slave)
             os.close(self._master)
         self._master = self._slave = -1
-        if self._claim is not None:
-            self._claim.close()
-            self._claim = None
+        if self._reservation is not None:
+            self._reservation.close()
+            self._reservation = None
         self._backlog.clear()
         self._backlog_bytes = 0
         self._begun = False
@@ -151,7 +151,7 @@ class PtyPort:
     def flush(self) -> None:
         """Pass on what the terminal takes now."""
         while self._backlog:
-            room = PTY_ROOM - _waiting(self._slave)
+            room = PTY_ROOM - _unread_bytes(self._slave)
             if room <= 0:
                 return
             oldest = self._backlog.popleft()
@@ -213,7 +213,7 @@ class SlcanPort:
         data = []
         for frame in frames:
             if frame.error:
-                self._suffer(frame)
+                self._apply_error_frame(frame)
             else:
                 data.append(frame)
         if self.adapter.is_open:
@@ -234,7 +234,7 @@ class SlcanPort:
         self.adapter.set_bus_off(fault)
         self._answer()
 
-    def _suffer(self, frame: CanFrame) -> None:
+    def _apply_error_frame(self, frame: CanFrame) -> None:
         state = can_transfers.reported_state(frame)
         if state is not None:
             self.adapter.set_bus_off(state is BusState.BUS_OFF)
@@ -321,11 +321,11 @@ class VirtualCanPort(PythonCanPort):
         super().__init__(CanSpec("virtual", channel, fd=fd))
 
 
-def _waiting(slave: int) -> int:
+def _unread_bytes(slave: int) -> int:
     return int(struct.unpack("i", fcntl.ioctl(slave, termios.FIONREAD, b"\0\0\0\0"))[0])
 
 
-def _claim(link: Path) -> socket.socket | None:
+def _reserve(link: Path) -> socket.socket | None:
     """Reserve ``link`` for this process until it ends. None where the system has no such names.
 
     An abstract socket name leaves no file behind and is free again after a kill.
@@ -333,13 +333,13 @@ def _claim(link: Path) -> socket.socket | None:
     if not sys.platform.startswith("linux"):
         return None
     place = str(link.parent.resolve() / link.name).encode()
-    claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    reservation = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:
-        claim.bind(b"\0simdevice-" + hashlib.sha256(place).hexdigest().encode())
+        reservation.bind(b"\0simdevice-" + hashlib.sha256(place).hexdigest().encode())
     except OSError as error:
-        claim.close()
+        reservation.close()
         raise LinkRefused(f"{link} is served by another simdevice", foreign=False) from error
-    return claim
+    return reservation
 
 
 def _check_replaceable(link: Path) -> None:

@@ -13,10 +13,10 @@ from sensor_proto.anyskin import MAX_MAGNETOMETERS
 from sensor_proto.can_transfers import CanFrame
 from sim_device.board.anyskin import CONVERSION_RATE, LOOP_RATE, AnySkinBoard, writer_of
 from sim_device.board.catalogue import build_skin, identity
-from sim_device.board.firmware import DEFAULT_RATE, BoardOptions, CanBoard, Identity, SerialBoard
+from sim_device.board.firmware import DEFAULT_RATE_HZ, BoardOptions, CanBoard, Identity, SerialBoard
 from sim_device.faults import FaultPlan, Window
 from sim_device.ports import PtyPort, PythonCanPort, SlcanPort
-from sim_device.runner import Board, CanServer, MakeBoard, PortServer, SerialServer
+from sim_device.runner import Board, CanPortServer, MakeBoard, PortServer, SerialPortServer
 from sim_device.skin.environment import (
     AttitudeScript,
     Environment,
@@ -76,7 +76,7 @@ class BoardsRequest:
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """PortServer not yet open. ``lines``: what to tell the user about each of its boards.
+    """Port server that is not yet open. ``lines``: what to tell the user about each of its boards.
 
     ``connect``: the command that reads it. ``note``: gives its state for a status line.
     """
@@ -147,37 +147,37 @@ def plan_boards(request: BoardsRequest) -> list[Planned]:
         raise ValueError("--unplug on a CAN bus; it is for --pty (for CAN: --faults busoff@5s+1s)")
     if len(request.serials) > count:
         raise ValueError(f"{len(request.serials)} serial numbers given for {count} boards")
-    maker = _Maker(request)
-    planned = [_plan_serial(maker, number, link) for number, link in enumerate(request.ptys)]
+    factory = _BoardFactory(request)
+    planned = [_plan_serial(factory, number, link) for number, link in enumerate(request.ptys)]
     number = len(request.ptys)
     for port, spec in buses:
-        planned.append(_plan_bus(maker, number, port, spec))
+        planned.append(_plan_bus(factory, number, port, spec))
         number += len(request.nodes)
     return planned
 
 
-def _plan_serial(maker: _Maker, number: int, link: Path) -> Planned:
-    request = maker.request
+def _plan_serial(factory: _BoardFactory, number: int, link: Path) -> Planned:
+    request = factory.request
     anyskin = request.board == "anyskin"
-    make: MakeBoard[bytes] = maker.anyskin(number) if anyskin else maker.serial(number)
+    make: MakeBoard[bytes] = factory.anyskin(number) if anyskin else factory.serial(number)
     connect = f"tactiled --port {link}" + (" --kind anyskin" if anyskin else "")
     if request.format and not request.format.endswith("-text"):
         connect = f"tactiled --port {link} --kind {request.format}"
-    server = SerialServer(PtyPort(link), make, request.unplugged)
-    return Planned(server, str(link), connect, (maker.describe(number),))
+    server = SerialPortServer(PtyPort(link), make, request.unplugged)
+    return Planned(server, str(link), connect, (factory.describe(number),))
 
 
 def _plan_bus(
-    maker: _Maker, number: int, port: SlcanPort | PythonCanPort, spec: CanSpec
+    factory: _BoardFactory, number: int, port: SlcanPort | PythonCanPort, spec: CanSpec
 ) -> Planned:
-    nodes = maker.request.nodes
+    nodes = factory.request.nodes
     share = None if spec.bitrate is None else BUS_SHARE * spec.bitrate / len(nodes)
-    makes = [maker.can(number + k, node, spec.fd, share) for k, node in enumerate(nodes)]
-    lines = tuple(f"{maker.describe(number + k)}, node {node}" for k, node in enumerate(nodes))
-    return Planned(CanServer(port, makes), str(spec), f"tactiled --can {spec}", lines)
+    makes = [factory.can(number + k, node, spec.fd, share) for k, node in enumerate(nodes)]
+    lines = tuple(f"{factory.describe(number + k)}, node {node}" for k, node in enumerate(nodes))
+    return Planned(CanPortServer(port, makes), str(spec), f"tactiled --can {spec}", lines)
 
 
-class _Maker:
+class _BoardFactory:
     """Makes boards by number. Errors in the request are raised before any port opens."""
 
     def __init__(self, request: BoardsRequest) -> None:
@@ -263,7 +263,7 @@ class _Maker:
             environment=Environment(self._parameters, lambda s: turn(s + powered)),
             contacts=self._contacts(powered),
             plan=plan,
-            rate=self.request.rate or DEFAULT_RATE,
+            rate=self.request.rate or DEFAULT_RATE_HZ,
         )
 
     def _contacts(self, powered: float) -> Callable[[float], Sequence[Contact]] | tuple[()]:

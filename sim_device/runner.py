@@ -13,24 +13,24 @@ from sim_device.faults import Window
 from sim_device.ports import PtyPort, PythonCanPort, SlcanPort
 from tactile_core.types import Instant, after, monotonic_now, seconds_between
 
-TICK = 0.001
+TICK_S = 0.001
 """Seconds between two ticks: the period of a USB frame. No sample waits longer."""
 
-STATUS_PERIOD = 0.5
+STATUS_PERIOD_S = 0.5
 """Seconds between two calls of the status function."""
 
-LONGEST_WAIT = 0.05
+LONGEST_WAIT_S = 0.05
 """Longest time, s, that a board waits for a full terminal. After that the board goes on and the
 port drops the oldest data, so that a host that comes back gets nothing older. A full bus always
 empties, so there is no limit on a bus."""
 
-STALL = 0.1
+STALL_S = 0.1
 """Seconds that a full port may last before a replay's later rows are moved back by that time."""
 
-DRAIN_TIME = 2.0
+DRAIN_S = 2.0
 """Seconds that the last frames of a replay wait for their reader."""
 
-SETTLE_TIME = 0.25
+SETTLE_S = 0.25
 """Seconds for written bytes to show as unread: the kernel delivers them later, on a busy machine
 much later. Without this wait, a replay would begin before anybody reads, and end before all is
 read."""
@@ -84,7 +84,7 @@ class PortServer(Protocol):
         """Pass on everything that is due."""
 
 
-class SerialServer:
+class SerialPortServer:
     """Board on a pseudo-terminal. ``unplugged``: when it has neither power nor port."""
 
     def __init__(
@@ -96,7 +96,7 @@ class SerialServer:
         self._make_board = make_board
         self._unplugged = tuple(unplugged)
         self._start: Instant | None = None
-        self._feeder = _Feeder[bytes](LONGEST_WAIT)
+        self._feeder = _Feeder[bytes](LONGEST_WAIT_S)
 
     @property
     def losses(self) -> dict[str, int]:
@@ -130,7 +130,7 @@ class SerialServer:
             return
         if not self.port.is_open:
             self.board = self._make_board(elapsed)
-            self._feeder = _Feeder(LONGEST_WAIT)
+            self._feeder = _Feeder(LONGEST_WAIT_S)
             self.port.open()
         data = self.port.receive()
         if data:
@@ -142,7 +142,7 @@ class SerialServer:
             self.port.send(out)
 
 
-class CanServer:
+class CanPortServer:
     """Boards on one CAN bus."""
 
     def __init__(
@@ -194,7 +194,7 @@ class CanServer:
                 self.port.send(out, now)
 
 
-class ReplayServer:
+class ReplayPortServer:
     """Recording on a pseudo-terminal. Nothing of it is lost: it begins when a host reads, and
     waits while no host does."""
 
@@ -203,8 +203,8 @@ class ReplayServer:
         self.board = board
         self._ended: Instant | None = None
         self._full: Instant | None = None
-        self._probed_at: Instant | None = None
-        self._probe_waiting = False
+        self._probed: Instant | None = None
+        self._probe_seen = False
         self._now = Instant(0)
 
     @property
@@ -219,11 +219,11 @@ class ReplayServer:
 
     @property
     def finished(self) -> bool:
-        """Whether the last frame was read, or nobody read it for `DRAIN_TIME`."""
+        """Whether the last frame was read, or nobody read it for `DRAIN_S`."""
         if self._ended is None:
             return False
         waited = seconds_between(self._ended, self._now)
-        return waited > (DRAIN_TIME if self.port.unread else SETTLE_TIME)
+        return waited > (DRAIN_S if self.port.unread else SETTLE_S)
 
     def fileno(self) -> int:
         """Descriptor of the port; −1 while closed."""
@@ -248,25 +248,25 @@ class ReplayServer:
         if self._full is not None:
             stalled = seconds_between(self._full, now)
             self._full = None
-            if stalled > STALL:
+            if stalled > STALL_S:
                 self.board.postpone(stalled)
         out = self.board.tick(now)
         self.port.send(out)
-        if not self.board.started and self._probe_was_read(now):
+        if not self.board.started and self._probe_is_read(now):
             self.board.start(now)
         if self.board.finished and self._ended is None:
             self._ended = now
 
-    def _probe_was_read(self, now: Instant) -> bool:
-        self._probed_at = self._probed_at or now
+    def _probe_is_read(self, now: Instant) -> bool:
+        self._probed = self._probed or now
         if self.port.unread:
-            self._probe_waiting = True
+            self._probe_seen = True
             return False
-        return self._probe_waiting or seconds_between(self._probed_at, now) > SETTLE_TIME
+        return self._probe_seen or seconds_between(self._probed, now) > SETTLE_S
 
 
 class Runner:
-    """Runs port servers on an absolute grid of `TICK` until told to stop."""
+    """Serves ports on an absolute grid of `TICK_S` until told to stop."""
 
     def __init__(self, servers: Sequence[PortServer]) -> None:
         self.servers = tuple(servers)
@@ -296,7 +296,7 @@ class Runner:
     ) -> None:
         """Serve until ``stopping()``, for ``duration`` s, or until every server has finished.
 
-        ``on_status``: called with the seconds since the start every `STATUS_PERIOD`.
+        ``on_status``: called with the seconds since the start every `STATUS_PERIOD_S`.
         """
         start = tick = monotonic_now()
         status = start
@@ -311,8 +311,8 @@ class Runner:
                 return
             if on_status is not None and now >= status:
                 on_status(elapsed)
-                status = after(now, STATUS_PERIOD)
-            tick = after(tick, TICK)
+                status = after(now, STATUS_PERIOD_S)
+            tick = after(tick, TICK_S)
             if tick < now:
                 tick = now  # late: the boards catch up by themselves, without extra ticks
             self._wait(seconds_between(monotonic_now(), tick))

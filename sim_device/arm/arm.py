@@ -28,11 +28,11 @@ from tactile_core.types import (
 
 STEP_NS: Final = round(PHYSICS_STEP * NS_PER_S)
 
-MAX_EXPIRY: Final = 0.075
+MAX_EXPIRY_S: Final = 0.075
 """Longest time, s, that a command holds. Braking takes up to 20 ms, so the arm rests within 100 ms
 of its last command."""
 
-DEFAULT_EXPIRY: Final = 0.05
+DEFAULT_EXPIRY_S: Final = 0.05
 """Seconds that a command holds by default: five cycles of a controller at 100 Hz."""
 
 MAX_PENDING: Final = 64
@@ -220,13 +220,13 @@ class SimulatedArm:
         self,
         twist: Twist,
         now: Instant,
-        expiry: float = DEFAULT_EXPIRY,
+        expiry: float = DEFAULT_EXPIRY_S,
         echo: Echo | None = None,
     ) -> bool:
         """Move at ``twist`` until ``expiry`` s from ``now``, or until the next command.
 
         ``echo``: what states report of the command once it is in force. Longer expiries are cut to
-        `MAX_EXPIRY`, speeds to the limits.
+        `MAX_EXPIRY_S`, speeds to the limits.
 
         Returns False, counts the command and stops the arm where it refuses: a twist that is not
         finite, an expiry that is not finite or not above 0, or an arm that is not enabled.
@@ -237,7 +237,7 @@ class SimulatedArm:
             return self._refuse("bad_expiry")
         if self._latched is not None:
             return self._refuse("not_enabled")
-        expiry = min(expiry, MAX_EXPIRY)
+        expiry = min(expiry, MAX_EXPIRY_S)
         effective = after(now, self._settings.command_latency)
         if len(self._pending) == MAX_PENDING:
             self._pending.popleft()
@@ -258,7 +258,7 @@ class SimulatedArm:
             end = self._next_change(at, end)
             target = self._active.twist if self._active is not None else ZERO
             if self._faults:
-                target = self._misunderstood(target)
+                target = self._distorted(target)
             self._world.step((end - at) / NS_PER_S, target)
             self._clock = end
             if end == self._next_state:
@@ -309,7 +309,7 @@ class SimulatedArm:
         self.counters["clamped"] += 1
         return Twist(twist.vx * scale, twist.vy * scale, omega)
 
-    def _misunderstood(self, twist: Twist) -> Twist:
+    def _distorted(self, twist: Twist) -> Twist:
         """Twist that an arm with faults of mounting or scale makes of ``twist``."""
         if ArmFault.BACKWARDS in self._faults:
             twist = Twist(-twist.vx, -twist.vy, -twist.omega)

@@ -2,7 +2,7 @@
 
 The world keeps to the host's clock. If the process was held up, the missed steps are made up for at
 once, in order, so nothing ever jumps: a controller sees old states with their true, old stamps,
-then new ones. Beyond `MAX_CATCH_UP` the world is suspended for the rest. That is longer than any
+then new ones. Beyond `MAX_CATCH_UP_S` the world is suspended for the rest. That is longer than any
 command holds: the arm has come to rest before, so nothing moves meanwhile.
 """
 
@@ -23,12 +23,12 @@ from sim_device.world.touch import on_skin
 from tactile_core.geometry import TIP_X
 from tactile_core.types import NS_PER_S, ArmLimits, ArmState, Echo, Instant, Twist, seconds_between
 
-COMMAND_EXPIRY: Final = 0.045
+COMMAND_EXPIRY_S: Final = 0.045
 """Longest time, s, that a command holds from its receipt, however much of its own expiry is left.
 With its braking, the period of states and the way over the bus, an observer sees the arm at rest
 within 100 ms of the last command; with 50 ms the longest of twenty times was 101 ms."""
 
-MAX_CATCH_UP: Final = 0.25
+MAX_CATCH_UP_S: Final = 0.25
 """Longest time, s, that is made up for: 3 ms of work, and three times what a command may hold."""
 
 
@@ -120,18 +120,18 @@ class Cupboard:
         if behind >= 2 * STEP_NS:
             self._late["late_steps"] += behind // STEP_NS - 1
         states: list[ArmState] = []
-        excess = behind - round(MAX_CATCH_UP * NS_PER_S)
+        excess = behind - round(MAX_CATCH_UP_S * NS_PER_S)
         if excess > 0:
-            states = self._moved_on(Instant(arm.now + behind - excess))
+            states = self._advance_arm(Instant(arm.now + behind - excess))
             self._suspended += excess
-        return states + self._moved_on(Instant(now - self._suspended))
+        return states + self._advance_arm(Instant(now - self._suspended))
 
     def command(
         self,
         twist: Twist,
         now: Instant,
         waited: float,
-        left: float = COMMAND_EXPIRY,
+        left: float = COMMAND_EXPIRY_S,
         echo: Echo | None = None,
     ) -> bool:
         """Obey ``twist`` for ``left`` s more; False if refused. Call it after `advance` to ``now``.
@@ -139,7 +139,7 @@ class Cupboard:
         The command arrived at most ``waited`` s before ``now``, and holds no longer than if it had
         arrived that early.
         """
-        expiry = min(left, COMMAND_EXPIRY - waited)
+        expiry = min(left, COMMAND_EXPIRY_S - waited)
         if expiry <= 0:
             self._late["late_commands"] += 1
             return False
@@ -176,7 +176,7 @@ class Cupboard:
         self._world, self._arm = world, new
         self.resets += 1
 
-    def _moved_on(self, simulated: Instant) -> list[ArmState]:
+    def _advance_arm(self, simulated: Instant) -> list[ArmState]:
         """States up to an instant of the simulation, restamped with the host's time."""
         states = self.arm.advance(simulated)
         if not self._suspended:

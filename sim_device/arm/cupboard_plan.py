@@ -41,7 +41,7 @@ def scene_of(request: CupboardRequest) -> Scene:
         raise SceneError(f"{request.scene}: {error}; take another seed") from error
 
 
-def _another(request: CupboardRequest, seed: int) -> Scene:
+def _with_seed(request: CupboardRequest, seed: int) -> Scene:
     """The same kind of scene with ``seed``. SceneError or ValueError if there is none."""
     if request.scene.endswith(".json"):
         raise SceneError(f"{request.scene} is one scene: leave the seed out to begin it again")
@@ -65,7 +65,7 @@ def plan_cupboard(request: CupboardRequest) -> list[Planned]:
         np.random.default_rng([request.boards.seed, 2]),
     )
     server = ArmServer(
-        cupboard, request.arm, request.world, request.bus, partial(_another, request), make_world
+        cupboard, request.arm, request.world, request.bus, partial(_with_seed, request), make_world
     )
     boards: list[Planned] = []
     if request.boards.ptys or request.boards.slcans:  # without boards the arm runs on its own

@@ -29,7 +29,7 @@ from tactile_core.types import ArmLimits, Echo, Instant, WallClock, after, secon
 # Faults, noise and latency of the simulated arm as a user writes them.
 
 
-PRESS: Final = 0.2
+PRESS_S: Final = 0.2
 """Seconds that the button is pressed, or the drives report a fault, when no time is given."""
 
 MOMENTARY = (ArmFault.ESTOP, ArmFault.FAULT)
@@ -45,7 +45,7 @@ NOISES: Final = {
 }
 """Noise by name: field of `ArmSettings`, and unit."""
 
-MAX_LATENCY: Final = 0.04
+MAX_LATENCY_S: Final = 0.04
 """Longest latency each way, s. Commands expire 0.05 s after their receipt, so a longer one would
 leave them without effect."""
 
@@ -64,7 +64,7 @@ def _fault(text: str) -> ScheduledFault:
     if match is None or match["kind"] not in tuple(ArmFault):
         raise ValueError(f"arm fault {text!r} is not understood; {allowed}")
     kind = ArmFault(match["kind"])
-    lasting = PRESS if kind in MOMENTARY else math.inf
+    lasting = PRESS_S if kind in MOMENTARY else math.inf
     duration = float(match["for"]) if match["for"] else lasting
     if duration == 0:
         raise ValueError(f"arm fault {text!r} lasts 0 s; {allowed}")
@@ -90,9 +90,9 @@ def parse_noise(text: str) -> dict[str, Any]:
 
 def arm_settings(rate: float, latency: float, noise: str) -> ArmSettings:
     """Settings for ``latency`` s each way and noise as `parse_noise` takes it; ValueError."""
-    if not 0 <= latency <= MAX_LATENCY:
+    if not 0 <= latency <= MAX_LATENCY_S:
         raise ValueError(
-            f"arm latency {latency:g} s given; allowed: 0 to {MAX_LATENCY:g} s, as commands die "
+            f"arm latency {latency:g} s given; allowed: 0 to {MAX_LATENCY_S:g} s, as commands die "
             "0.05 s after their receipt"
         )
     return ArmSettings(
@@ -102,7 +102,7 @@ def arm_settings(rate: float, latency: float, noise: str) -> ArmSettings:
 
 log = logging.getLogger(__name__)
 
-MARKER_PERIOD: Final = 1 / WORLD.rate
+MARKER_PERIOD_S: Final = 1 / WORLD.rate
 
 
 class ResetRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -223,7 +223,7 @@ class ArmServer:
         for state in states:
             self.port.publish(state)
         if now >= self._next_markers:
-            self._next_markers = max(now, after(self._next_markers, MARKER_PERIOD))
+            self._next_markers = max(now, after(self._next_markers, MARKER_PERIOD_S))
             wall_ns = self._wall.wall_ns(now)
             markers = scene_markers(self.cupboard.world, wall_ns)
             world.markers.put(self._codec.encode(WORLD, markers), wall_ns)

@@ -207,16 +207,16 @@ def _pitch_um(array: ArrayGeometry) -> int:
 
 FIRMWARE = "sim 1.0"
 
-DEFAULT_RATE = 100.0
+DEFAULT_RATE_HZ = 100.0
 """Hz after a boot."""
 
-BOOT_TIME = 0.15
+BOOT_S = 0.15
 """Seconds from reset to the first message: clocks, then the chips' own start-up (assumed)."""
 
-REBOOT_DELAY = 0.02
+REBOOT_DELAY_S = 0.02
 """Seconds between the answer to `Reboot` and the reset, so that the answer gets out."""
 
-STATUS_PERIOD = 1.0
+STATUS_PERIOD_S = 1.0
 """Seconds between `Status` messages, sent from boot on whether streaming or not."""
 
 MAX_QUEUED_CYCLES = 8
@@ -281,7 +281,7 @@ class Controller:
         identity: Identity,
         clock: ClockParameters,
         plan: FaultPlan,
-        rate: float = DEFAULT_RATE,
+        rate: float = DEFAULT_RATE_HZ,
     ) -> None:
         self.sampler = sampler
         self.identity = identity
@@ -332,7 +332,7 @@ class Controller:
                 self._answer(message, request, result)
                 self._restart_conversion(result, now)
             case Reboot(request):
-                run.reboot_at = after(now, REBOOT_DELAY)
+                run.reboot_at = after(now, REBOOT_DELAY_S)
                 self._answer(message, request, AckResult.OK)
             case _:
                 # Only boards send these: another board on the bus, or an echo of the line.
@@ -413,8 +413,8 @@ class Controller:
         start = self._clock.start_ticks if cause is ResetCause.POWER_ON else 0
         clock = BoardClock(replace(self._clock, start_ticks=start), now)
         clock.warm(now, self.sampler.temperature_c)
-        ready = after(now, BOOT_TIME)
-        return _Run(clock, cause, now, ready, after(ready, STATUS_PERIOD))
+        ready = after(now, BOOT_S)
+        return _Run(clock, cause, now, ready, after(ready, STATUS_PERIOD_S))
 
     def _boot(self, now: Instant, cause: ResetCause) -> _Run:
         """Start again with nothing kept but the skin, which a reset does not touch."""
@@ -480,7 +480,7 @@ class Controller:
 
     def _status(self, due: Instant) -> None:
         run = self._run
-        run.next_status = after(due, STATUS_PERIOD)
+        run.next_status = after(due, STATUS_PERIOD_S)
         self._reply(
             Status(
                 uptime_ms=int(1000 * seconds_between(run.booted, due)),
@@ -562,7 +562,7 @@ class SimulatedBoard(SkinOwner, ABC):
             identity,
             options.get("clock", ClockParameters()),
             self._plan,
-            options.get("rate", DEFAULT_RATE),
+            options.get("rate", DEFAULT_RATE_HZ),
         )
         self._line_rate = options.get("line_rate")
         self._credit = 0.0

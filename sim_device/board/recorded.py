@@ -25,7 +25,7 @@ from tactile_core.types import Instant, after, seconds_between
 TEMPERATURE_C = 25.0
 """°C put into every frame: recordings hold no temperature."""
 
-PROBE_FRAME = b"\r\n"
+PROBE = b"\r\n"
 """Probe bytes sent before the start: once they are gone, a host reads. A real host, too, opens a
 port in the middle of a frame, so the first bytes it gets are the end of one."""
 
@@ -149,7 +149,7 @@ def _number(cell: str, column: int, where: str) -> float:
 
 
 class ReplayBoard:
-    """Board that sends a recording. It sends `PROBE_FRAME` until `start`, and takes no commands.
+    """Board that sends a recording. It sends `PROBE` until `start`, and takes no commands.
 
     ``speed``: times real time. ``loop``: begin again one period after the last row. ``plan``:
     faults of the chips, which form one array ``skin``, and of the wire, in the recording's time.
@@ -168,7 +168,7 @@ class ReplayBoard:
             raise ValueError("reset and busoff: such a board has neither clock nor bus")
         self._broken = BrokenTaxels(plan, {"skin": recording.magnetometers})
         self._wire = SerialWire(plan, delimited=False) if plan.touches_wire else None
-        self._spoils = bool(plan.taxels or plan.copy)
+        self._has_faults = bool(plan.taxels or plan.copy)
         self._lsb = _scale(recording.field_ut)
         if not (speed > 0 and math.isfinite(speed)):
             raise ValueError(f"speed {speed} given; allowed: a positive number")
@@ -178,7 +178,7 @@ class ReplayBoard:
         self._temperature = np.full(recording.magnetometers, TEMPERATURE_C, np.float32)
         self._status = np.zeros(recording.magnetometers, np.uint8)
         self._start: Instant | None = None
-        self._probed = False
+        self._probe_sent = False
         self._row = 0
         self.sent = 0
         """Frames sent so far."""
@@ -212,7 +212,7 @@ class ReplayBoard:
     def tick(self, now: Instant) -> bytes:
         """Frames due by ``now``, at most `BURST`; the others come with the next call."""
         if self._start is None:
-            probe, self._probed = (b"" if self._probed else PROBE_FRAME), True
+            probe, self._probe_sent = (b"" if self._probe_sent else PROBE), True
             return probe
         out: list[bytes] = []
         while len(out) < BURST and not self.finished and self._due(self._row) <= now:
@@ -233,11 +233,11 @@ class ReplayBoard:
 
     def _frame(self, row: int) -> bytes:
         field, temperature = self._recording.field_ut[row], self._temperature
-        if self._spoils:
-            field, temperature = self._spoilt(field, float(self._recording.seconds[row]))
+        if self._has_faults:
+            field, temperature = self._with_faults(field, float(self._recording.seconds[row]))
         return encode_anyskin(FloatSamples(field, temperature, self._status))
 
-    def _spoilt(
+    def _with_faults(
         self, field: NDArray[np.float32], seconds: float
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Field, µT, and temperatures, °C, as broken chips give them.
@@ -246,13 +246,13 @@ class ReplayBoard:
         """
         counts = np.clip(np.rint(field / self._lsb), -COUNT_MAX - 1, COUNT_MAX).astype(np.int16)
         reading = Reading(counts, self._status, self._temperature.astype(np.float64))
-        spoilt = self._broken.spoil(reading, seconds)
-        out = spoilt.counts * self._lsb
-        failed = np.flatnonzero(spoilt.status & TaxelStatus.READ_FAILED)
-        temperature = spoilt.temperature_c.copy()
+        broken = self._broken.apply(reading, seconds)
+        out = broken.counts * self._lsb
+        failed = np.flatnonzero(broken.status & TaxelStatus.READ_FAILED)
+        temperature = broken.temperature_c.copy()
         temperature[failed] = temperature_of_raw(np.full(len(failed), 65535.0))
-        if spoilt.infinite is not None:
-            out[spoilt.infinite] = np.inf, -np.inf, np.nan
+        if broken.infinite is not None:
+            out[broken.infinite] = np.inf, -np.inf, np.nan
         return out.astype(np.float32), temperature.astype(np.float32)
 
 

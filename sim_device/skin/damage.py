@@ -55,7 +55,7 @@ class BrokenTaxels:
             "copy": self._count["copy"]
         }
 
-    def spoil(self, reading: Reading, seconds: float) -> Reading:
+    def apply(self, reading: Reading, seconds: float) -> Reading:
         """``reading`` as the broken chips give it ``seconds`` s after power-on."""
         self._readings += 1
         active = [f for f in self._faults if f[0].window.covers(seconds)]

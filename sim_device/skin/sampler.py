@@ -53,7 +53,7 @@ class Sampler:
         self.temperature_c = surroundings.temperature_c
         surroundings = self._changes.surround(seconds, surroundings)
         reading = self._changes.amplify(seconds, self.skin.sample(now, contacts, surroundings))
-        return self._broken.spoil(reading, seconds)
+        return self._broken.apply(reading, seconds)
 
 
 class SkinOwner:

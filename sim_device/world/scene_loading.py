@@ -21,7 +21,7 @@ They are not part of this repository: nobody has published them under a licence.
 FOLDER_VARIABLE: Final = "TACTILE_SCENES_DIR"
 """Environment variable that names their folder."""
 
-_BESIDE = Path(__file__).resolve().parents[3] / "shared" / "data" / "authors_scenes"
+_BESIDE_CHECKOUT = Path(__file__).resolve().parents[3] / "shared" / "data" / "authors_scenes"
 
 MAX_SCENE_BYTES: Final = 1 << 20
 """Largest scene file: a scene of 200 objects, the maximum, takes 50 kB of JSON."""
@@ -53,10 +53,10 @@ def find_recorded(name: str) -> Path:
     Searched in the folder that `FOLDER_VARIABLE` names; if it is not set, in the user's data
     folder, then beside the checkout.
     """
-    told = os.environ.get(FOLDER_VARIABLE)
+    configured = os.environ.get(FOLDER_VARIABLE)
     data = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
     home = data / "tactile-reach" / "authors_scenes"
-    folders = [Path(told)] if told else [home, _BESIDE]
+    folders = [Path(configured)] if configured else [home, _BESIDE_CHECKOUT]
     for folder in folders:
         if (folder / name).is_file():
             return folder / name

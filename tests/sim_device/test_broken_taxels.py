@@ -24,9 +24,9 @@ def reading(number: int = 0) -> Reading:
     return Reading(counts, np.zeros(5, np.uint8), np.full(5, 27.0))
 
 
-def spoilt(faults: str, seconds: float = 1.0) -> Reading:
+def broken_reading(faults: str, seconds: float = 1.0) -> Reading:
     """First reading under a plan."""
-    return BrokenTaxels(FaultPlan.parse(faults), TAXELS).spoil(reading(), seconds)
+    return BrokenTaxels(FaultPlan.parse(faults), TAXELS).apply(reading(), seconds)
 
 
 Check = Callable[[NDArray[np.int16]], bool]
@@ -46,7 +46,7 @@ Check = Callable[[NDArray[np.int16]], bool]
     ],
 )
 def test_only_the_chosen_chip_is_broken(faults: str, row: int, right: Check) -> None:
-    out = spoilt(faults)
+    out = broken_reading(faults)
     assert right(out.counts[row])
     others = np.arange(5) != row
     assert (out.counts[others] == COUNTS[others]).all()
@@ -55,29 +55,29 @@ def test_only_the_chosen_chip_is_broken(faults: str, row: int, right: Check) -> 
 
 def test_press_takes_a_wrapping_chip_across_the_wrap() -> None:
     broken = BrokenTaxels(FaultPlan.parse("wrap=skin:0"), TAXELS)
-    broken.spoil(reading(), 1.0)
+    broken.apply(reading(), 1.0)
     pressed = reading()
     pressed.counts[2, 2] += 2500
-    assert broken.spoil(pressed, 1.1).counts[2, 2] == 30767 + 2500 - 65536
+    assert broken.apply(pressed, 1.1).counts[2, 2] == 30767 + 2500 - 65536
 
 
 def test_dithering_chip_changes_only_its_last_bits() -> None:
     broken = BrokenTaxels(FaultPlan.parse("dither=left:1"), TAXELS)
-    seen = np.array([broken.spoil(reading(9 * k), 1.0).counts[1] for k in range(50)])
+    seen = np.array([broken.apply(reading(9 * k), 1.0).counts[1] for k in range(50)])
     assert (np.ptp(seen, axis=0) == 1).all()
 
 
 def test_thermometer_infinity_and_failed_read_faults() -> None:
-    assert spoilt("hot=left:0").temperature_c.tolist() == [99.0, 27.0, 27.0, 27.0, 27.0]
-    infinite = spoilt("inf=skin:2").infinite
+    assert broken_reading("hot=left:0").temperature_c.tolist() == [99.0, 27.0, 27.0, 27.0, 27.0]
+    infinite = broken_reading("inf=skin:2").infinite
     assert infinite is not None
     assert infinite.tolist() == [False, False, False, False, True]
-    assert spoilt("failed=left:0").status[0] == TaxelStatus.READ_FAILED
+    assert broken_reading("failed=left:0").status[0] == TaxelStatus.READ_FAILED
 
 
 def test_fault_applies_to_all_chips_part_of_the_time() -> None:
     broken = BrokenTaxels(FaultPlan.parse("zeros=skin:*:0.25@1s+9s"), TAXELS)
-    zeros = np.array([(broken.spoil(reading(), 2.0).counts == 0).all(axis=1) for _ in range(2000)])
+    zeros = np.array([(broken.apply(reading(), 2.0).counts == 0).all(axis=1) for _ in range(2000)])
     assert not zeros[:, :2].any()
     assert zeros[:, 2:].mean() == pytest.approx(0.25, abs=0.03)
     assert broken.counters["zeros"] == zeros.sum()
@@ -85,7 +85,7 @@ def test_fault_applies_to_all_chips_part_of_the_time() -> None:
 
 def test_stale_readings_repeat_bit_for_bit() -> None:
     broken = BrokenTaxels(FaultPlan.parse("copy@0s+9s"), TAXELS)
-    out = [broken.spoil(reading(k), 1.0).counts[0, 0] - 100 for k in range(100)]
+    out = [broken.apply(reading(k), 1.0).counts[0, 0] - 100 for k in range(100)]
     old = [k for k in range(100) if out[k] != k]
     assert old == [k for k in range(40, 100) if (k + 1) % 3 == 0]
     assert {k - out[k] for k in old} == {40}

@@ -119,7 +119,7 @@ def test_missing_recorded_scenes_are_asked_for(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(scene_loading, "_BESIDE", tmp_path / "none")
+    monkeypatch.setattr(scene_loading, "_BESIDE_CHECKOUT", tmp_path / "none")
     monkeypatch.delenv(FOLDER_VARIABLE, raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     if place == "folder":

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sim_device.arm.arm import FACTORY_LIMITS, ArmSettings
-from sim_device.arm.cupboard import MAX_CATCH_UP, Cupboard, NotNow
+from sim_device.arm.cupboard import MAX_CATCH_UP_S, Cupboard, NotNow
 from sim_device.arm.server import parse_arm_faults
 from sim_device.world.mujoco_world import MujocoWorld
 from sim_device.world.scenes import Scene
@@ -86,9 +86,9 @@ def test_long_stop_suspends_the_world_and_stamps_follow_the_clock(scene: Scene) 
     before = run(cupboard, 0, 0.2, AHEAD)
     states = cupboard.advance(after(T0, 60.0))
     assert cupboard.counters["suspended_ms"] == pytest.approx(
-        1000 * (60 - 0.2 - MAX_CATCH_UP), abs=6
+        1000 * (60 - 0.2 - MAX_CATCH_UP_S), abs=6
     )
-    assert states[-1].captured <= before[-1].captured + round(1e9 * (MAX_CATCH_UP + 0.01))
+    assert states[-1].captured <= before[-1].captured + round(1e9 * (MAX_CATCH_UP_S + 0.01))
     assert not moving(states[-1])
     where = cupboard.world.finger().x
     after_it = run(cupboard, 60.001, 60.3)

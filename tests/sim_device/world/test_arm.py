@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_device.arm.arm import (
-    DEFAULT_EXPIRY,
+    DEFAULT_EXPIRY_S,
     FACTORY_LIMITS,
-    MAX_EXPIRY,
+    MAX_EXPIRY_S,
     MAX_PENDING,
     MAX_UNREAD,
     ArmFault,
@@ -110,7 +110,7 @@ def test_backward_time_is_refused(arm: SimulatedArm) -> None:
     assert arm.world.finger().x == pose
 
 
-@pytest.mark.parametrize("expiry", [0.02, DEFAULT_EXPIRY, MAX_EXPIRY, 10.0])
+@pytest.mark.parametrize("expiry", [0.02, DEFAULT_EXPIRY_S, MAX_EXPIRY_S, 10.0])
 def test_arm_rests_within_100_ms_of_the_last_command(build: Any, expiry: float) -> None:
     arm = arm_in(build.cupboard(), ArmSettings(state_rate=200))
     drive(arm, 0.5, FORWARD)
@@ -121,7 +121,7 @@ def test_arm_rests_within_100_ms_of_the_last_command(build: Any, expiry: float) 
     assert seconds_between(last, still.captured) <= 0.1
     # It must obey until then: a command that expires at once does nothing.
     moving = [s for s in states if s.mode == "moving"]
-    assert seconds_between(last, moving[-1].captured) >= min(expiry, MAX_EXPIRY) - 0.011
+    assert seconds_between(last, moving[-1].captured) >= min(expiry, MAX_EXPIRY_S) - 0.011
     assert states[-1].mode == "stopped"
     assert arm.counters["expired"] == 1
     x = states[-1].x
