@@ -16,7 +16,7 @@ from tactile_tools.experiments.conditions import parameters_of, scene_of, sense_
 from tactile_tools.experiments.degraded_touch import (
     DegradedContacts,
     DegradedTaxels,
-    Unstretched,
+    FingerStretch,
     dead_taxels,
 )
 from tactile_tools.experiments.spec import TrialSpec
@@ -118,7 +118,7 @@ def test_wider_finger_feels_the_same_forces_at_its_width(stretch: float) -> None
     pressed = FingerContact(
         0.12, y, math.sin(slope), math.cos(slope), -3.0 * math.sin(slope), -3.0 * math.cos(slope), 0
     )
-    (moved,) = Unstretched(stretch).contacts([pressed])
+    (moved,) = FingerStretch(stretch).contacts([pressed])
     assert moved.y == pytest.approx(0.0285)
     assert math.hypot(moved.normal_x, moved.normal_y) == pytest.approx(1.0)
     assert moved.normal_force == pytest.approx(3.0)

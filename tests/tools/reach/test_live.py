@@ -13,7 +13,7 @@ from matplotlib.image import imread
 
 from tactile_core.bus.topics import ARM_STATE, COMMAND, FEATURES
 from tactile_tools.cli import main
-from tactile_tools.dev.benches.stop import SpoiltTrialError, rest_after, zero_after
+from tactile_tools.dev.benches.stop import InvalidTrialError, rest_after, zero_after
 from tactile_tools.plot.reach_series import read_reach
 from tactile_tools.reach.process_rig import LiveReach
 from tests.support import trial_trace
@@ -107,9 +107,9 @@ def test_measured_time_runs_from_last_message_to_standstill() -> None:
 def test_arm_that_did_not_move_is_no_measurement() -> None:
     still = [sample(t) for t in range(0, 400, 10)]
     live: Any = Heard(features=still, commands=still, states=still)
-    with pytest.raises(SpoiltTrialError):
+    with pytest.raises(InvalidTrialError):
         zero_after(live, FEATURES, 90 * MS)
-    with pytest.raises(SpoiltTrialError):
+    with pytest.raises(InvalidTrialError):
         rest_after(live, 90 * MS)
     moving = [sample(t, 0.05) for t in range(0, 400, 10)]
     live = Heard(features=still, commands=moving, states=moving)

@@ -230,7 +230,7 @@ def run(options: argparse.Namespace) -> int:
         )
         return 2
     try:
-        kept = {} if only is None else _earlier(options.out)
+        kept = {} if only is None else _previous_report(options.out)
     except ValueError as error:
         print(f"tactile bench: --out {options.out}: {error}", file=sys.stderr)
         return 2
@@ -276,7 +276,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _earlier(path: Path | None) -> dict[str, Any]:
+def _previous_report(path: Path | None) -> dict[str, Any]:
     """Report in ``path``; empty if there is none. ValueError."""
     if path is None or not path.exists():
         return {}

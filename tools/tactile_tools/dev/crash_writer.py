@@ -45,7 +45,7 @@ def run(directory: Path, truth: Path, seed: int, seconds: float) -> None:
     encode = codec().encode
     count, cycle, first_ns = 0, 0, clock.wall_ns(monotonic_now())
 
-    def hand_over(topic: Topic, message: Any, now_ns: int) -> None:
+    def record(topic: Topic, message: Any, now_ns: int) -> None:
         nonlocal count
         recorder.write(topic, NAME, encode(topic, message), now_ns, now_ns)
         count += 1
@@ -67,7 +67,7 @@ def run(directory: Path, truth: Path, seed: int, seconds: float) -> None:
         empty,
         np.zeros(0, np.bool_),
     )
-    hand_over(GEOMETRY, geometry, now_ns)
+    record(GEOMETRY, geometry, now_ns)
     while time.monotonic() < end:
         now_ns = clock.wall_ns(monotonic_now())
         head = header(now_ns, "ee")
@@ -75,7 +75,7 @@ def run(directory: Path, truth: Path, seed: int, seconds: float) -> None:
         status = np.zeros(TAXELS, np.uint8)
         bounds = np.full(TAXELS, 0.1, np.float32)
         taxels = np.array([TAXELS], np.uint16)
-        hand_over(
+        record(
             FORCES,
             MSG.TaxelForces(
                 head, now_ns, now_ns, 1e-4, cycle, taxels, forces, status, True, True, bounds
@@ -87,10 +87,10 @@ def run(directory: Path, truth: Path, seed: int, seconds: float) -> None:
             head, now_ns, now_ns, 1e-4, cycle, True, [], True, float(forces[0]), 1, origin,
             1.0, MSG.Wrench(zero, zero), 0.5, 0.1, 3, 0, [], [], 0.1, 0.1, 0.1,
         )  # fmt: skip
-        hand_over(FEATURES, features, now_ns)
+        record(FEATURES, features, now_ns)
         none = np.zeros(0, np.uint32), np.zeros(0, np.uint8)
         raw = rng.integers(0, 256, 600, np.uint8)
-        hand_over(RAW, MSG.RawChunk(head, now_ns, 0, *none, raw), now_ns)
+        record(RAW, MSG.RawChunk(head, now_ns, 0, *none, raw), now_ns)
         cycle += 1
         now = time.monotonic()
         due = max(due + 1 / RATE, now)  # do not catch up, as a board that was read late does not

@@ -219,7 +219,7 @@ def run(options: argparse.Namespace) -> int:
         return 2
     columns = ("[progress.description]{task.description}", BarColumn(), MofNCompleteColumn())
     with Progress(*columns, TimeRemainingColumn()) as bar:
-        task = bar.add_task("frames spoilt", total=options.frames)
+        task = bar.add_task("frames corrupted", total=options.frames)
         result = _fuzz(options, lambda done: bar.advance(task, done))
     if options.out is not None:
         try:
@@ -228,9 +228,9 @@ def run(options: argparse.Namespace) -> int:
             print(f"{options.out}: {error.strerror}; name another file", file=sys.stderr)
             return 3
     if options.through == "pipeline":
-        return _tell_pipeline(result)
+        return _report_pipeline(result)
     print(
-        f"{result['touched']} frames spoilt, {result['wrong']} accepted wrongly; "
+        f"{result['touched']} frames corrupted, {result['wrong']} accepted wrongly; "
         f"{result['lost']} of {result['sent']} lost (allowed {result['lost_allowed']}) "
         f"in {result['seconds']} s"
     )
@@ -250,7 +250,7 @@ def _fuzz(options: argparse.Namespace, progress: Progress) -> Totals:
     )
 
 
-def _tell_pipeline(result: Totals) -> int:
+def _report_pipeline(result: Totals) -> int:
     """Print the result. Returns the exit status."""
     failures = result["failures"]
     oversized = sum(m["oversized"] for m in result["media"].values())

@@ -172,7 +172,7 @@ def _kill(live: LiveReach, folder: Path, number: int, seed: int, totals: KillTot
     before = time.monotonic()
     live.start(kill.process)
     live.clear()
-    live.until(lambda: _speaks(live, kill.process), f"{kill.process} again")
+    live.until(lambda: _is_sending(live, kill.process), f"{kill.process} again")
     kill.back_s = time.monotonic() - before
     live.clear()
     time.sleep(WATCH_S)
@@ -196,7 +196,7 @@ def _rest(live: LiveReach, killed_ns: int, kill: OneKill) -> float:
     return rest
 
 
-def _speaks(live: LiveReach, process: str) -> bool:
+def _is_sending(live: LiveReach, process: str) -> bool:
     from tactile_core.bus.topics import FEATURES, REACH_STATE
 
     topic = {"tactiled": FEATURES, "reachd": REACH_STATE, "cupboard": ARM_STATE}[process]

@@ -119,8 +119,8 @@ def _soak(soak: Soak) -> None:
         names = [f"b{index}" for index in range(soak.boards)]
         for index, board in enumerate(names):
             simulator = _simulator(soak, folder / board, index, seconds)
-            said = folder / f"{board}.txt"
-            wait_for(folder / board, stack.enter_context(running(simulator, said)), said)
+            output = folder / f"{board}.txt"
+            wait_for(folder / board, stack.enter_context(running(simulator, output)), output)
         (folder / "soak.toml").write_text(
             f'[log]\ndestination = "{folder / "logs"}"\n[log.recorder]\nmax_bytes = {LOG_BYTES}\n',
             encoding="utf-8",

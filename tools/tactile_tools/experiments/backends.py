@@ -24,10 +24,10 @@ BATCH = 10
 ATTEMPTS = 2
 """Workers that may die of one trial before it is given up: the first may have been bad luck."""
 
-FRUITLESS = 20
+MAX_DEATHS_IN_A_ROW = 20
 """Workers that may die in succession, without a row in between, before the run is given up."""
 
-_ENVIRONMENT = {
+_WORKER_ENVIRONMENT = {
     # Linear algebra uses one thread: the other workers use the other cores.
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
@@ -139,7 +139,7 @@ class Processes:
         while len(self._workers) < min(self.workers, len(waiting)):
             self._workers.append(_start_worker())
         idle = list(self._workers)
-        fruitless = 0
+        deaths_in_a_row = 0
         while True:
             while idle and waiting:
                 idle.pop().ask(waiting.popleft())
@@ -152,19 +152,19 @@ class Processes:
                 try:
                     row: Row = pipe.recv()
                 except (EOFError, OSError):
-                    fruitless += 1
+                    deaths_in_a_row += 1
                     yield from self._handle_death(worker, waiting, deaths)
-                    if fruitless == FRUITLESS:
+                    if deaths_in_a_row == MAX_DEATHS_IN_A_ROW:
                         raise BackendError(
-                            f"{FRUITLESS} worker processes in a row died "
-                            f"({_how(worker.process)}); is there enough memory? "
+                            f"{MAX_DEATHS_IN_A_ROW} worker processes in a row died "
+                            f"({_cause_of_death(worker.process)}); is there enough memory? "
                             "Finished trials are kept, and the same command runs the rest"
                         ) from None
                     self._workers.remove(worker)
                     self._workers.append(_start_worker())
                     idle.append(self._workers[-1])
                     continue
-                fruitless = 0
+                deaths_in_a_row = 0
                 worker.asked.popleft()
                 if not worker.asked:
                     idle.append(worker)
@@ -183,13 +183,13 @@ class Processes:
         if deaths[killer] < ATTEMPTS:
             waiting.appendleft([killer])
             return
-        from tactile_tools.experiments.trial import lost
+        from tactile_tools.experiments.trial import lost_row
 
-        how = _how(worker.process)
-        yield lost(killer, f"the process that ran it died ({how}), {ATTEMPTS} times")
+        cause = _cause_of_death(worker.process)
+        yield lost_row(killer, f"the process that ran it died ({cause}), {ATTEMPTS} times")
 
 
-def _how(process: BaseProcess) -> str:
+def _cause_of_death(process: BaseProcess) -> str:
     """How a process died."""
     code = process.exitcode or 0
     return signal.Signals(-code).name if code < 0 else f"exit code {code}"
@@ -197,8 +197,8 @@ def _how(process: BaseProcess) -> str:
 
 def _start_worker() -> _Worker:
     """Start a worker with its own environment."""
-    before = {name: os.environ.get(name) for name in _ENVIRONMENT}
-    os.environ.update(_ENVIRONMENT)
+    before = {name: os.environ.get(name) for name in _WORKER_ENVIRONMENT}
+    os.environ.update(_WORKER_ENVIRONMENT)
     try:
         return _Worker()
     finally:

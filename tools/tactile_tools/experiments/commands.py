@@ -49,11 +49,11 @@ BENCHMARK_ENGINES = ("mujoco", "pymunk")
 STOPPED = 130
 """Exit status after Ctrl-C."""
 
-TOLD_EVERY_S = 30.0
+REPORT_EVERY_S = 30.0
 """Seconds between lines of progress where there is no terminal for a bar."""
 
 
-def _told(work: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
+def _as_command(work: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
     """``work`` as a command: every failure that a user can cause becomes a `CommandError`."""
 
     def command(options: argparse.Namespace) -> int:
@@ -80,13 +80,13 @@ def _common(options: argparse.Namespace) -> Options:
     )
 
 
-def _studied(make: Callable[[argparse.Namespace], Study], word: str) -> Any:
+def _study_command(make: Callable[[argparse.Namespace], Study], word: str) -> Any:
     """A study as a command."""
 
     def run(options: argparse.Namespace) -> int:
         return _study(make(options), options, word)
 
-    return _told(run)
+    return _as_command(run)
 
 
 def _sweep(options: argparse.Namespace) -> Study:
@@ -102,9 +102,9 @@ def _chosen(options: argparse.Namespace) -> tuple[str, ...]:
     return tuple(options.strategy or PAPER_STRATEGIES)
 
 
-strategies = _studied(lambda o: strategies_study(_common(o), _chosen(o)), "strategies")
-sweep = _studied(_sweep, "sweep")
-robustness = _studied(
+strategies = _study_command(lambda o: strategies_study(_common(o), _chosen(o)), "strategies")
+sweep = _study_command(_sweep, "sweep")
+robustness = _study_command(
     lambda o: robustness_study(_common(o), _chosen(o), tuple(o.axis or AXIS_NAMES)), "robustness"
 )
 
@@ -125,21 +125,21 @@ def _study(study: Study, options: argparse.Namespace, word: str) -> int:
         console=console,
         disable=not console.is_terminal,
     )
-    told = _Teller(console, bar)
+    reporter = _Reporter(console, bar)
     try:
         with bar:
-            summary = run_study(study, directory, backend, told, retry=options.retry)
+            summary = run_study(study, directory, backend, reporter, retry=options.retry)
     except KeyboardInterrupt:
         console.print(
-            f"stopped: {told.finished} of {told.total} trials are finished and kept; "
+            f"stopped: {reporter.finished} of {reporter.total} trials are finished and kept; "
             "the same command runs the rest"
         )
         return STOPPED
-    _say(console, summary, told, directory)
+    _print_summary(console, summary, reporter, directory)
     return 1 if summary["errors"] else 0
 
 
-class _Teller:
+class _Reporter:
     """Prints how far a run is, and keeps the first failures."""
 
     def __init__(self, console: Console, bar: Progress) -> None:
@@ -164,13 +164,15 @@ class _Teller:
         if row["error"] is not None and len(self.failed) < 3:
             self.failed.append(f"{describe(row)}: {row['error']}")
         now = time.monotonic()
-        if not self._console.is_terminal and now - self._last > TOLD_EVERY_S:
+        if not self._console.is_terminal and now - self._last > REPORT_EVERY_S:
             self._last = now
             left = (now - self._began) / (finished - self._before) * (total - finished)
             self._console.print(f"{finished} of {total} trials, {left / 60:.1f} min left")
 
 
-def _say(console: Console, summary: dict[str, Any], told: _Teller, directory: Path) -> None:
+def _print_summary(
+    console: Console, summary: dict[str, Any], reporter: _Reporter, directory: Path
+) -> None:
     session = summary["this_session"]
     if session["damaged_lines"]:
         console.print(
@@ -201,12 +203,12 @@ def _say(console: Console, summary: dict[str, Any], told: _Teller, directory: Pa
         )
     if summary["errors"]:
         console.print(f"{summary['errors']} trials could not be run; the first:")
-        for text in told.failed:
+        for text in reporter.failed:
             console.print(f"  {text}", markup=False)
     console.print(f"wrote {directory}/trials.parquet, trials.csv and summary.json")
 
 
-@_told
+@_as_command
 def benchmark(options: argparse.Namespace) -> int:
     """``tactile benchmark``."""
     from tactile_tools.experiments import benchmark as board
@@ -290,17 +292,17 @@ def _show_entry(entry: dict[str, Any]) -> None:
     )
 
 
-@_told
+@_as_command
 def trial(options: argparse.Namespace) -> int:
     """``tactile experiment trial``."""
     if options.png is not None:
         require("matplotlib", "scipy", extra="plot")
-    from tactile_tools.experiments.rerun_trial import run_again
+    from tactile_tools.experiments.rerun_trial import rerun
 
-    return run_again(options)
+    return rerun(options)
 
 
-@_told
+@_as_command
 def report(options: argparse.Namespace) -> int:
     """``tactile experiment report``."""
     from tactile_tools.experiments.report import write_report
@@ -314,7 +316,7 @@ def report(options: argparse.Namespace) -> int:
     return 0
 
 
-@_told
+@_as_command
 def compare(options: argparse.Namespace) -> int:
     """``tactile experiment compare``."""
     from tactile_tools.experiments.compare import compare_runs

@@ -35,10 +35,10 @@ def compare_runs(first: Path, second: Path, csv: Path | None = None) -> int:
     tables = comparison(rows[0], rows[1])
     console = Console()
     for name, run in zip("AB", runs, strict=True):
-        told = f"{name}: {run.directory}, {len(run.rows)} trials"
+        heading = f"{name}: {run.directory}, {len(run.rows)} trials"
         if run.missing:
-            told += f", {run.missing} of its trials are missing"
-        console.print(told, highlight=False, markup=False)
+            heading += f", {run.missing} of its trials are missing"
+        console.print(heading, highlight=False, markup=False)
     for line in differences(rows[0], rows[1]):
         console.print("   " + line, highlight=False, markup=False)
     for table in tables:

@@ -82,11 +82,11 @@ class DaskCluster:
                     done.add(future)
                 if asked:
                     future = next(done)
-                    yield from self._take(future, asked.pop(future), suspects)
+                    yield from self._rows_of(future, asked.pop(future), suspects)
                 else:
-                    yield self._try(suspects.popleft())
+                    yield self._run_alone(suspects.popleft())
         except OSError as error:
-            raise self._gone(error) from error
+            raise self._scheduler_gone(error) from error
 
     def _submit(self, batch: Sequence[TrialSpec]) -> Any:
         from tactile_tools.experiments.trial import run_batch
@@ -94,7 +94,7 @@ class DaskCluster:
         # Not pure: a trial requested again, or by another run, must run again.
         return self._client.submit(run_batch, list(batch), pure=False)
 
-    def _take(
+    def _rows_of(
         self, future: Any, batch: list[TrialSpec], suspects: deque[TrialSpec]
     ) -> Iterator[Row]:
         """Rows of a task that ended; if its workers died, its trials become suspects."""
@@ -103,17 +103,17 @@ class DaskCluster:
         else:
             yield from future.result()
 
-    def _try(self, spec: TrialSpec) -> Row:
+    def _run_alone(self, spec: TrialSpec) -> Row:
         """Row of a suspect, run while nothing else runs that could kill its worker."""
         from distributed import wait
 
-        from tactile_tools.experiments.trial import lost
+        from tactile_tools.experiments.trial import lost_row
 
         future = self._submit([spec])
         with self._client.as_current():
             wait(future)
         if self._died(future):
-            return lost(spec, "the Dask workers that ran it died, one after another")
+            return lost_row(spec, "the Dask workers that ran it died, one after another")
         row: Row = future.result()[0]
         return row
 
@@ -127,7 +127,7 @@ class DaskCluster:
         if future.status == "finished":
             return False
         if future.status in ("lost", "cancelled"):
-            raise self._gone(future.status)
+            raise self._scheduler_gone(future.status)
         error = future.exception()
         if isinstance(error, KilledWorker):
             return True
@@ -140,7 +140,7 @@ class DaskCluster:
         try:
             found: dict[str, str] = self._client.run(version, "tactile-reach", on_error="return")
         except OSError as error:
-            raise self._gone(error) from error
+            raise self._scheduler_gone(error) from error
         if not found:
             raise BackendError(
                 f"the scheduler at {self._address} has no workers: start `dask worker "
@@ -155,7 +155,7 @@ class DaskCluster:
                     "the same everywhere"
                 )
 
-    def _gone(self, why: object) -> BackendError:
+    def _scheduler_gone(self, why: object) -> BackendError:
         return BackendError(
             f"the Dask scheduler at {self._address} is gone ({why}); finished trials are kept, "
             "and the same command runs the rest"

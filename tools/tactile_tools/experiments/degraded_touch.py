@@ -42,7 +42,7 @@ def dead_taxels(seed: int, fraction: float) -> list[tuple[str, int]]:
     return [every[i] for i in sorted(order[: round(fraction * len(every))].tolist())]
 
 
-class SeenWorld:
+class WorldView:
     """The part of a world that a sense reads, with its contacts changed by ``change``."""
 
     def __init__(
@@ -67,7 +67,7 @@ class SeenWorld:
         return self._world.finger()
 
 
-class Unstretched:
+class FingerStretch:
     """Converts between a finger stretched across by ``stretch`` and the finger as built.
 
     The skin of the stretched finger has the same taxels at the same places along its outline.
@@ -126,7 +126,7 @@ class DegradedContacts:
         self._period = None if rate is None else 1.0 / rate
         self._due: Instant | None = None
         self._touch: Touch | None = None
-        self._unstretched = Unstretched(stretch)
+        self._stretch_map = FingerStretch(stretch)
         self._columns = _columns(seed, dead) if dead > 0 else None
 
     def settle(self, world: World, now: Instant) -> Instant:
@@ -139,16 +139,16 @@ class DegradedContacts:
             return self._touch
         if self._period is not None:
             self._due = after(now if self._due is None else self._due, self._period)
-        seen = SeenWorld(world, self._felt)
-        # A sense only reads a world, and `SeenWorld` has everything that it reads.
+        seen = WorldView(world, self._felt)
+        # A sense only reads a world, and `WorldView` has everything that it reads.
         touch = self._inner.feel(cast(World, seen), now)
         if self._noise > 0:
-            touch = self._disturbed(touch)
-        self._touch = self._unstretched.touch(touch)
+            touch = self._with_noise(touch)
+        self._touch = self._stretch_map.touch(touch)
         return self._touch
 
     def _felt(self, contacts: tuple[FingerContact, ...]) -> tuple[FingerContact, ...]:
-        moved = self._unstretched.contacts(contacts)
+        moved = self._stretch_map.contacts(contacts)
         if self._columns is None:
             return moved
         places, alive = self._columns
@@ -160,7 +160,7 @@ class DegradedContacts:
                 felt.append(replace(c, force_x=share * c.force_x, force_y=share * c.force_y))
         return tuple(felt)
 
-    def _disturbed(self, touch: Touch) -> Touch:
+    def _with_noise(self, touch: Touch) -> Touch:
         """``touch`` with noise; a force is never below 0."""
         peak, total, tip = (self._rng.standard_normal(3) * self._noise).tolist()
         return replace(
@@ -199,13 +199,13 @@ class DegradedTaxels(TaxelSense):
         # The same skin as the plain one of this seed: tolerances are drawn before any noise.
         skin = SkinModel(finger(), replace(parameters, chip=chip), np.random.default_rng([seed, 0]))
         self._board = SerialBoard(skin, identity("finger", seed), rate=rate, plan=plan)
-        self._unstretched = Unstretched(stretch)
+        self._stretch_map = FingerStretch(stretch)
 
     def feel(self, world: World, now: Instant) -> Touch | None:
         """As `TaxelSense`, through the stretched finger."""
-        seen = SeenWorld(world, self._unstretched.contacts)
+        seen = WorldView(world, self._stretch_map.contacts)
         touch = super().feel(cast(World, seen), now)
-        return None if touch is None else self._unstretched.touch(touch)
+        return None if touch is None else self._stretch_map.touch(touch)
 
 
 def _columns(seed: int, fraction: float) -> tuple[Any, Any]:

@@ -128,7 +128,7 @@ def shown_p(p: float) -> str:
     return f"{p:.4f}" if p < 0.01 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
-def told_p(p: float) -> str:
+def p_text(p: float) -> str:
     """A p-value for a sentence."""
     shown = shown_p(p)
     return f"p {shown}" if shown.startswith("<") else f"p = {shown}"
@@ -139,7 +139,7 @@ def slug(text: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
 
 
-def spoken(name: str) -> str:
+def in_words(name: str) -> str:
     """Name of a strategy in a sentence: the paper's in words, a user's own as given."""
     return name.replace("_", " ") if name in STRATEGIES else name
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from statistics import fmean
 
-from tactile_tools.experiments.document import listed, spoken, told_p, whole
+from tactile_tools.experiments.document import in_words, listed, p_text, whole
 from tactile_tools.experiments.reference import PAPER_EJECTED, Reference
 from tactile_tools.experiments.rows import Row
 from tactile_tools.experiments.statistics import (
@@ -45,18 +45,19 @@ def worst_is_straight(means: Mapping[str, float], pairs: Sequence[PairedValues],
     )
     if len(worse) == len(others):
         p = max(against[n].adjusted for n in others)
-        return f"{start}: it is significantly worse than each of them (the greatest {told_p(p)})."
-    told = []
+        return f"{start}: it is significantly worse than each of them (the greatest {p_text(p)})."
+    parts = []
     for word, names in (
         ("significantly worse than", worse),
         ("not significantly different from", [n for n in others if n not in beyond]),
         ("significantly better than", better),
     ):
         if names:
-            told.append(
-                f"{word} " + listed([f"{spoken(n)} ({told_p(against[n].adjusted)})" for n in names])
+            parts.append(
+                f"{word} "
+                + listed([f"{in_words(n)} ({p_text(against[n].adjusted)})" for n in names])
             )
-    return f"{start}: it is {'; '.join(told)}."
+    return f"{start}: it is {'; '.join(parts)}."
 
 
 def faster_by_touch(means: Mapping[str, float], pairs: Sequence[PairedValues]) -> str:
@@ -67,7 +68,7 @@ def faster_by_touch(means: Mapping[str, float], pairs: Sequence[PairedValues]) -
     gain = _signed(pair, "hybrid_clock")
     figures = (
         f"mean normalised time {means['hybrid_event']:.3f} against {means['hybrid_clock']:.3f}, "
-        f"{told_p(pair.adjusted)}"
+        f"{p_text(pair.adjusted)}"
     )
     if pair.adjusted >= SIGNIFICANT:
         return f"Hybrid event is not significantly faster than hybrid clock ({figures})."
@@ -79,14 +80,14 @@ def order_of_success(rates: Mapping[str, Rate], reference: Reference | None) -> 
     """Order from least to most successful, with the paper's order."""
     ranked = sorted(rates, key=lambda name: rates[name].value)
     text = "By success, from least to most: " + ", ".join(
-        f"{spoken(n)} {whole(rates[n].value)} %" for n in ranked
+        f"{in_words(n)} {whole(rates[n].value)} %" for n in ranked
     )
     if reference is None or not set(reference.success) >= set(rates):
         return text + "."
     theirs = sorted(rates, key=lambda name: reference.success[name].value)
     if theirs == ranked:
         return f"{text}. The order is the paper's."
-    order = ", ".join(spoken(n) for n in theirs)
+    order = ", ".join(in_words(n) for n in theirs)
     return f"{text}. The paper's order is {order}."
 
 
@@ -101,18 +102,18 @@ def beside(rates: Mapping[str, Rate], reference: Reference, column: str = "succe
         if p < SIGNIFICANT:
             word = "above" if rate.value > theirs[name].value else "below"
             differ.append(
-                f"{spoken(name)} ({whole(rate.value)} %, {word} its "
-                f"{whole(theirs[name].value)} %, {told_p(p)})"
+                f"{in_words(name)} ({whole(rate.value)} %, {word} its "
+                f"{whole(theirs[name].value)} %, {p_text(p)})"
             )
         else:
-            agree.append(spoken(name))
+            agree.append(in_words(name))
     what = f"the success in {reference.what}"
     if not differ and not agree:
         return ""
     if not differ:
         return f"No rate differs significantly from {what}."
-    told = f"Significantly different from {what}: {listed(differ)}"
-    return told + (f"; not different: {listed(agree)}." if agree else ".")
+    text = f"Significantly different from {what}: {listed(differ)}"
+    return text + (f"; not different: {listed(agree)}." if agree else ".")
 
 
 def solved_by_touch(rows: ByStrategy) -> str:
@@ -129,7 +130,7 @@ def solved_by_touch(rows: ByStrategy) -> str:
     return (
         f"Of {len(seen)} scenes, {every} were solved by at least one strategy. Hybrid event failed "
         f"in {lost} that another strategy solved; every other strategy failed in at least "
-        f"{gained[least]} that hybrid event solved (the least is {spoken(least)})."
+        f"{gained[least]} that hybrid event solved (the least is {in_words(least)})."
     )
 
 
@@ -137,11 +138,13 @@ def pushed_out(rows: ByStrategy) -> str:
     """Objects pushed out of the front by the two hybrids, with the paper's numbers."""
     if not {"hybrid_clock", "hybrid_event"} <= set(rows):
         return ""
-    told, counts = [], {}
+    parts, counts = [], {}
     for name in ("hybrid_clock", "hybrid_event"):
         counts[name] = 25 * fmean(row["ejected"] for row in rows[name])
         objects, trials = PAPER_EJECTED[name]
-        told.append(f"{spoken(name)} {counts[name]:.1f} (paper, hardware: {objects} in {trials})")
+        parts.append(
+            f"{in_words(name)} {counts[name]:.1f} (paper, hardware: {objects} in {trials})"
+        )
     clock, event = ({r["scene_seed"]: r["ejected"] for r in rows[n]} for n in counts)
     scenes = sorted(clock.keys() & event.keys())
     p = signed_rank([clock[s] for s in scenes], [event[s] for s in scenes])[0]
@@ -152,7 +155,7 @@ def pushed_out(rows: ByStrategy) -> str:
     else:
         verdict = "unlike in the paper, touch disturbs more"
     return (
-        f"Objects pushed out of the front, per 25 trials: {listed(told)}; {verdict} ({told_p(p)})."
+        f"Objects pushed out of the front, per 25 trials: {listed(parts)}; {verdict} ({p_text(p)})."
     )
 
 

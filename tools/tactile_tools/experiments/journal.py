@@ -54,11 +54,11 @@ class Journal:
         wanted = {"format": FORMAT, **definition}
         try:
             directory.mkdir(parents=True, exist_ok=True)
-            self._hold()
+            self._lock_folder()
             path = directory / "experiment.json"
             if not path.exists():
-                _refuse_strangers(directory)
-            elif not _grows(directory, read_definition(directory), wanted):
+                _refuse_other_files(directory)
+            elif not _extends(directory, read_definition(directory), wanted):
                 return
             replace_file(path, (json.dumps(wanted, indent=1) + "\n").encode())
         except OSError as error:
@@ -118,7 +118,7 @@ class Journal:
                 os.close(descriptor)
         self._stream = self._lock = None
 
-    def _hold(self) -> None:
+    def _lock_folder(self) -> None:
         """Take the lock. The system releases it when the process ends, however it ends."""
         self._lock = os.open(
             self.directory / ".lock", os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644
@@ -196,12 +196,12 @@ def _write_whole(stream: int, line: bytes) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def _grows(directory: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
+def _extends(directory: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
     """Whether ``wanted`` extends ``found``; FolderError names what differs otherwise."""
     # Through JSON, as a tuple comes back as a list.
     wanted = json.loads(json.dumps(wanted))
     names = [n for n in dict.fromkeys([*found, *wanted]) if found.get(n) != wanted.get(n)]
-    others = [n for n in names if not _more(n, found.get(n), wanted.get(n))]
+    others = [n for n in names if not _is_more(n, found.get(n), wanted.get(n))]
     if others:
         differences = "; ".join(
             f"{n} is {_short(found.get(n))} there and {_short(wanted.get(n))} here" for n in others
@@ -213,7 +213,7 @@ def _grows(directory: Path, found: Mapping[str, Any], wanted: Mapping[str, Any])
     return bool(names)
 
 
-def _more(name: str, found: object, wanted: object) -> bool:
+def _is_more(name: str, found: object, wanted: object) -> bool:
     """Whether a study with ``wanted`` has every trial of one with ``found``, and more."""
     if name == "scenes":  # they are numbered from the same seed on
         return isinstance(found, int) and isinstance(wanted, int) and found < wanted
@@ -224,7 +224,7 @@ def _more(name: str, found: object, wanted: object) -> bool:
     )
 
 
-def _refuse_strangers(directory: Path) -> None:
+def _refuse_other_files(directory: Path) -> None:
     """Raise FolderError if the folder has files of others."""
     # A run that was killed at its very start leaves these.
     ours = {".lock", "experiment.json.part"}

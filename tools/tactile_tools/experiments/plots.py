@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from tactile_core.arrays import FloatArray
-from tactile_tools.experiments.document import spoken, whole
+from tactile_tools.experiments.document import in_words, whole
 from tactile_tools.experiments.statistics import Rate
 
 DPI = 130
@@ -73,7 +73,7 @@ def boxes(
                 index, y.mean(), "D", color="white", markeredgecolor="black", markersize=6, zorder=4
             )
     _brackets(axes, values, brackets)
-    axes.set_xticks(range(len(names)), [spoken(n).replace(" ", "\n") for n in names])
+    axes.set_xticks(range(len(names)), [in_words(n).replace(" ", "\n") for n in names])
     axes.set_ylabel(label)
     axes.set_title(title, loc="left", fontsize=10.5)
     return _png(figure)
@@ -137,7 +137,7 @@ def rates(
             label=label,
             zorder=4,
         )
-    axes.set_xticks(range(len(names)), [spoken(n).replace(" ", "\n") for n in names])
+    axes.set_xticks(range(len(names)), [in_words(n).replace(" ", "\n") for n in names])
     axes.set_ylabel("success, % (95 % intervals)")
     axes.set_ylim(0, 100)
     if others:
@@ -241,7 +241,7 @@ def heat_map(
             light = not np.isnan(value) and value < 0.55
             axes.text(j, i, text, ha="center", va="center", color="white" if light else "black")
     axes.set_xticks(range(len(columns)), columns)
-    axes.set_yticks(range(len(rows)), [spoken(r) for r in rows])
+    axes.set_yticks(range(len(rows)), [in_words(r) for r in rows])
     axes.tick_params(length=0)
     axes.set_xlabel(x_label)
     axes.set_title(title, loc="left", fontsize=10.5)

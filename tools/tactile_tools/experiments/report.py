@@ -12,7 +12,7 @@ from tactile_tools.experiments.report_strategies import strategy_sections
 from tactile_tools.experiments.report_sweep import sweep_sections
 from tactile_tools.experiments.rows import TableError
 from tactile_tools.experiments.runner import summarize
-from tactile_tools.experiments.tables import Run, load_run, put_by
+from tactile_tools.experiments.tables import Run, archive, load_run
 
 PAPER = (
     "A robot arm with a finger reaches into a cluttered cupboard toward a place it cannot see. "
@@ -51,7 +51,7 @@ def write_report(run_directory: Path, out: Path, *, rows: bool = False) -> Path:
     run = load_run(run_directory)
     document = build(run)
     if rows and out.resolve() != run_directory.resolve():
-        put_by(run, out)
+        archive(run, out)
     return document.write(out)
 
 

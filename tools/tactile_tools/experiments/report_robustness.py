@@ -14,9 +14,9 @@ from tactile_tools.experiments.document import (
     Picture,
     Section,
     TableData,
+    in_words,
     percent,
     slug,
-    spoken,
 )
 from tactile_tools.experiments.plots import heat_map
 from tactile_tools.experiments.rows import Row
@@ -138,7 +138,7 @@ def points_of(run: Run, axis: str, set_name: str, rows: Sequence[Row]) -> list[P
 
 def _findings(axes: Mapping[str, Sequence[Point]], strategies: Sequence[str]) -> list[str]:
     """A sentence for each claim for which all its strategies were run."""
-    told = []
+    sentences = []
     for claim in _testable(strategies):
         verdicts = [(axis, p.level, p.verdict(claim)) for axis, p in _conditions(axes)]
         known = [v for v in verdicts if v[2] != UNKNOWN]
@@ -160,8 +160,8 @@ def _findings(axes: Mapping[str, Sequence[Point]], strategies: Sequence[str]) ->
             text += f". By tendency it is the other way at {_places(against)}"
         if not flips and not against:
             text += ", nowhere the other way"
-        told.append(text + ".")
-    return told
+        sentences.append(text + ".")
+    return sentences
 
 
 def _conditions(axes: Mapping[str, Sequence[Point]]) -> list[tuple[str, Point]]:
@@ -208,7 +208,7 @@ def _rate_table(
     return TableData(
         f"Success: {AXES[axis].title}",
         ["strategy", *(_label(point) for point in points)],
-        [[spoken(s), *(percent(point.rate(s)) for point in points)] for s in strategies],
+        [[in_words(s), *(percent(point.rate(s)) for point in points)] for s in strategies],
         note=_remarks(points),
         name=f"{prefix}{axis}",
     )
@@ -226,15 +226,15 @@ def _remarks(points: Sequence[Point]) -> str:
         if (n := sum(bool(r["error"]) for by in point.rows.values() for r in by.values()))
     ]
     empty = [point.level.label for point in points if not point.rows]
-    told = []
+    sentences = []
     if refused:
-        told.append(
+        sentences.append(
             "Trials that the safety gate did not let begin, as no valid touch came, count as not "
             f"reached: {', '.join(refused)}."
         )
     if empty:
-        told.append(f"No trials could be run at {', '.join(empty)}.")
-    return " ".join(told)
+        sentences.append(f"No trials could be run at {', '.join(empty)}.")
+    return " ".join(sentences)
 
 
 def _picture(axis: str, points: Sequence[Point], strategies: Sequence[str], prefix: str) -> Picture:

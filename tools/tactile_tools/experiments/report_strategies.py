@@ -13,11 +13,11 @@ from tactile_tools.experiments.document import (
     Picture,
     Section,
     TableData,
+    in_words,
     percent,
     points,
     shown_p,
     slug,
-    spoken,
     whole,
 )
 from tactile_tools.experiments.findings import ByStrategy, means_of, rate_of
@@ -77,7 +77,7 @@ def strategy_sections(run: Run) -> list[Section]:
         tables = [
             TableData(
                 "Success by parameter set, engine and sensing",
-                ["", *(spoken(n) for n in order)],
+                ["", *(in_words(n) for n in order)],
                 headline,
                 name="headline",
             ),
@@ -109,7 +109,7 @@ def _section(name: str, by: ByStrategy, references: Sequence[Reference], prefix:
     ours = {n: rate_of(of) for n, of in by.items()}
     means = {column: means_of(by, column) for column in MEASURES}
     paper = references[0] if references else None
-    told = [
+    sentences = [
         findings.worst_is_straight(means["normalized_distance"], distance, "distance to the goal"),
         findings.worst_is_straight(means["normalized_time"], time, "time"),
         findings.faster_by_touch(means["normalized_time"], time),
@@ -120,7 +120,7 @@ def _section(name: str, by: ByStrategy, references: Sequence[Reference], prefix:
     ]
     return Section(
         title=name,
-        findings=[text for text in told if text],
+        findings=[text for text in sentences if text],
         tables=[
             _success_table(by, references, prefix),
             _entered_table(by, references, prefix),
@@ -175,7 +175,7 @@ def _beside(
     body = []
     for name, rows in by.items():
         rate = rate_of(rows, column)
-        cells = [spoken(name), str(len(rows)), percent(rate)]
+        cells = [in_words(name), str(len(rows)), percent(rate)]
         for theirs in others.values():
             if name not in theirs:
                 cells += ["–"] * 3
@@ -204,7 +204,7 @@ def _measures_table(by: ByStrategy, references: Sequence[Reference], prefix: str
     theirs = [f"{r.label}, mean" for r in others]
     body = []
     for name, rows in by.items():
-        cells = [spoken(name)]
+        cells = [in_words(name)]
         for column, means in (
             ("normalized_distance", [r.distance for r in others]),
             ("normalized_time", [r.time for r in others]),
@@ -233,7 +233,7 @@ def _pairs_table(caption: str, pairs: Sequence[PairedValues], name: str) -> Tabl
         ["pair", "scenes", "mean difference", "rank effect", "p", "p (Holm)", ""],
         [
             [
-                f"{spoken(pair.a)} – {spoken(pair.b)}",
+                f"{in_words(pair.a)} – {in_words(pair.b)}",
                 str(pair.scenes),
                 f"{pair.mean_difference:+.3f}",
                 f"{pair.effect:+.2f}",
@@ -264,7 +264,7 @@ def _mcnemar_table(by: ByStrategy, prefix: str) -> TableData:
         ["pair", "only the first", "only the second", "difference [95 %]", "p", "p (Holm)", ""],
         [
             [
-                f"{spoken(a)} – {spoken(b)}",
+                f"{in_words(a)} – {in_words(b)}",
                 str(r.only_a),
                 str(r.only_b),
                 points(r.difference, r.interval),
@@ -291,7 +291,7 @@ def _behaviour_table(by: ByStrategy, prefix: str) -> TableData:
         ]
         body.append(
             [
-                spoken(name),
+                in_words(name),
                 *parts,
                 f"{25 * mean(rows, 'ejected'):.1f}",
                 f"{mean(rows, 'peak_contact_n'):.1f}",

@@ -163,7 +163,7 @@ def _finding(grid: Grid) -> str:
 def _where(grid: Grid) -> str:
     """Say which quarter of the grid is worst, and which the paper says to avoid."""
     rows, columns = ("A_bur", "f_bur") if grid.key[0] == "burrow" else ("t_excv", "t_trig")
-    told = []
+    sentences = []
     for metric in METRICS:
         smooth = grid.smooth(metric)
         if not np.isfinite(smooth).all():
@@ -175,10 +175,10 @@ def _where(grid: Grid) -> str:
         }
         down, across = max(quarters, key=lambda q: quarters[q])
         paper = PAPER_SWEEP.avoid[grid.key[0], metric]
-        told.append(
+        sentences.append(
             f"{metric} is worst where {rows} is {down} and {columns} {across} (paper: {paper})"
         )
-    return f"By quarters of the grid, {'; '.join(told)}." if told else ""
+    return f"By quarters of the grid, {'; '.join(sentences)}." if sentences else ""
 
 
 def _worst_table(grids: Sequence[Grid], prefix: str) -> TableData:

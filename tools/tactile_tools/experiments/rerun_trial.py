@@ -18,7 +18,7 @@ from tactile_tools.experiments.tables import load_run
 from tactile_tools.experiments.trial import run_one
 
 
-def run_again(options: argparse.Namespace) -> int:
+def rerun(options: argparse.Namespace) -> int:
     """Run the trial that ``options`` name. Returns 0 if it ran and, for a row, came out the
     same."""
     if options.png is not None and options.log is None:
@@ -44,10 +44,10 @@ def run_again(options: argparse.Namespace) -> int:
         print(f"wrote {options.png}")
     if recorded is None:
         return 0
-    return _judge(recorded, row)
+    return _compare(recorded, row)
 
 
-def _judge(recorded: Row, row: Row) -> int:
+def _compare(recorded: Row, row: Row) -> int:
     """Print whether the row came out the same. Returns the exit status."""
     before, now = outcome_of(recorded), outcome_of(row)
     different = [name for name in before if before[name] != now[name]]

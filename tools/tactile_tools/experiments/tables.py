@@ -61,12 +61,12 @@ class Run:
 
 
 def load_run(directory: Path) -> Run:
-    """Load the run in ``directory``, or one kept by `put_by`; FolderError or TableError."""
+    """Load the run in ``directory``, or one kept by `archive`; FolderError or TableError."""
     definition: dict[str, Any] = read_definition(directory)
     study, options = rebuild(directory, definition)
     table = directory / "trials.parquet"
     if table.exists() and not (directory / "trials.jsonl").exists():
-        # A run kept by `put_by`, which writes only the table.
+        # A run kept by `archive`, which writes only the table.
         found = read_table(table)
     else:
         found = list(read_lines(directory).values())
@@ -75,7 +75,7 @@ def load_run(directory: Path) -> Run:
     return Run(directory, study, options, rows)
 
 
-def put_by(run: Run, directory: Path) -> None:
+def archive(run: Run, directory: Path) -> None:
     """Write to ``directory`` what `load_run` needs of ``run``, as small as possible; OSError."""
     directory.mkdir(parents=True, exist_ok=True)
     replace_file(directory / "experiment.json", (run.directory / "experiment.json").read_bytes())

@@ -65,7 +65,7 @@ def run_batch(specs: Sequence[TrialSpec]) -> list[Row]:
     return [run_one(spec) for spec in specs]
 
 
-def lost(spec: TrialSpec, why: str) -> Row:
+def lost_row(spec: TrialSpec, why: str) -> Row:
     """Row of a trial whose worker died; it holds only ``why``."""
     row: Row = dict.fromkeys(NAMES)
     row.update({name: getattr(spec, name) for name in IDENTITY})

@@ -29,7 +29,7 @@ class BoardError(CommandError):
     """A request to a board failed."""
 
 
-def told(work: Callable[[argparse.Namespace], None]) -> Callable[[argparse.Namespace], int]:
+def as_command(work: Callable[[argparse.Namespace], None]) -> Callable[[argparse.Namespace], int]:
     """``work`` as a command: what the bus or a daemon refuses becomes a `CommandError`."""
 
     def command(options: argparse.Namespace) -> int:

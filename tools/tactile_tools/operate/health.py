@@ -13,16 +13,16 @@ from tactile_core.options import BusTable, bus_config
 if TYPE_CHECKING:
     import zenoh
 
-HEALTHY, DEGRADED, USAGE, NOBODY, FAILED = range(5)
+HEALTHY, DEGRADED, USAGE, NO_ANSWER, FAILED = range(5)
 """Exit statuses: all well; needs attention; bad argument; no answer; something has failed."""
 
-WORDS = {HEALTHY: "OK", DEGRADED: "WARNING", FAILED: "CRITICAL", NOBODY: "NOBODY"}
+WORDS = {HEALTHY: "OK", DEGRADED: "WARNING", FAILED: "CRITICAL", NO_ANSWER: "NOBODY"}
 
 LATE_S = 0.010
 """Lateness of the control loop (99.9 %) that is too much, s: a whole cycle."""
 
 KINDS = ("tactile", "reach", "arm")
-CALLED = {"tactile": "board", "reach": "reach", "arm": "arm"}
+LABELS = {"tactile": "board", "reach": "reach", "arm": "arm"}
 
 
 @dataclass
@@ -49,13 +49,13 @@ def run(options: argparse.Namespace) -> int:
         session = open_session(bus_config(options, BusTable(), "tool"))
     except BusError as error:
         print(f"tactile health: {error}", file=sys.stderr)
-        return NOBODY
+        return NO_ANSWER
     try:
-        wanted = {kind: list(getattr(options, CALLED[kind])) for kind in KINDS}
-        parts = look(session, wanted, options.wait)
+        wanted = {kind: list(getattr(options, LABELS[kind])) for kind in KINDS}
+        parts = check(session, wanted, options.wait)
     finally:
         close_session(session)
-    level = max((part.level for part in parts), default=NOBODY)
+    level = max((part.level for part in parts), default=NO_ANSWER)
     if options.json:
         print(json.dumps({"level": WORDS[level], "parts": [_shown(p) for p in parts]}))
     else:
@@ -72,7 +72,7 @@ def line(level: int, parts: list[Part]) -> str:
     return f"{WORDS[level]}: " + " | ".join([*wrong, *well])
 
 
-def look(session: zenoh.Session, wanted: dict[str, list[str]], timeout: float) -> list[Part]:
+def check(session: zenoh.Session, wanted: dict[str, list[str]], timeout: float) -> list[Part]:
     """Ask those that are there, or those ``wanted``; in a fixed order. ``timeout``: s."""
     from tactile_core.bus.services import ServiceError, call
     from tactile_core.bus.topics import service_key
@@ -83,7 +83,7 @@ def look(session: zenoh.Session, wanted: dict[str, list[str]], timeout: float) -
         if not any(wanted.values()):
             names = dict.fromkeys(_alive(session, kind, timeout))
         for name in names:
-            part = Part(CALLED[kind], name)
+            part = Part(LABELS[kind], name)
             parts.append(part)
             try:
                 status = call(session, service_key(name, "status", kind), timeout=timeout)

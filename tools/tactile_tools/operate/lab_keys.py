@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 CA_KEY = "ca.key"
 """File of the authority's private key, in the lab's folder."""
 
-HERE = ("localhost", "127.0.0.1", "::1")
+LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
 """Names of the machine itself, which every daemon's certificate contains."""
 
-LISTENS: tuple[CertificateRole, ...] = ("tactiled", "reachd", "arm")
+SERVER_ROLES: tuple[CertificateRole, ...] = ("tactiled", "reachd", "arm")
 """Roles that others connect to; no other certificate can pass as a server's."""
 
 PARTY = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
@@ -210,9 +210,9 @@ def _party(
         x509.BasicConstraints(ca=False, path_length=None), critical=True
     ).add_extension(_usage(authority=False), critical=True)
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
-    if role in LISTENS:
+    if role in SERVER_ROLES:
         uses.append(ExtendedKeyUsageOID.SERVER_AUTH)
-        names = x509.SubjectAlternativeName(list(_hosts((*HERE, *order.hosts))))
+        names = x509.SubjectAlternativeName(list(_hosts((*LOCAL_NAMES, *order.hosts))))
         builder = builder.add_extension(names, critical=False)
     builder = builder.add_extension(x509.ExtendedKeyUsage(uses), critical=False).add_extension(
         x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()),

@@ -61,12 +61,12 @@ class Plan:
 
 def install(options: argparse.Namespace) -> int:
     """``tactile service install``."""
-    return _guarded(_put, options)
+    return _guarded(_install, options)
 
 
 def uninstall(options: argparse.Namespace) -> int:
     """``tactile service uninstall``."""
-    return _guarded(_take_away, options)
+    return _guarded(_uninstall, options)
 
 
 def _guarded(work: Callable[[argparse.Namespace], object], options: argparse.Namespace) -> int:
@@ -83,7 +83,7 @@ def _guarded(work: Callable[[argparse.Namespace], object], options: argparse.Nam
     return DONE
 
 
-def _put(options: argparse.Namespace) -> None:
+def _install(options: argparse.Namespace) -> None:
     programs = (options.bin or Path(sys.argv[0]).parent).absolute()
     if not (programs / "tactiled").exists():
         programs = Path(sys.executable).parent
@@ -105,7 +105,7 @@ def _put(options: argparse.Namespace) -> None:
             target.parent.mkdir(parents=True, exist_ok=True)
             _write(target, plan.text(name))
     if plan.live:
-        _tell(
+        _notify_managers(
             ["systemd-sysusers"],
             ["systemctl", "daemon-reload"],
             ["udevadm", "control", "--reload"],
@@ -119,10 +119,10 @@ def _put(options: argparse.Namespace) -> None:
     )
 
 
-def _take_away(options: argparse.Namespace) -> None:
+def _uninstall(options: argparse.Namespace) -> None:
     plan = Plan(options.root, Path("/"), options.dry_run)
     if plan.live:
-        _tell(["systemctl", "disable", "--now", *UNITS])
+        _notify_managers(["systemctl", "disable", "--now", *UNITS])
     for name, folder in PLACES.items():
         target = plan.target(name)
         if not target.exists():
@@ -137,7 +137,7 @@ def _take_away(options: argparse.Namespace) -> None:
     if options.purge and not plan.dry and folder.is_dir() and not any(folder.iterdir()):
         folder.rmdir()
     if plan.live:
-        _tell(["systemctl", "daemon-reload"], ["udevadm", "control", "--reload"])
+        _notify_managers(["systemctl", "daemon-reload"], ["udevadm", "control", "--reload"])
     print("Logs in /var/lib/tactile and the user tactile are left as they are.")
 
 
@@ -148,7 +148,7 @@ def _write(path: Path, text: str) -> None:
     os.replace(new, path)
 
 
-def _tell(*commands: Iterable[str]) -> None:
+def _notify_managers(*commands: Iterable[str]) -> None:
     """Run commands that notify the system's managers; those not installed are reported and
     skipped."""
     for words in commands:

@@ -23,21 +23,21 @@ def status(options: argparse.Namespace) -> None:
         names = boards.find(session, options)
         if options.board is not None:
             names = [boards.choose(options.board, names)]
-        told: dict[str, Any] = {}
+        statuses: dict[str, Any] = {}
         for name in names:
             try:
-                told[name] = call(session, service_key(name, "status"), timeout=boards.STATUS_S)
+                statuses[name] = call(session, service_key(name, "status"), timeout=boards.STATUS_S)
             except ServiceError as error:
-                told[name] = {"state": "unknown", "reasons": [str(error)]}
+                statuses[name] = {"state": "unknown", "reasons": [str(error)]}
     if options.json:
-        print(json.dumps(told, indent=2, ensure_ascii=False))
+        print(json.dumps(statuses, indent=2, ensure_ascii=False))
         return
     width = shutil.get_terminal_size().columns
-    for name, values in told.items():
+    for name, values in statuses.items():
         print("\n".join(describe(name, values, width)))
 
 
-run = boards.told(status)
+run = boards.as_command(status)
 
 
 def describe(name: str, values: Mapping[str, Any], width: int) -> list[str]:

@@ -36,4 +36,4 @@ def tare(options: argparse.Namespace) -> None:
         print(f"{name}: {report['message']}")
 
 
-run = boards.told(tare)
+run = boards.as_command(tare)

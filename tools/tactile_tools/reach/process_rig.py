@@ -239,22 +239,22 @@ class LiveReach:
         while not done():
             for name, process in self._running.items():
                 if process.poll() not in (None, -signal.SIGKILL):
-                    raise WatchError(f"{name} ended: {self._said(name)}")
+                    raise WatchError(f"{name} ended: {self._output_of(name)}")
             if time.monotonic() > end:
-                raise WatchError(f"{what} did not come: {self._said('reachd')}")
+                raise WatchError(f"{what} did not come: {self._output_of('reachd')}")
             time.sleep(0.005)
 
-    def _said(self, name: str) -> str:
+    def _output_of(self, name: str) -> str:
         return (self.folder / f"{name}.txt").read_text(errors="replace")[-800:]
 
     def wait_ready(self) -> None:
         """Wait until all three send, and the features are valid."""
         self.clear()
         for topic in (ARM_STATE, FEATURES, REACH_STATE):
-            self.until(partial(self._hears, topic), f"the first {topic.template}")
+            self.until(partial(self._has_heard, topic), f"the first {topic.template}")
         self.until(lambda: self.last(FEATURES).valid, "valid features")
 
-    def _hears(self, topic: Topic) -> bool:
+    def _has_heard(self, topic: Topic) -> bool:
         return bool(self.heard[topic])
 
     def last(self, topic: Topic) -> Any:

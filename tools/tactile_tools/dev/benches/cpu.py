@@ -43,8 +43,8 @@ def _percent(fingers: int, seconds: float) -> float:
         process = stack.enter_context(running(daemon, folder / "tactiled.txt"))
         time.sleep(WARM_UP_S)
         if process.poll() is not None:
-            said = (folder / "tactiled.txt").read_text(errors="replace")
-            raise RuntimeError(f"tactiled ended: {said[-2000:]}")
+            output = (folder / "tactiled.txt").read_text(errors="replace")
+            raise RuntimeError(f"tactiled ended: {output[-2000:]}")
         watched = psutil.Process(process.pid)
         before, started = watched.cpu_times(), time.monotonic()
         time.sleep(seconds)

@@ -78,10 +78,10 @@ def bench_latency(*, quick: bool = False) -> dict[str, float]:
                     run.close()
             wire, bare = run.results()
             if len(wire) < seconds / PERIOD_S / 2 or len(bare) < seconds / PERIOD_S / 2:
-                said = (folder / "tactiled.txt").read_text(errors="replace")[-1500:]
+                output = (folder / "tactiled.txt").read_text(errors="replace")[-1500:]
                 raise RuntimeError(
                     f"only {len(wire)} features and {len(bare)} bare messages came; "
-                    f"tactiled said: {said}"
+                    f"tactiled output: {output}"
                 )
     return {
         "wire_to_feature_ms_p50": float(np.percentile(wire, 50)),

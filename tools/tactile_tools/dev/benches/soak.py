@@ -38,8 +38,8 @@ def bench_soak(*, quick: bool = False) -> dict[str, float]:
             with running(daemon, folder / "tactiled.txt") as process:
                 readings = _readings(psutil.Process(process.pid), seconds)
                 if process.poll() is not None:
-                    said = (folder / "tactiled.txt").read_text(errors="replace")
-                    raise RuntimeError(f"tactiled ended during the soak: {said[-2000:]}")
+                    output = (folder / "tactiled.txt").read_text(errors="replace")
+                    raise RuntimeError(f"tactiled ended during the soak: {output[-2000:]}")
         log_mb = sum(p.stat().st_size for p in folder.glob("*.mcap")) / 1e6
     part = max(1, len(readings) // 20)
     first, last = np.median(readings[:part]), np.median(readings[-part:])

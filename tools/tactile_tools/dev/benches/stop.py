@@ -20,12 +20,12 @@ TIMES = 20
 TIMES_QUICK = 2
 WATCH_S = 0.5  # what is watched after the signal; below the 1 s after which the gate latches
 MOVING_S = (0.4, 0.9)  # the arm has moved for so long when the signal comes
-TRIES = 4  # a trial that the machine spoilt is made again
+TRIES = 4  # an invalid trial is repeated
 
 NS_PER_MS = 1e6
 
 
-class SpoiltTrialError(RuntimeError):
+class InvalidTrialError(RuntimeError):
     """The trial says nothing: the arm was not moving, or the signal came too late."""
 
 
@@ -85,7 +85,7 @@ def _trial(live: LiveReach, case: Case, number: signal.Signals, rng: np.random.G
         time.sleep(WATCH_S)
         try:
             found = case.measure(live, since)
-        except SpoiltTrialError:
+        except InvalidTrialError:
             if not left:
                 raise
             found = -1.0
@@ -96,7 +96,7 @@ def _trial(live: LiveReach, case: Case, number: signal.Signals, rng: np.random.G
         live.wait_ready()
         if found >= 0:
             return found
-    raise SpoiltTrialError(f"{case.process} was hit {TRIES} times and the arm never moved then")
+    raise InvalidTrialError(f"{case.process} was hit {TRIES} times and the arm never moved then")
 
 
 def zero_after(live: LiveReach, topic: Topic, since: int) -> float:
@@ -105,7 +105,7 @@ def zero_after(live: LiveReach, topic: Topic, since: int) -> float:
     commands = live.decoded(COMMAND)
     moving = [k for k, (_, m) in enumerate(commands) if is_moving(m.twist)]
     if not kept or not moving or commands[moving[-1]][0] < since:
-        raise SpoiltTrialError("the arm was not moving when the signal came")
+        raise InvalidTrialError("the arm was not moving when the signal came")
     if moving[-1] + 1 == len(commands):
         raise RuntimeError(f"no zero twist came within {WATCH_S} s of the signal")
     return float(commands[moving[-1] + 1][0] - kept[-1][1].captured_ns) / NS_PER_MS
@@ -116,7 +116,7 @@ def rest_after(live: LiveReach, since: int) -> float:
     commands, states = live.decoded(COMMAND), live.decoded(ARM_STATE)
     moving = [k for k, (_, m) in enumerate(states) if is_moving(m.twist)]
     if not commands or not moving or states[moving[-1]][1].captured_ns < since:
-        raise SpoiltTrialError("the arm was not moving when the signal came")
+        raise InvalidTrialError("the arm was not moving when the signal came")
     if moving[-1] + 1 == len(states):
         raise RuntimeError(f"the arm moved on for {WATCH_S} s after the signal")
     return float(states[moving[-1] + 1][1].captured_ns - commands[-1][0]) / NS_PER_MS

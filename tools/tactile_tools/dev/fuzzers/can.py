@@ -67,7 +67,7 @@ class CanFuzzer:
         before = self.touched
         queues: list[list[CanFrame]] = []
         for board in BOARDS:
-            queues.append(self._spoil(*self._transfers(board)))
+            queues.append(self._corrupt(*self._transfers(board)))
         frames = self._interleave(queues)
         self.judge.receive(self._decoder.feed(frames[: len(frames) // 2]))
         self.judge.receive(self._decoder.feed(frames[len(frames) // 2 :]))
@@ -84,7 +84,7 @@ class CanFuzzer:
             self.judge.send(name)
         return names, [list(self._encoders[board].encode(message)) for message, _ in chosen]
 
-    def _spoil(self, names: list[Hashable], transfers: list[list[CanFrame]]) -> list[CanFrame]:
+    def _corrupt(self, names: list[Hashable], transfers: list[list[CanFrame]]) -> list[CanFrame]:
         """Frames of one board, with each transfer mutated."""
         out: list[CanFrame] = []
         delayed: list[CanFrame] = []
@@ -93,17 +93,17 @@ class CanFuzzer:
         for name, frames, number, r in zip(names, transfers, kinds, draws, strict=True):
             kind = KINDS[number]
             self.kinds[kind] += 1
-            spoilt, later = self._one(kind, list(frames), transfers, r)
+            corrupted, later = self._one(kind, list(frames), transfers, r)
             if kind == "repeat_later" and len(frames) == 1:
                 # The whole message was sent twice; a later copy cannot be told from a new one.
                 self.judge.send(name)
-            if spoilt != frames and kind not in _HARMLESS:
+            if corrupted != frames and kind not in _HARMLESS:
                 self.touched += 1
-            out += spoilt
+            out += corrupted
             # Delayed frames appear in the middle of whatever is sent two transfers later.
             if len(delayed) > 2 or (delayed and r[3] % 3 == 0):
                 # Not between a frame and its repetition, which would then be a separate message.
-                at = len(out) - (0 if kind == "duplicate" else r[3] % (len(spoilt) + 1))
+                at = len(out) - (0 if kind == "duplicate" else r[3] % (len(corrupted) + 1))
                 out[at:at] = delayed
                 self.strays += len(delayed)
                 delayed = []

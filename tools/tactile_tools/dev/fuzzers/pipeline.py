@@ -215,7 +215,7 @@ class PipelineFuzzer:
         self._source.written.clear()
         payload = self._board.tick(self.now)
         if hostile:
-            payload = self._spoil(payload)
+            payload = self._corrupt(payload)
         if payload:
             self._inbox.put(Chunk(self.now, payload))
         self.port.pump(Instant(self.now + 100_003))
@@ -225,9 +225,9 @@ class PipelineFuzzer:
 
     # Mutations of a frame
 
-    def _spoil(self, payload: Any) -> Any:
+    def _corrupt(self, payload: Any) -> Any:
         if self.kind == "floats":
-            return self._spoil_floats(payload)
+            return self._corrupt_floats(payload)
         raws = list(self._raws(payload))
         out: list[bytes] = []
         for raw in raws:
@@ -302,7 +302,7 @@ class PipelineFuzzer:
                 return [raw] * int(rng.integers(2, 6))
         return [_pack(bytes(head), bytes(body))]
 
-    def _spoil_floats(self, payload: bytes) -> bytes:
+    def _corrupt_floats(self, payload: bytes) -> bytes:
         rng = self._rng
         if not payload:
             return payload

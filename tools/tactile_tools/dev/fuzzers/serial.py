@@ -63,7 +63,7 @@ def _blank(data: bytes, r: Draw) -> bytes:
     return data[:start] + filler * min(run, len(data) - start) + data[start + run :]
 
 
-_SPOIL: dict[str, Callable[[bytes, Draw], bytes]] = {
+_ON_WIRE: dict[str, Callable[[bytes, Draw], bytes]] = {
     "flip": _flip,
     "burst": _burst,
     "truncate": _truncate,
@@ -77,7 +77,7 @@ _INSIDE = ("flip_inside", "burst_inside", "graft_inside", "noise_inside")
 """Mutations of the packet, which is then encoded again: framing notices nothing."""
 
 _WHOLE = ("splice", "noise", "drop", "reorder", "duplicate", "intact")
-KINDS = (*_SPOIL, *_INSIDE, *_WHOLE)
+KINDS = (*_ON_WIRE, *_INSIDE, *_WHOLE)
 _HARMLESS = frozenset({"reorder", "duplicate", "intact"})
 
 
@@ -140,24 +140,24 @@ class SerialFuzzer:
             wire += (frame, frame) if kind == "duplicate" else (other, frame)
             return 1 if kind == "duplicate" else 2
         used = 1
-        if kind in _SPOIL:
-            spoilt = _SPOIL[kind](frame, r)
+        if kind in _ON_WIRE:
+            corrupted = _ON_WIRE[kind](frame, r)
         elif kind in _INSIDE:
-            spoilt = cobs.encode(self._inside(kind, raw, other_raw, r)) + b"\0"
+            corrupted = cobs.encode(self._inside(kind, raw, other_raw, r)) + b"\0"
         elif kind == "splice":
             self.judge.send(other_name)
             self.touched += 1
             used = 2
-            spoilt = frame[: r[0] % len(frame)] + other[r[1] % len(other) :]
+            corrupted = frame[: r[0] % len(frame)] + other[r[1] % len(other) :]
         else:
-            spoilt = self._rng.bytes(len(frame)) if kind == "noise" else b""
-        if spoilt == frame:
+            corrupted = self._rng.bytes(len(frame)) if kind == "noise" else b""
+        if corrupted == frame:
             wire.append(frame)
             return used
         self.touched += 1
         # A frame without its end also destroys the next one.
-        self.glued += bool(spoilt) and spoilt[-1] != 0
-        wire.append(spoilt)
+        self.glued += bool(corrupted) and corrupted[-1] != 0
+        wire.append(corrupted)
         return used
 
     def _inside(self, kind: str, raw: bytes, other: bytes, r: Draw) -> bytes:
