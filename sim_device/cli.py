@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import gc
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -78,22 +79,28 @@ def _request(arguments: argparse.Namespace) -> BoardsRequest:
 def cupboard(arguments: argparse.Namespace) -> int:
     """``simdevice cupboard``."""
     from sim_device.arm.cupboard_plan import goal_text, plan_cupboard, scene_of
+
+    with _world_errors():
+        try:
+            request = _cupboard_request(arguments)
+            if arguments.print_goal:
+                print(goal_text(scene_of(request)))
+                return DONE
+            planned = plan_cupboard(request)
+        except ValueError as error:
+            raise CommandError(str(error)) from error
+        # Services answer on other threads: the world must get its turn within a tick.
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        return _serve(planned, arguments)
+
+
+@contextmanager
+def _world_errors() -> Iterator[None]:
+    """Report that the physics failed, while a world is built or runs, as a `CommandError`."""
     from sim_device.world.base import WorldError
 
     try:
-        request = _cupboard_request(arguments)
-        if arguments.print_goal:
-            print(goal_text(scene_of(request)))
-            return DONE
-        planned = plan_cupboard(request)
-    except WorldError as error:
-        raise CommandError(str(error), REFUSED) from error
-    except ValueError as error:
-        raise CommandError(str(error)) from error
-    # Services answer on other threads: the world must get its turn within a tick.
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
-    try:
-        return _serve(planned, arguments)
+        yield
     except WorldError as error:
         raise CommandError(str(error), REFUSED) from error
 
@@ -129,7 +136,6 @@ def robot(arguments: argparse.Namespace) -> int:
     """``simdevice ur`` and ``simdevice xarm``."""
     from sim_device.ports_plan import BoardsRequest
     from sim_device.robots.plan import RobotRequest, plan_robot
-    from sim_device.world.base import WorldError
     from tactile_core.options import BusTable, bus_config
 
     scene_seed, seed = seeds_of(arguments)
@@ -149,17 +155,13 @@ def robot(arguments: argparse.Namespace) -> int:
         boards=BoardsRequest(ptys=tuple(arguments.pty), seed=seed),
         bus=bus_config(arguments, BusTable(), "tool") if arguments.world else None,
     )
-    try:
-        planned = plan_robot(request)
-    except WorldError as error:
-        raise CommandError(str(error), REFUSED) from error
-    except ValueError as error:
-        raise CommandError(str(error)) from error
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
-    try:
+    with _world_errors():
+        try:
+            planned = plan_robot(request)
+        except ValueError as error:
+            raise CommandError(str(error)) from error
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
         return _serve(planned, arguments)
-    except WorldError as error:
-        raise CommandError(str(error), REFUSED) from error
 
 
 def replay(arguments: argparse.Namespace) -> int:

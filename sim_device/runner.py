@@ -36,6 +36,7 @@ much later. Without this wait, a replay would begin before anybody reads, and en
 read."""
 
 Payload = TypeVar("Payload", bytes, tuple[CanFrame, ...])
+AnyPort = TypeVar("AnyPort", bound=PtyPort | SlcanPort | PythonCanPort)
 
 
 class Board(Protocol[Payload]):
@@ -84,13 +85,37 @@ class PortServer(Protocol):
         """Pass on everything that is due."""
 
 
-class SerialPortServer:
+class _OnePort(Generic[AnyPort]):
+    """What servers of one ``port`` share."""
+
+    def __init__(self, port: AnyPort) -> None:
+        self.port = port
+
+    @property
+    def finished(self) -> bool:
+        """False: boards run until they are stopped."""
+        return False
+
+    def fileno(self) -> int:
+        """Descriptor of the port; −1 for none."""
+        return self.port.fileno()
+
+    def open(self) -> None:
+        """Open the port."""
+        self.port.open()
+
+    def close(self) -> None:
+        """Close the port."""
+        self.port.close()
+
+
+class SerialPortServer(_OnePort[PtyPort]):
     """Board on a pseudo-terminal. ``unplugged``: when it has neither power nor port."""
 
     def __init__(
         self, port: PtyPort, make_board: MakeBoard[bytes], unplugged: Sequence[Window] = ()
     ) -> None:
-        self.port = port
+        super().__init__(port)
         self.board: Board[bytes] = make_board(0.0)
         self.sent = 0
         self._make_board = make_board
@@ -102,23 +127,6 @@ class SerialPortServer:
     def losses(self) -> dict[str, int]:
         """What was lost at the port and at the board, by reason."""
         return self.port.losses | _only_losses(self.board.counters)
-
-    @property
-    def finished(self) -> bool:
-        """False: a board runs until it is stopped."""
-        return False
-
-    def fileno(self) -> int:
-        """Descriptor of the port; −1 while closed."""
-        return self.port.fileno()
-
-    def open(self) -> None:
-        """Open the port."""
-        self.port.open()
-
-    def close(self) -> None:
-        """Close the port."""
-        self.port.close()
 
     def service(self, now: Instant) -> None:
         """Unplug or plug in when it is time, then pass bytes on."""
@@ -142,7 +150,7 @@ class SerialPortServer:
             self.port.send(out)
 
 
-class CanPortServer:
+class CanPortServer(_OnePort[SlcanPort | PythonCanPort]):
     """Boards on one CAN bus."""
 
     def __init__(
@@ -150,7 +158,7 @@ class CanPortServer:
         port: SlcanPort | PythonCanPort,
         make_boards: Sequence[MakeBoard[tuple[CanFrame, ...]]],
     ) -> None:
-        self.port = port
+        super().__init__(port)
         self.boards = [make(0.0) for make in make_boards]
         self.sent = 0
         self._feeders = [_Feeder[tuple[CanFrame, ...]](math.inf) for _ in self.boards]
@@ -163,23 +171,6 @@ class CanPortServer:
             for reason, count in _only_losses(board.counters).items():
                 total[reason] = total.get(reason, 0) + count
         return total
-
-    @property
-    def finished(self) -> bool:
-        """False: boards run until they are stopped."""
-        return False
-
-    def fileno(self) -> int:
-        """Descriptor of the port; −1 for none."""
-        return self.port.fileno()
-
-    def open(self) -> None:
-        """Open the port."""
-        self.port.open()
-
-    def close(self) -> None:
-        """Close the port."""
-        self.port.close()
 
     def service(self, now: Instant) -> None:
         """Pass frames on. Boards receive what the host sends, not what other boards send."""
@@ -194,12 +185,12 @@ class CanPortServer:
                 self.port.send(out, now)
 
 
-class ReplayPortServer:
+class ReplayPortServer(_OnePort[PtyPort]):
     """Recording on a pseudo-terminal. Nothing of it is lost: it begins when a host reads, and
     waits while no host does."""
 
     def __init__(self, port: PtyPort, board: ReplayBoard) -> None:
-        self.port = port
+        super().__init__(port)
         self.board = board
         self._ended: Instant | None = None
         self._full: Instant | None = None
@@ -224,18 +215,6 @@ class ReplayPortServer:
             return False
         waited = seconds_between(self._ended, self._now)
         return waited > (DRAIN_S if self.port.unread else SETTLE_S)
-
-    def fileno(self) -> int:
-        """Descriptor of the port; −1 while closed."""
-        return self.port.fileno()
-
-    def open(self) -> None:
-        """Open the port."""
-        self.port.open()
-
-    def close(self) -> None:
-        """Close the port."""
-        self.port.close()
 
     def service(self, now: Instant) -> None:
         """Send the frames that are due; begin once the probe bytes have been read."""
