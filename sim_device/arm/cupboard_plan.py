@@ -55,7 +55,9 @@ def plan_cupboard(request: CupboardRequest) -> list[Planned]:
     """
     for name in (request.arm, request.world):
         if not NAME.fullmatch(name):
-            raise ValueError(f"{name!r} is no name; allowed: letters, digits, _ and -, at most 64")
+            raise ValueError(
+                f"{name!r} is not a name; allowed: letters, digits, _ and -, at most 64"
+            )
     make_world = world_maker(request.engine)
     scene = scene_of(request)
     cupboard = Cupboard(

@@ -60,7 +60,7 @@ def parse_arm_faults(text: str) -> tuple[ScheduledFault, ...]:
 def _fault(text: str) -> ScheduledFault:
     match = _FAULT.fullmatch(text)
     kinds = ", ".join(ArmFault)
-    allowed = f"allowed: KIND, KIND@Ts or KIND@Ts+Ds, parted by commas; KIND one of {kinds}"
+    allowed = f"allowed: KIND, KIND@Ts or KIND@Ts+Ds, separated by commas; KIND one of {kinds}"
     if match is None or match["kind"] not in tuple(ArmFault):
         raise ValueError(f"arm fault {text!r} is not understood; {allowed}")
     kind = ArmFault(match["kind"])
@@ -75,7 +75,7 @@ def parse_noise(text: str) -> dict[str, Any]:
     """Fields of `ArmSettings` from text such as ``force=0.1,position=1e-4``; ValueError."""
     fields: dict[str, Any] = {}
     units = ", ".join(f"{name} ({unit})" for name, (_, unit) in NOISES.items())
-    allowed = f"allowed: NAME=STD, parted by commas; NAME one of {units}"
+    allowed = f"allowed: NAME=STD, separated by commas; NAME one of {units}"
     for item in text.split(",") if text else ():
         name, _, figure = item.partition("=")
         try:

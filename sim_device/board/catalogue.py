@@ -55,7 +55,9 @@ def controller(model: str, arrays: tuple[int, ...]) -> SkinGeometry:
     """Geometry of AnySkin boards on one controller. Boards of five sit on different sides of the
     finger."""
     if model != "anyskin":
-        raise ValueError(f"the arrays of a {model} are what they are; they are for anyskin boards")
+        raise ValueError(
+            f"the arrays of a {model} are fixed; they can be set only for anyskin boards"
+        )
     if set(arrays) == {ANYSKIN_CHIPS} and len(arrays) <= len(MOUNTS):
         return anyskin_jaws(len(arrays))
     geometry = nominal_calibration_of("anyskin", "", None, arrays).geometry

@@ -97,9 +97,9 @@ def load(path: str | Path) -> Recording:
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise RecordingError(f"{path}: broken gzip file ({error}); allowed: a whole one") from error
     except UnicodeDecodeError as error:
-        raise RecordingError(f"{path}: no text ({error.reason}); allowed: {FIXED_FORM}") from error
+        raise RecordingError(f"{path}: not text ({error.reason}); allowed: {FIXED_FORM}") from error
     except csv.Error as error:
-        raise RecordingError(f"{path}: no CSV ({error}); allowed: {FIXED_FORM}") from error
+        raise RecordingError(f"{path}: not CSV ({error}); allowed: {FIXED_FORM}") from error
     if not rows:
         raise RecordingError(f"{path}: no rows; allowed: {FIXED_FORM}")
     table = np.array(rows)

@@ -142,7 +142,7 @@ def substeps(dt: float) -> int:
     """Number of physics steps in ``dt`` s; ValueError if it is not a whole number."""
     count = round(dt / PHYSICS_STEP)
     if count < 1 or abs(count * PHYSICS_STEP - dt) > 1e-9:
-        raise ValueError(f"a step of {dt} s is no multiple of {PHYSICS_STEP} s")
+        raise ValueError(f"a step of {dt} s is not a multiple of {PHYSICS_STEP} s")
     return count
 
 

@@ -64,7 +64,7 @@ def load_recorded(path: Path) -> tuple[Scene, ...]:
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from None
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise SceneError(f"{path} is no file of recorded scenes: {error!r}") from None
+        raise SceneError(f"{path} is not a file of recorded scenes: {error!r}") from None
 
 
 def load_outcomes(path: Path) -> tuple[Outcome, ...]:

@@ -94,7 +94,7 @@ def test_invalid_recording_is_refused_with_file_and_line(
     [
         (b"", "no rows"),
         (b"\n\n", "no rows"),
-        (b"\xff\xfe\x00\x81", "no text"),
+        (b"\xff\xfe\x00\x81", "not text"),
         (gzip.compress(b"1,2,3,4\n", mtime=0)[:-6], "broken gzip"),
         (b"\x1f\x8brubbish", "broken gzip"),
         (b"1,2,\x00,4\n", "allowed"),

@@ -60,9 +60,9 @@ def test_names_in_help_match_available_names() -> None:
         (("trial", "--condition", "objects=5"), "objects = 5; allowed: an array of 2"),
         (("trial", "--png", "x.png"), "give --log as well"),
         (("trial", "--row", "somewhere"), "is not RUN:N"),
-        (("trial", "--row", "nowhere:3"), "nowhere is no folder of an experiment"),
-        (("report", "nowhere"), "nowhere is no folder of an experiment"),
-        (("compare", "nowhere", "elsewhere"), "nowhere is no folder of an experiment"),
+        (("trial", "--row", "nowhere:3"), "nowhere is not a folder of an experiment"),
+        (("report", "nowhere"), "nowhere is not a folder of an experiment"),
+        (("compare", "nowhere", "elsewhere"), "nowhere is not a folder of an experiment"),
     ],
 )
 def test_bad_argument_is_named_with_allowed_values(

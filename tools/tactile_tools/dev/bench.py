@@ -285,7 +285,7 @@ def _previous_report(path: Path | None) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise ValueError(f"cannot be read, so cannot be added to: {error}") from error
     if not isinstance(report, dict) or not isinstance(report.get("figures"), dict):
-        raise ValueError("is no report of this command: name another file")
+        raise ValueError("is not a report of this command: name another file")
     return report
 
 

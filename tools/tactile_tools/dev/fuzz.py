@@ -215,7 +215,9 @@ def run(options: argparse.Namespace) -> int:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
     if options.out is not None and not options.out.parent.is_dir():
-        print(f"{options.out}: no directory {options.out.parent}; make it first", file=sys.stderr)
+        print(
+            f"{options.out}: no such folder {options.out.parent}; create it first", file=sys.stderr
+        )
         return 2
     columns = ("[progress.description]{task.description}", BarColumn(), MofNCompleteColumn())
     with Progress(*columns, TimeRemainingColumn()) as bar:

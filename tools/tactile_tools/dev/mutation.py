@@ -217,7 +217,7 @@ def _judge_all(package: Path, tests: Sequence[str], options: argparse.Namespace)
         ["pytest", "numpy", "hypothesis", "scipy.integrate"]
     )
     if judge(package, None, tests, options.patience) != "survived":
-        print("the tests fail on the package as it is: mend that first", file=sys.stderr)
+        print("the tests fail on the unchanged package: fix that first", file=sys.stderr)
         return 3
     verdicts = []
     console = Console()

@@ -138,7 +138,7 @@ def read_definition(directory: Path) -> dict[str, Any]:
         raw = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise FolderError(
-            f"{directory} is no folder of an experiment: cannot read {path.name} ({error})"
+            f"{directory} is not a folder of an experiment: cannot read {path.name} ({error})"
         ) from None
     if not isinstance(raw, dict) or raw.get("format") != FORMAT:
         found = raw.get("format") if isinstance(raw, dict) else type(raw).__name__
@@ -232,8 +232,8 @@ def _refuse_other_files(directory: Path) -> None:
     if others:
         shown: Sequence[str] = others[:3]
         raise FolderError(
-            f"{directory} is no folder of an experiment and not empty (it has {', '.join(shown)}"
-            f"{', …' if len(others) > 3 else ''}): choose another --out"
+            f"{directory} is not a folder of an experiment, and not empty (it has "
+            f"{', '.join(shown)}{', …' if len(others) > 3 else ''}): choose another --out"
         )
 
 

@@ -171,7 +171,7 @@ def read_table(path: Path) -> list[Row]:
         if not whole(row):
             lacks = sorted(set(NAMES) - set(row))
             raise TableError(
-                f"{path} is no table of this version's trials"
+                f"{path} is not a table of this version's trials"
                 + (f": it lacks {', '.join(lacks)}" if lacks else "")
                 + "; run the experiment again"
             )

@@ -77,7 +77,7 @@ def choose(wanted: str | None, names: list[str]) -> str:
     if wanted is None and len(names) == 1:
         return names[0]
     if wanted is None:
-        raise BoardError(f"there are several boards; name one of them: {there}", USAGE)
+        raise BoardError(f"there are several boards; name one: {there}", USAGE)
     if wanted not in names:
-        raise BoardError(f"there is not a board {wanted!r}; there is {there}", USAGE)
+        raise BoardError(f"no such board: {wanted!r}; available: {there}", USAGE)
     return wanted

@@ -154,7 +154,7 @@ def _notify_managers(*commands: Iterable[str]) -> None:
     for words in commands:
         line = list(words)
         if shutil.which(line[0]) is None:
-            print(f"left out {' '.join(line)}: there is no {line[0]}")
+            print(f"left out {' '.join(line)}: {line[0]} is not installed")
             continue
         done = subprocess.run(line, check=False, capture_output=True, text=True)
         if done.returncode != 0:

@@ -119,7 +119,7 @@ def _calibration(used: Mapping[str, Any]) -> str:
     if not used:
         return ""
     if used.get("nominal"):
-        return "none: forces are nominal, right to about a factor of two"
+        return "none: forces are nominal, accurate to about a factor of two"
     return str(used.get("file") or used.get("hash", ""))
 
 
