@@ -74,15 +74,15 @@ COMMANDS = {
 
 ARM_HELP = """\
 faults of the arm, separated by commas: silent, frozen, stale, biased, refuses_limits, backwards,
-sideways, fast (it moves so, or 5 times as fast as it is told), fault, estop; each from the start,
-@Ts or @Ts+Ds (T s after the start, for D s), such as silent@5s+1s,estop@8s.
-fault and estop are given for 0.2 s where D is left out, and hold the arm until it is cleared.
+sideways (it moves that way), fast (5 times as fast as commanded), fault, estop; each from the
+start, @Ts or @Ts+Ds (T s after the start, for D s), such as silent@5s+1s,estop@8s.
+fault and estop last 0.2 s without +Ds, and hold the arm until it is cleared.
 noise of the arm, separated by commas: position (m), heading (rad), speed (m/s), turn (rad/s),
 force (N), moment (N·m), each =STD, such as position=1e-4,force=0.1
 
-services, JSON: arm/NAME/srv/claim {name, clock} and release grant who commands the arm;
-arm/NAME/srv/limits {v_max, omega_max, f_max, m_max} (m/s, rad/s, N, N·m) and clear are its
-commander's while it has one (reachd clears it for an operator: reach/NAME/srv/clear);
+services, JSON: arm/NAME/srv/claim {name, clock} and release take and give up command of the arm;
+arm/NAME/srv/limits {v_max, omega_max, f_max, m_max} (m/s, rad/s, N, N·m) and clear are for its
+commander only, if it has one (reachd clears it for an operator: reach/NAME/srv/clear);
 arm/NAME/srv/status; world/WORLD/srv/reset {seed} (left out: the same scene),
 world/WORLD/srv/status. Objects, finger and goal are at world/WORLD/objects at 10 Hz.
 """

@@ -161,12 +161,12 @@ def test_bus_off_is_reported_by_error_frames_and_ends() -> None:
     wire = CanWire(FaultPlan(busoff=(Window(1.0, 0.5),)))
     data = can_frames(1)
     assert wire.pass_on(data, 0.9) == data
-    (told,) = wire.pass_on(data, 1.0)
-    assert told.error
-    assert reported_state(told) is BusState.BUS_OFF
+    (frame,) = wire.pass_on(data, 1.0)
+    assert frame.error
+    assert reported_state(frame) is BusState.BUS_OFF
     assert wire.pass_on(data, 1.2) == []
-    told, *rest = wire.pass_on(data, 1.5)
-    assert reported_state(told) is BusState.ACTIVE
+    frame, *rest = wire.pass_on(data, 1.5)
+    assert reported_state(frame) is BusState.ACTIVE
     assert rest == data
     counters = wire.counters
     assert counters["lost"] == 2 * len(data)

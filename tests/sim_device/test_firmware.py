@@ -191,9 +191,9 @@ def test_unknown_commands_are_refused_by_number(real_skin, identity, host) -> No
 def test_garbage_from_the_host_is_counted(serial) -> None:
     host = serial()
     host.run(200)
-    spoilt = bytearray(encode_serial(Start(1)))
-    spoilt[3] ^= 0x10
-    host.board.receive(bytes(spoilt), Instant(200 * MS))
+    corrupted = bytearray(encode_serial(Start(1)))
+    corrupted[3] ^= 0x10
+    host.board.receive(bytes(corrupted), Instant(200 * MS))
     host.board.receive(b"\xff\xfe\xfd\0", Instant(200 * MS))
     host.board.receive(encode_serial(Log(20, 0, "not a command")), Instant(200 * MS))
     host.run(1300)

@@ -34,19 +34,19 @@ def board(contacts: tuple[Contact, ...] = ()) -> Controller:
 
 
 def run(controller: Controller, start_ms: int, end_ms: int) -> list[Message]:
-    said: list[Message] = []
+    sent: list[Message] = []
     for ms in range(start_ms, end_ms, 5):
         now = Instant(ms * MS)
         controller.advance(now)
         while messages := controller.take(now):
-            said += messages
-    return said
+            sent += messages
+    return sent
 
 
 def test_status_is_sent_before_any_identify() -> None:
-    said = run(board(), 0, 1500)
-    assert any(isinstance(m, Status) for m in said)
-    assert not any(isinstance(m, Descriptor | Samples) for m in said)
+    sent = run(board(), 0, 1500)
+    assert any(isinstance(m, Status) for m in sent)
+    assert not any(isinstance(m, Descriptor | Samples) for m in sent)
 
 
 @pytest.mark.parametrize(
@@ -106,6 +106,6 @@ def test_frame_with_bit_7_set_is_ignored() -> None:
 
 def test_each_type_counts_its_own_transfers() -> None:
     encoder = CanEncoder(5, fd=True)
-    said: tuple[Message, ...] = (Start(1), Identify(2), Start(3), Start(4), Identify(5))
-    ids = [encoder.encode(message)[-1].data[-1] & 0x1F for message in said]
+    sent: tuple[Message, ...] = (Start(1), Identify(2), Start(3), Start(4), Identify(5))
+    ids = [encoder.encode(message)[-1].data[-1] & 0x1F for message in sent]
     assert ids == [0, 0, 1, 2, 1]

@@ -42,10 +42,10 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "said"), BAD, ids=lambda v: " ".join(v)[:40])
+@pytest.mark.parametrize(("arguments", "message"), BAD, ids=lambda v: " ".join(v)[:40])
 def test_bad_input_is_refused_with_allowed_values(
     arguments: list[str],
-    said: str,
+    message: str,
     scene_file: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -61,7 +61,7 @@ def test_bad_input_is_refused_with_allowed_values(
         code = int(ended.code or 0)
     assert code == 2
     errors = capsys.readouterr().err
-    assert said in " ".join(errors.split())
+    assert message in " ".join(errors.split())
     assert "Traceback" not in errors
     assert not Path("board0").is_symlink()
 
@@ -74,14 +74,14 @@ def test_system_errors_are_distinguished_from_bad_input(
         taken.listen()
         port = taken.getsockname()[1]
         monkeypatch.setitem(sys.modules, "pymunk", None)
-        for arguments, code, said in (
+        for arguments, code, message in (
             (["--engine", "pymunk"], 2, "pip install 'tactile-reach[crosscheck]'"),
             (["--listen", f"tcp/127.0.0.1:{port}"], 3, "is in use: another arm runs"),
             (["--listen", "tcp/0.0.0.0:1"], 3, "leaves this machine unprotected"),
         ):
             quiet = ["--connect", f"tcp/127.0.0.1:{port}"]
             assert main(["cupboard", "--scene", str(scene_file), *quiet, *arguments]) == code
-            assert said in capsys.readouterr().err
+            assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["authors_sim", "hardware"])
@@ -127,9 +127,9 @@ def test_missing_recorded_scenes_are_asked_for(
     asked = tmp_path / ("empty" if place == "folder" else "tactile-reach/authors_scenes")
     words = ["cupboard", "--scene", "authors_sim_recorded", "--seed", "7", "--print-goal"]
     assert main(words) == 2
-    said = capsys.readouterr().err
-    assert f"{RECORDED_SCENES} is not in {asked}" in said
-    assert f"put {RECORDED_SCENES} and {RECORDED_OUTCOMES} there" in said
+    message = capsys.readouterr().err
+    assert f"{RECORDED_SCENES} is not in {asked}" in message
+    assert f"put {RECORDED_SCENES} and {RECORDED_OUTCOMES} there" in message
     asked.mkdir(parents=True)
     (asked / RECORDED_SCENES).write_bytes((FOUR / "scenes_5_8.json.gz").read_bytes())
     assert main(words) == 0

@@ -308,8 +308,8 @@ def test_reset_restores_arm_and_objects(cupboard: Any) -> None:
     wait_until(refused)
     commander.stop()
     cupboard.rest()
-    told = cupboard.call("reset", kind="world")
-    assert (told["goal"], told["start"]) == ([0.358, 0.1], [-0.2, 0.0, 0.0])
+    reply = cupboard.call("reset", kind="world")
+    assert (reply["goal"], reply["start"]) == ([0.358, 0.1], [-0.2, 0.0, 0.0])
     wait_until(lambda: cupboard.states[-1].x < -0.199)
     assert cupboard.states[-1].f_max == 10.0
     with pytest.raises(ServiceError, match="is one scene"):

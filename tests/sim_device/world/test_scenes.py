@@ -59,7 +59,7 @@ def test_half_extent_of_a_rotated_box(build: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"mass": 0.0}, "mass"),
         ({"mass": math.nan}, "mass"),
@@ -69,12 +69,12 @@ def test_half_extent_of_a_rotated_box(build: Any) -> None:
         ({"shape": Shape.DISC, "size_x": 0.05}, "one diameter"),
     ],
 )
-def test_impossible_objects_are_refused(change: dict[str, Any], says: str) -> None:
+def test_impossible_objects_are_refused(change: dict[str, Any], message: str) -> None:
     figures: dict[str, Any] = {
         "shape": Shape.BOX, "size_x": 0.04, "size_y": 0.04, "height": 0.07, "mass": 0.5,
         "x": 0.1, "y": 0.0, "yaw": 0.0,
     }  # fmt: skip
-    with pytest.raises(SceneError, match=says):
+    with pytest.raises(SceneError, match=message):
         SceneObject(**{**figures, **change})
 
 
@@ -91,7 +91,7 @@ def test_too_many_objects_are_refused(build: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("{", "no JSON"),
         ("[]", "format"),
@@ -100,6 +100,6 @@ def test_too_many_objects_are_refused(build: Any) -> None:
         ('{"format": 1, "goal": 3}', "damaged"),
     ],
 )
-def test_damaged_json_is_refused_with_a_reason(text: str, says: str) -> None:
-    with pytest.raises(SceneError, match=says):
+def test_damaged_json_is_refused_with_a_reason(text: str, message: str) -> None:
+    with pytest.raises(SceneError, match=message):
         Scene.from_json(text)

@@ -26,9 +26,9 @@ def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, s
         code = main(["experiment", *map(str, words)])
     except SystemExit as stop:
         code = int(stop.code or 0)
-    told = capsys.readouterr()
-    assert "Traceback" not in told.err
-    return code, told.out, told.err
+    printed = capsys.readouterr()
+    assert "Traceback" not in printed.err
+    return code, printed.out, printed.err
 
 
 def test_names_in_help_match_available_names() -> None:
@@ -37,7 +37,7 @@ def test_names_in_help_match_available_names() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
         (("strategies", "--scenes", "0"), "'0' given; allowed: a whole number of at least 1"),
         (("strategies", "--scenes", "many"), "'many' given; allowed: a whole number"),
@@ -67,7 +67,7 @@ def test_names_in_help_match_available_names() -> None:
 )
 def test_bad_argument_is_named_with_allowed_values(
     words: tuple[str, ...],
-    says: str,
+    message: str,
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -75,7 +75,7 @@ def test_bad_argument_is_named_with_allowed_values(
     monkeypatch.chdir(tmp_path)
     code, _, error = run(capsys, *words)
     assert code == 2
-    assert says in error
+    assert message in error
     assert not list(tmp_path.iterdir()), "nothing is begun with a bad argument"
 
 

@@ -175,9 +175,9 @@ def test_damaged_journal_never_invents_a_trial(rows: list[Row], data: Any) -> No
     lines = [json.dumps(row).encode() + b"\n" for row in rows]
     hit = data.draw(st.integers(0, len(lines) - 1))
     at = data.draw(st.integers(0, len(lines[hit]) - 1))
-    spoilt = bytearray(lines[hit])
-    spoilt[at] = data.draw(st.integers(0, 255).filter(lambda b: b not in b"0123456789."))
-    lines[hit] = bytes(spoilt)
+    damaged = bytearray(lines[hit])
+    damaged[at] = data.draw(st.integers(0, 255).filter(lambda b: b not in b"0123456789."))
+    lines[hit] = bytes(damaged)
     found, damaged = parse_lines(b"".join(lines))
     assert len(found) + damaged >= len(rows) - 1
     kept = [row for i, row in enumerate(rows) if i not in (hit, hit + 1)]

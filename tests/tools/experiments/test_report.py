@@ -88,13 +88,13 @@ class Links(HTMLParser):
         self.found += [v or "" for k, v in attrs if k in ("src", "href")]
 
 
-def told(document: Document) -> str:
+def text_of(document: Document) -> str:
     return "\n".join(f for s in document.sections for f in s.findings)
 
 
 def test_findings_of_the_paper_are_found_in_similar_rows(filled: Filled, tmp_path: Path) -> None:
     run = filled(strategies_study(options()), tmp_path / "run", like_the_paper)
-    text = told(build(load_run(run)))
+    text = text_of(build(load_run(run)))
     assert re.search(r"distance to the goal.* significantly worse than each of them", text)
     assert re.search(r"In time.* significantly worse than each of them", text)
     assert "is significantly faster than hybrid clock" in text
@@ -111,7 +111,7 @@ def test_opposite_findings_are_found_in_opposite_rows(filled: Filled, tmp_path: 
         return ends(spec.scene_seed < round(100 * share), spec.strategy, rng)
 
     run = filled(strategies_study(options()), tmp_path / "run", reverse)
-    text = told(build(load_run(run)))
+    text = text_of(build(load_run(run)))
     assert "significantly better than burrow" in text
     assert "is significantly slower than hybrid clock" in text
     assert "The paper's order is straight, excavate, burrow, hybrid clock, hybrid event" in text
@@ -217,7 +217,7 @@ def test_sweep_is_smoothed_and_judged(filled: Filled, tmp_path: Path) -> None:
     inside = weights[:4].sum() / weights.sum()
     assert grid.smooth("distance")[9, 0] == pytest.approx(0.25 * inside + 0.5 * (1 - inside))
     assert grid.smooth("time") == pytest.approx(np.full((10, 10), 0.75))
-    text = told(build(run))
+    text = text_of(build(run))
     assert "the claim about time holds here, the other does not" in text
     assert "The least success of a setting is 100 %" in text
 

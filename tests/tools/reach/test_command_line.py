@@ -42,14 +42,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize(("words", "said"), BAD, ids=[" ".join(words) for words, _ in BAD])
+@pytest.mark.parametrize(("words", "printed"), BAD, ids=[" ".join(words) for words, _ in BAD])
 def test_bad_input_is_refused_with_allowed_values(
-    words: list[str], said: str, folder: Path, capsys: pytest.CaptureFixture[str]
+    words: list[str], printed: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("bad.json").write_text("{")
     assert code_of(["reach", *words]) == 2
     errors = capsys.readouterr().err
-    assert said in " ".join(errors.split())
+    assert printed in " ".join(errors.split())
     assert "Traceback" not in errors
     assert [p.name for p in folder.iterdir()] == ["bad.json"], "nothing is left behind"
 
@@ -60,9 +60,9 @@ def test_unwritable_log_is_reported_before_the_trial(
 ) -> None:
     Path("taken.mcap").write_bytes(b"mine")
     assert code_of(["reach", "--scene", str(scene_file), "--log", log]) == 3
-    said = capsys.readouterr()
-    assert str(Path(log).parent if log.startswith("/") else log) in said.err
-    assert "simulated seconds" not in said.out
+    printed = capsys.readouterr()
+    assert str(Path(log).parent if log.startswith("/") else log) in printed.err
+    assert "simulated seconds" not in printed.out
     assert Path("taken.mcap").read_bytes() == b"mine"
 
 
@@ -116,13 +116,13 @@ def test_own_strategy_in_the_working_folder_may_fail(
     )
     Path("free.json").write_text(trial_trace.crowded(0).to_json())
     assert code_of(["reach", "--scene", "free.json", "--strategy", "own_strategy:Own"]) == 1
-    said = capsys.readouterr().out
-    assert "lost my way" in said
-    assert "strategy_failed × 1" in said
+    printed = capsys.readouterr().out
+    assert "lost my way" in printed
+    assert "strategy_failed × 1" in printed
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "printed"),
     [
         (["--scene", "attic"], 2, "allowed: authors_sim, hardware"),
         (["--strategy", "luck"], 2, "available: straight, burrow"),
@@ -132,11 +132,11 @@ def test_own_strategy_in_the_working_folder_may_fail(
     ],
 )
 def test_demo_refuses_impossible_arguments(
-    words: list[str], code: int, said: str, folder: Path, capfd: pytest.CaptureFixture[str]
+    words: list[str], code: int, printed: str, folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     assert code_of(["demo", *words]) == code
     errors = capfd.readouterr().err
-    assert said in errors
+    assert printed in errors
     assert not list(folder.iterdir())
 
 

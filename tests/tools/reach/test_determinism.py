@@ -30,14 +30,14 @@ def test_same_seed_gives_the_same_trial_bit_for_bit(depth: str) -> None:
 def test_separate_process_runs_the_same_trial(depth: str) -> None:
     """In another process with another hash seed; this process ran another kind of trial before."""
     here = trial_trace.traced(trial_trace.crowded(), "hybrid_event", 3, depth)[1]
-    said = subprocess.run(
+    printed = subprocess.run(
         [sys.executable, trial_trace.__file__, "hybrid_event", "3", depth],
         env=os.environ | {"PYTHONHASHSEED": "77"},
         check=True,
         capture_output=True,
         text=True,
     ).stdout
-    assert said.strip() == here
+    assert printed.strip() == here
 
 
 @pytest.mark.parametrize("depth", DEPTHS)

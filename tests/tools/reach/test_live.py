@@ -29,11 +29,11 @@ def test_demo_reaches_and_leaves_log_and_picture(
     log, picture = tmp_path / "demo.mcap", tmp_path / "demo.png"
     for _ in range(3):
         code = main(["demo", "--seed", "13", "--out", str(log), "--png", str(picture)])
-        said = capfd.readouterr()
+        printed = capfd.readouterr()
         if code != 3:
             break  # 3: nothing was felt in time, for which a starved machine is enough
-    assert code in (0, 1), said
-    assert ("\nREACHED: " if code == 0 else "\nNOT REACHED") in said.out
+    assert code in (0, 1), printed
+    assert ("\nREACHED: " if code == 0 else "\nNOT REACHED") in printed.out
     reach = read_reach(log)
     assert reach.outcome() is not None
     assert (reach.outcome().code == "reached") == (code == 0)

@@ -88,14 +88,14 @@ def test_any_of_several_reaches_and_boards_can_be_chosen(
     out = tmp_path / "a.png"
     words = ["plot", str(several), "--out", str(out), "--dpi", "40"]
     assert main([*words, "--reach", "1"]) == 0
-    said = capsys.readouterr().out
-    assert "drawn: board finger (of 2: finger, thumb); choose with --board" in said
-    assert "drawn: arm arm (of 2: arm, b); choose with --arm" in said
+    printed = capsys.readouterr().out
+    assert "drawn: board finger (of 2: finger, thumb); choose with --board" in printed
+    assert "drawn: arm arm (of 2: arm, b); choose with --arm" in printed
     assert main(words) == 0
-    said = capsys.readouterr().out
-    assert "drawn: reach 2 of 2; choose with --reach" in said
-    assert "  1  hybrid_event, " in said
-    assert "  2  my_own:_Strategy, " in said
+    printed = capsys.readouterr().out
+    assert "drawn: reach 2 of 2; choose with --reach" in printed
+    assert "  1  hybrid_event, " in printed
+    assert "  2  my_own:_Strategy, " in printed
     for wrong, text in (
         (["--reach", "3"], "no reach 3 in the log; it holds 2"),
         (["--board", "palm"], "no board 'palm' was heard during this reach, but finger"),

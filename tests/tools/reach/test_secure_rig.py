@@ -47,9 +47,9 @@ class Rig:
         return call(self.operator, service_key(name, service, kind), request, timeout=20)
 
     def until(self, done: Callable[[], object], timeout_s: float = PATIENCE_S) -> None:
-        wait_until(done, timeout_s, self.said)
+        wait_until(done, timeout_s, self.output)
 
-    def said(self) -> list[str]:
+    def output(self) -> list[str]:
         return [p.read_text(errors="replace")[-500:] for p in self.folder.glob("*.txt")]
 
 

@@ -89,7 +89,7 @@ def _failures(run: Run) -> Section | None:
         "Trials that could not be run",
         text=[
             f"{errors.total()} of {len(run.rows)} trials ended before they began or could not be "
-            "finished. They count for nothing above unless it is said there."
+            "finished. They are not counted above unless it says so there."
         ],
         tables=[
             TableData(

@@ -206,6 +206,6 @@ def rebuild(directory: Path, definition: Mapping[str, Any]) -> tuple[Study, Opti
                 raise FolderError(f"{directory} is a study {other!r}, which this version lacks")
     except (KeyError, TypeError, ValueError) as error:
         raise FolderError(
-            f"{directory}/experiment.json is damaged: {error!r}; run the experiment anew elsewhere"
+            f"{directory}/experiment.json is damaged: {error!r}; run the experiment again elsewhere"
         ) from None
     return study, options

@@ -150,7 +150,7 @@ def _check(order: Order) -> None:
         if not re.fullmatch(r"[A-Za-z0-9._:*-]{1,253}", host):
             raise LabError(f"{host!r} is not a host: give a name or an address")
     try:
-        import cryptography  # noqa: F401
+        import cryptography  # noqa: F401 - only whether it is installed
     except ImportError as error:
         raise LabError(
             "making keys needs the package cryptography: pip install 'tactile-reach[keys]'"

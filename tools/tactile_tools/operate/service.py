@@ -113,7 +113,7 @@ def _install(options: argparse.Namespace) -> None:
         )
     print(
         "Next: name the boards in /etc/tactile/tactiled.toml, then\n"
-        "  sudo usermod -aG tactile $USER     # whoever is to speak with them\n"
+        "  sudo usermod -aG tactile $USER     # each user who works with them\n"
         "  sudo systemctl enable --now tactiled reachd\n"
         "  tactile health"
     )
@@ -158,5 +158,5 @@ def _notify_managers(*commands: Iterable[str]) -> None:
             continue
         done = subprocess.run(line, check=False, capture_output=True, text=True)
         if done.returncode != 0:
-            said = (done.stderr or done.stdout).strip().splitlines()
-            print(f"failed   {' '.join(line)}: {said[-1] if said else done.returncode}")
+            output = (done.stderr or done.stdout).strip().splitlines()
+            print(f"failed   {' '.join(line)}: {output[-1] if output else done.returncode}")

@@ -178,8 +178,8 @@ class LiveReach:
     def start(self, name: str) -> None:
         """Start one of "cupboard", "tactiled", "reachd"."""
         self._started += 1
-        said = self.folder / f"{name}.txt"
-        with said.open("ab") as output:
+        path = self.folder / f"{name}.txt"
+        with path.open("ab") as output:
             self._running[name] = subprocess.Popen(
                 self._words(name),
                 stdout=output,
@@ -188,7 +188,7 @@ class LiveReach:
                 env=os.environ | {LOCKS: str(self.folder)},
             )
         if name == "cupboard":
-            wait_for(self.folder / BOARD, self._running[name], said)
+            wait_for(self.folder / BOARD, self._running[name], path)
 
     def _words(self, name: str) -> list[str]:
         log = f"{name}-{self._started}.mcap"  # a new one after every start

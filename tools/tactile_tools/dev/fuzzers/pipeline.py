@@ -74,14 +74,14 @@ class Sink:
         self.sent = 0
         self.features = 0
         self.valid = 0
-        self.told = 0
+        self.texts = 0
         self.oversized = 0
 
     def now(self) -> Instant:
         """Virtual time."""
         return self.moment
 
-    def send(self, topic: Topic, name: str, message: Any, stamp_ns: int) -> None:  # noqa: ARG002
+    def send(self, topic: Topic, name: str, message: Any, stamp_ns: int) -> None:  # noqa: ARG002 - as the daemon's sink
         """Encode and check; `PipelineFailure` for a force that is valid and not finite."""
         data = codec().encode(topic, message)
         self.sent += 1
@@ -94,11 +94,11 @@ class Sink:
 
     def announce(self, *_: Any, **__: Any) -> None:
         """Count a line of the daemon's own log."""
-        self.told += 1
+        self.texts += 1
 
     def firmware_text(self, *_: Any, **__: Any) -> None:
         """Count a text of the board's."""
-        self.told += 1
+        self.texts += 1
 
 
 class Source(RecordedSource):
