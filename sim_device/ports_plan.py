@@ -11,7 +11,7 @@ import numpy as np
 
 from sensor_proto.anyskin import MAX_MAGNETOMETERS
 from sensor_proto.can_transfers import CanFrame
-from sim_device.board.anyskin import CONVERSION_RATE, LOOP_RATE, AnySkinBoard, writer_of
+from sim_device.board.anyskin import CONVERSION_RATE_HZ, LOOP_RATE_HZ, AnySkinBoard, writer_of
 from sim_device.board.catalogue import build_skin, identity
 from sim_device.board.firmware import DEFAULT_RATE_HZ, BoardOptions, CanBoard, Identity, SerialBoard
 from sim_device.faults import FaultPlan, Window
@@ -234,7 +234,7 @@ class _BoardFactory:
 
     def anyskin(self, number: int) -> MakeBoard[bytes]:
         """Board that sends unframed floats."""
-        loop = self.request.rate or LOOP_RATE
+        loop = self.request.rate or LOOP_RATE_HZ
         request = self.request
         chips = sum(request.arrays or (ANYSKIN_CHIPS,))
         write = writer_of(request.format or "anyskin", chips)
@@ -248,7 +248,7 @@ class _BoardFactory:
                 options["contacts"],
                 options["plan"],
                 loop_rate=loop,
-                conversion_rate=loop * CONVERSION_RATE / LOOP_RATE,
+                conversion_rate=loop * CONVERSION_RATE_HZ / LOOP_RATE_HZ,
                 write=write,
                 banner=request.banner,
             )

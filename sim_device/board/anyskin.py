@@ -120,10 +120,10 @@ SKETCHES: dict[str, Writer] = {
 """Output formats: ``anyskin`` is the usual one; the others follow what public firmware prints."""
 
 
-LOOP_RATE = 115.0
+LOOP_RATE_HZ = 115.0
 """Hz at which the loop of such firmware reads and sends, whether or not there is new data."""
 
-CONVERSION_RATE = 100.0
+CONVERSION_RATE_HZ = 100.0
 """Hz at which the chips convert on their own: about one frame in seven is sent twice."""
 
 MAX_BACKLOG = 32
@@ -143,8 +143,8 @@ class AnySkinBoard(SkinOwner):
         environment: Environment | None = None,
         contacts: Contacts = (),
         plan: FaultPlan | None = None,
-        loop_rate: float = LOOP_RATE,
-        conversion_rate: float = CONVERSION_RATE,
+        loop_rate: float = LOOP_RATE_HZ,
+        conversion_rate: float = CONVERSION_RATE_HZ,
         write: Writer | None = None,
         banner: bool = False,
     ) -> None:

@@ -31,7 +31,7 @@ VERSION = b"V1013"
 
 SERIAL = b"NA123"
 
-SJA1000_CLOCK = 8_000_000
+SJA1000_CLOCK_HZ = 8_000_000
 """Hz behind the prescaler; the two registers of command ``s`` divide it."""
 
 TIMESTAMP_WRAP_MS = 60_000
@@ -80,7 +80,7 @@ DIALECTS = {
 }
 """Adapters by name: the one in the LAWICEL manual, and what is sold."""
 
-REPORT_EVERY = 1.0
+REPORT_PERIOD_S = 1.0
 """Seconds between the ``E`` and ``L`` lines of firmware that reports by itself."""
 
 _RATE_OF = {command: rate for rate, command in BITRATES.items()}
@@ -205,7 +205,7 @@ class SlcanAdapter:
         if not (self.dialect.reports and self.is_open):
             return
         if self._report_due is None or now >= self._report_due:
-            self._report_due = after(now, REPORT_EVERY)
+            self._report_due = after(now, REPORT_PERIOD_S)
             state = list(_STATE_LINES).index(self._state)
             self._put(b"E%d0000000\r" % state + b"L34\r")
 
@@ -265,7 +265,7 @@ class SlcanAdapter:
         elif match := _BTR.fullmatch(line):
             btr0, btr1 = int(match[1], 16), int(match[2], 16)
             quanta = 3 + (btr1 & 0x0F) + (btr1 >> 4 & 0x07)
-            self.bitrate = SJA1000_CLOCK // ((1 + (btr0 & 0x3F)) * quanta)
+            self.bitrate = SJA1000_CLOCK_HZ // ((1 + (btr0 & 0x3F)) * quanta)
         elif line in (b"Z0", b"Z1"):
             self._timestamps = line == b"Z1"
         else:

@@ -11,7 +11,7 @@ import numpy as np
 from sim_device.skin.parameters import ElastomerParameters
 from tactile_core.arrays import FloatArray
 
-CALIBRATION_DWELL = 2.0
+CALIBRATION_DWELL_S = 2.0
 """Seconds that a calibration rig waits at each load: about as long as a contact in use lasts."""
 
 _HERTZ_VARIANCE = 0.2
@@ -113,13 +113,13 @@ class Elastomer:
         return self._displace(effective)
 
     def settled(self, force: FloatArray) -> FloatArray:
-        """Displacement (..., N, 3) m of recovered rubber `CALIBRATION_DWELL` after loading.
+        """Displacement (..., N, 3) m of recovered rubber `CALIBRATION_DWELL_S` after loading.
 
         ``force``: (..., N, 3) N. This is what a calibration rig sees, which loads and never unloads
         before it reads. Changes no state.
         """
         p = self._parameters
-        crept = -p.creep * math.expm1(-CALIBRATION_DWELL / p.creep_time)
+        crept = -p.creep * math.expm1(-CALIBRATION_DWELL_S / p.creep_time)
         return self._displace(force * (1.0 + crept - self._play_weight * p.hysteresis_knee))
 
     def _displace(self, effective: FloatArray) -> FloatArray:

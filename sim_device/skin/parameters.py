@@ -12,10 +12,10 @@ _LSB_XY_UT = (0.751, 0.601, 0.451, 0.376, 0.300, 0.250, 0.200, 0.150)
 _LSB_Z_UT = (1.210, 0.968, 0.726, 0.605, 0.484, 0.403, 0.323, 0.242)
 """µT per LSB at RES 0 and HALLCONF 0xC for GAIN_SEL 0 to 7 (MLX90393 datasheet, table 17)."""
 
-_AXIS_UNIT = 0.064e-3
+_AXIS_UNIT_S = 0.064e-3
 """Unit of an axis conversion in the datasheet, s: it takes (2 + 2^DIG_FILT) · 2^OSR of these."""
 
-_CYCLE_OVERHEAD = 0.688e-3
+_CYCLE_OVERHEAD_S = 0.688e-3
 """Part of a T+X+Y+Z cycle that no axis uses, s: 1.84 ms at OSR 0, DIG_FILT 2 less 3 × 0.384 ms."""
 
 _OSCILLATOR_MARGIN = 1.10
@@ -61,12 +61,12 @@ class ChipSetting:
     @property
     def axis_time(self) -> float:
         """Conversion time of one axis, s."""
-        return self.averaging * _AXIS_UNIT
+        return self.averaging * _AXIS_UNIT_S
 
     @property
     def conversion_time(self) -> float:
         """Time of one T+X+Y+Z cycle, s: 1.84, 2.61, 4.15 ms at DIG_FILT 2, 3, 4 (table)."""
-        return _CYCLE_OVERHEAD + 3 * self.axis_time
+        return _CYCLE_OVERHEAD_S + 3 * self.axis_time
 
     @property
     def max_rate(self) -> float:

@@ -30,18 +30,18 @@ from tactile_core.log.recovery import recover
 from tactile_core.types import NS_PER_S
 from tactile_tools.dev.crash_writer import TRUTH
 
-ALLOWED_LOSS = 1.0
+ALLOWED_LOSS_S = 1.0
 """Seconds of log that a kill may cost (faults.md row 29)."""
 
 START_SHARE = 0.2
 """Share of the kills that come anywhere from the start of the process on, also before and while
 its first file is opened. The others come after its first message."""
 
-START_TIME = 1.0
-RUN_TIME = 2.5
+START_S = 1.0
+RUN_S = 2.5
 """Seconds after the start, or after the first message, within which the kill comes."""
 
-PATIENCE = 30.0
+PATIENCE_S = 30.0
 """Seconds to wait for a writer's first message before giving up on it."""
 
 
@@ -178,10 +178,10 @@ def kill_one(seed: np.random.SeedSequence, keep: Path | None = None) -> Kill:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
         try:
             if rng.random() < START_SHARE:
-                time.sleep(rng.uniform(0, START_TIME))
+                time.sleep(rng.uniform(0, START_S))
             else:
                 _await_first(truth, process)
-                time.sleep(rng.uniform(0, RUN_TIME))
+                time.sleep(rng.uniform(0, RUN_S))
         finally:
             process.kill()
             _, errors = process.communicate()
@@ -194,7 +194,7 @@ def kill_one(seed: np.random.SeedSequence, keep: Path | None = None) -> Kill:
 
 
 def _await_first(truth: Path, process: subprocess.Popen[bytes]) -> None:
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + PATIENCE_S
     while TRUTH.unpack(truth.read_bytes())[0] == 0 and process.poll() is None:
         if time.monotonic() > deadline:
             return
@@ -229,7 +229,7 @@ def judge(logs: Path, truth: Path) -> Kill:
     kill.read = sum(seen.values())
     if kill.written:
         kill.lost_s = (last_written_ns - (last_read_ns or first_written_ns)) / NS_PER_S
-    if kill.lost_s > ALLOWED_LOSS:
+    if kill.lost_s > ALLOWED_LOSS_S:
         kill.problems.append(f"{kill.lost_s:.3f} s lost")
     return kill
 

@@ -24,7 +24,7 @@ TRUTH = struct.Struct("<QQQ")
 """Messages recorded so far, wall-clock ns of the first and of the last."""
 
 NAME = "b0"
-RATE = 100.0
+RATE_HZ = 100.0
 """Rate of each of the three streams, Hz: a board at its usual rate."""
 
 SPLIT_BYTES = 150_000
@@ -93,7 +93,7 @@ def run(directory: Path, truth: Path, seed: int, seconds: float) -> None:
         record(RAW, MSG.RawChunk(head, now_ns, 0, *none, raw), now_ns)
         cycle += 1
         now = time.monotonic()
-        due = max(due + 1 / RATE, now)  # do not catch up, as a board that was read late does not
+        due = max(due + 1 / RATE_HZ, now)  # do not catch up, as a board that was read late does not
         time.sleep(due - now)
     recorder.close()
 

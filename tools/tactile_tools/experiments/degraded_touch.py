@@ -22,13 +22,13 @@ from tactile_core.types import Instant, after
 from tactile_tools.reach.touch_senses import ContactSense, TaxelSense
 from tactiled.sensing.pipeline import PipelineSettings
 
-BOARD_RATE = 25.0
+BOARD_RATE_HZ = 25.0
 """Rate of a board with default settings, Hz: the paper's."""
 
 FIELD_PER_NEWTON_UT = 152.0
 """Change of a chip's reading by 1 N, µT, in the simulated skin: converts noise from N to µT."""
 
-SAME_COLUMN = 1e-3
+SAME_COLUMN_M = 1e-3
 """Distance along the outline, m, within which taxels are above one another."""
 
 
@@ -177,7 +177,7 @@ class DegradedTaxels(TaxelSense):
     def __init__(
         self, seed: int, *, noise: float, rate: float | None, dead: float, stretch: float
     ) -> None:
-        rate = BOARD_RATE if rate is None else rate
+        rate = BOARD_RATE_HZ if rate is None else rate
         extra = noise * FIELD_PER_NEWTON_UT
         # A user would set the noise of the board at hand; otherwise every field fit would fail.
         x, y, z = (math.hypot(n, extra) for n in PipelineSettings().noise_ut)
@@ -217,5 +217,5 @@ def _columns(seed: int, fraction: float) -> tuple[Any, Any]:
             places.append(array.position[index, :2])
             alive.append((array.name, index) not in dead)
     at, up = np.array(places), np.array(alive, dtype=np.float64)
-    near = np.linalg.norm(at[:, None] - at[None], axis=2) < SAME_COLUMN
+    near = np.linalg.norm(at[:, None] - at[None], axis=2) < SAME_COLUMN_M
     return at, (near * up).sum(axis=1) / near.sum(axis=1)

@@ -64,7 +64,7 @@ class Result:
     simulated_s: float
 
 
-ENTERED = 0.0075
+ENTERED_M = 0.0075
 """Radius of the paper's goal region, m."""
 
 
@@ -119,7 +119,7 @@ def run_trial(
         raise RuntimeError("the trial ended without an outcome: " + supervisor.status(now).text)
     return Result(
         outcome=outcome,
-        entered=outcome.closest <= ENTERED,
+        entered=outcome.closest <= ENTERED_M,
         ejected=world.ejected,
         mean_load=math.fsum(loads) / max(1, cycles),
         peak_load=max(loads, default=0.0),
