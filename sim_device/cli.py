@@ -170,7 +170,7 @@ def replay(arguments: argparse.Namespace) -> int:
     from sim_device.faults import FaultPlan
     from sim_device.ports import PtyPort
     from sim_device.ports_plan import Planned
-    from sim_device.runner import ReplayPortServer
+    from sim_device.runner import ReplayServer
 
     try:
         recording = load(arguments.recording)
@@ -189,7 +189,7 @@ def replay(arguments: argparse.Namespace) -> int:
         "begins when a host reads"
     )
     link = arguments.pty
-    server = ReplayPortServer(PtyPort(link), board)
+    server = ReplayServer(PtyPort(link), board)
     plan = Planned(server, str(link), f"tactiled --port {link} --kind anyskin", (line,))
     return _serve([plan], arguments)
 

@@ -16,7 +16,7 @@ from sim_device.board.catalogue import build_skin, identity
 from sim_device.board.firmware import DEFAULT_RATE_HZ, BoardOptions, CanBoard, Identity, SerialBoard
 from sim_device.faults import FaultPlan, Window
 from sim_device.ports import PtyPort, PythonCanPort, SlcanPort
-from sim_device.runner import Board, CanPortServer, MakeBoard, PortServer, SerialPortServer
+from sim_device.runner import Board, CanServer, MakeBoard, PortServer, SerialServer
 from sim_device.skin.environment import (
     AttitudeScript,
     Environment,
@@ -163,7 +163,7 @@ def _plan_serial(factory: _BoardFactory, number: int, link: Path) -> Planned:
     connect = f"tactiled --port {link}" + (" --kind anyskin" if anyskin else "")
     if request.format and not request.format.endswith("-text"):
         connect = f"tactiled --port {link} --kind {request.format}"
-    server = SerialPortServer(PtyPort(link), make, request.unplugged)
+    server = SerialServer(PtyPort(link), make, request.unplugged)
     return Planned(server, str(link), connect, (factory.describe(number),))
 
 
@@ -174,7 +174,7 @@ def _plan_bus(
     share = None if spec.bitrate is None else BUS_SHARE * spec.bitrate / len(nodes)
     makes = [factory.can(number + k, node, spec.fd, share) for k, node in enumerate(nodes)]
     lines = tuple(f"{factory.describe(number + k)}, node {node}" for k, node in enumerate(nodes))
-    return Planned(CanPortServer(port, makes), str(spec), f"tactiled --can {spec}", lines)
+    return Planned(CanServer(port, makes), str(spec), f"tactiled --can {spec}", lines)
 
 
 class _BoardFactory:

@@ -109,7 +109,7 @@ class _OnePort(Generic[AnyPort]):
         self.port.close()
 
 
-class SerialPortServer(_OnePort[PtyPort]):
+class SerialServer(_OnePort[PtyPort]):
     """Board on a pseudo-terminal. ``unplugged``: when it has neither power nor port."""
 
     def __init__(
@@ -150,7 +150,7 @@ class SerialPortServer(_OnePort[PtyPort]):
             self.port.send(out)
 
 
-class CanPortServer(_OnePort[SlcanPort | PythonCanPort]):
+class CanServer(_OnePort[SlcanPort | PythonCanPort]):
     """Boards on one CAN bus."""
 
     def __init__(
@@ -185,7 +185,7 @@ class CanPortServer(_OnePort[SlcanPort | PythonCanPort]):
                 self.port.send(out, now)
 
 
-class ReplayPortServer(_OnePort[PtyPort]):
+class ReplayServer(_OnePort[PtyPort]):
     """Recording on a pseudo-terminal. Nothing of it is lost: it begins when a host reads, and
     waits while no host does."""
 
@@ -194,8 +194,8 @@ class ReplayPortServer(_OnePort[PtyPort]):
         self.board = board
         self._ended: Instant | None = None
         self._full: Instant | None = None
-        self._probed: Instant | None = None
-        self._probe_seen = False
+        self._probed_at: Instant | None = None
+        self._probe_waiting = False
         self._now = Instant(0)
 
     @property
@@ -231,17 +231,17 @@ class ReplayPortServer(_OnePort[PtyPort]):
                 self.board.postpone(stalled)
         out = self.board.tick(now)
         self.port.send(out)
-        if not self.board.started and self._probe_is_read(now):
+        if not self.board.started and self._probe_was_read(now):
             self.board.start(now)
         if self.board.finished and self._ended is None:
             self._ended = now
 
-    def _probe_is_read(self, now: Instant) -> bool:
-        self._probed = self._probed or now
+    def _probe_was_read(self, now: Instant) -> bool:
+        self._probed_at = self._probed_at or now
         if self.port.unread:
-            self._probe_seen = True
+            self._probe_waiting = True
             return False
-        return self._probe_seen or seconds_between(self._probed, now) > SETTLE_S
+        return self._probe_waiting or seconds_between(self._probed_at, now) > SETTLE_S
 
 
 class Runner:

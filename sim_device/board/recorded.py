@@ -25,7 +25,7 @@ from tactile_core.types import Instant, after, seconds_between
 TEMPERATURE_C = 25.0
 """°C put into every frame: recordings hold no temperature."""
 
-PROBE = b"\r\n"
+PROBE_FRAME = b"\r\n"
 """Probe bytes sent before the start: once they are gone, a host reads. A real host, too, opens a
 port in the middle of a frame, so the first bytes it gets are the end of one."""
 
@@ -149,7 +149,7 @@ def _number(cell: str, column: int, where: str) -> float:
 
 
 class ReplayBoard:
-    """Board that sends a recording. It sends `PROBE` until `start`, and takes no commands.
+    """Board that sends a recording. It sends `PROBE_FRAME` until `start`, and takes no commands.
 
     ``speed``: times real time. ``loop``: begin again one period after the last row. ``plan``:
     faults of the chips, which form one array ``skin``, and of the wire, in the recording's time.
@@ -178,7 +178,7 @@ class ReplayBoard:
         self._temperature = np.full(recording.magnetometers, TEMPERATURE_C, np.float32)
         self._status = np.zeros(recording.magnetometers, np.uint8)
         self._start: Instant | None = None
-        self._probe_sent = False
+        self._probed = False
         self._row = 0
         self.sent = 0
         """Frames sent so far."""
@@ -212,7 +212,7 @@ class ReplayBoard:
     def tick(self, now: Instant) -> bytes:
         """Frames due by ``now``, at most `BURST`; the others come with the next call."""
         if self._start is None:
-            probe, self._probe_sent = (b"" if self._probe_sent else PROBE), True
+            probe, self._probed = (b"" if self._probed else PROBE_FRAME), True
             return probe
         out: list[bytes] = []
         while len(out) < BURST and not self.finished and self._due(self._row) <= now:

@@ -17,7 +17,7 @@ from sensor_proto.slcan import SlcanDecoder, encode_frame
 from sim_device.board.catalogue import identity
 from sim_device.faults import Window
 from sim_device.ports_plan import BoardsRequest, Planned, parse_serial, parse_window, plan_boards
-from sim_device.runner import CanPortServer, Runner, SerialPortServer
+from sim_device.runner import CanServer, Runner, SerialServer
 from sim_device.skin.indenter import load_script
 from sim_device.status import StatusLine
 from tactile_core.can_bus import CanSpec
@@ -61,7 +61,7 @@ def test_press_and_rotation_continue_while_board_is_unplugged(
     script = tmp_path / "press.toml"
     script.write_text(PRESS)
     (plan, _) = plan_boards(replace(request_of, press=script, rotate="90deg/10s@z"))
-    assert isinstance(plan.server, SerialPortServer)
+    assert isinstance(plan.server, SerialServer)
     board: Any = plan.server.board
     replugged: Any = plan.server._make_board(4.0)
     expected = load_script(script)
@@ -80,7 +80,7 @@ def test_unpowered_board_disappears_and_reboots(request_of: BoardsRequest) -> No
     wanted = replace(request_of, ptys=request_of.ptys[:1], unplugged=(Window(1.0, 0.5),))
     (plan,) = plan_boards(wanted)
     server = plan.server
-    assert isinstance(server, SerialPortServer)
+    assert isinstance(server, SerialServer)
     server.open()
     boards = []
     for step in range(20):
@@ -111,7 +111,7 @@ def ask_can(node: int) -> bytes:
 
 def test_overloaded_bus_loses_whole_cycles_and_corrupts_no_message(tmp_path: Path) -> None:
     (plan,) = plan_boards(BoardsRequest(slcans=(tmp_path / "can0",)))
-    assert isinstance(plan.server, CanPortServer)
+    assert isinstance(plan.server, CanServer)
     plan.server.open()
     host = SerialTransport(str(tmp_path / "can0"))
     host.open()
@@ -133,7 +133,7 @@ def test_overloaded_bus_loses_whole_cycles_and_corrupts_no_message(tmp_path: Pat
 def test_bus_off_of_a_board_reaches_the_adapter(tmp_path: Path) -> None:
     (plan,) = plan_boards(BoardsRequest(slcans=(tmp_path / "can0",), faults="busoff@0.5s+0.2s"))
     server = plan.server
-    assert isinstance(server, CanPortServer)
+    assert isinstance(server, CanServer)
     server.open()
     host = SerialTransport(str(tmp_path / "can0"))
     host.open()

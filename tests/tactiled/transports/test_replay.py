@@ -14,7 +14,7 @@ import pytest
 
 from sensor_proto.anyskin import AnySkinDecoder
 from sensor_proto.packets import FloatSamples
-from sim_device.board.recorded import PROBE, TEMPERATURE_C, RecordingError, ReplayBoard, load
+from sim_device.board.recorded import PROBE_FRAME, TEMPERATURE_C, RecordingError, ReplayBoard, load
 from tactile_core.types import Instant, after
 from tactiled.transports import PortGone
 from tactiled.transports.serial_port import SerialTransport
@@ -111,7 +111,7 @@ def test_rows_are_sent_when_they_are_due(tmp_path: Path) -> None:
     path = write(tmp_path / "r.csv", "5,1,2,3", "5.1,4,5,6", "5.1,7,8,9", "6,10,11,12")
     board = ReplayBoard(load(path), speed=2)
     start = Instant(10**12)
-    assert board.tick(start) == PROBE
+    assert board.tick(start) == PROBE_FRAME
     assert board.tick(start) == b""
     board.start(start)
     sizes = [len(board.tick(after(start, s))) // 18 for s in (0, 0.049, 0.0501, 0.4, 0.51, 9)]
