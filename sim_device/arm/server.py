@@ -103,6 +103,7 @@ def arm_settings(rate: float, latency: float, noise: str) -> ArmSettings:
 log = logging.getLogger(__name__)
 
 MARKER_PERIOD_S: Final = 1 / WORLD.rate
+"""Seconds between two messages of the world's markers."""
 
 
 class ResetRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -32,6 +32,7 @@ BANNER = (
 
 REMARK = b"loop time 8123 us, errors 0\r\n"
 REMARK_EVERY = 50
+"""Frames from one remark to the next."""
 
 
 def writer_of(name: str, chips: int) -> Writer:

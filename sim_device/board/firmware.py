@@ -55,6 +55,7 @@ from tactile_core.types import Instant, after, seconds_between
 
 
 TICK_MASK = 0xFFFF_FFFF
+"""Ticks are sent as 32 bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +105,7 @@ class BoardClock:
 
 
 ALL_ARRAYS = 255
+"""Array number in `SetGain` that stands for all arrays."""
 
 MIN_RATE_MHZ = 100
 """Lowest rate, mHz: less than a sample in ten seconds is not a stream."""
@@ -227,6 +229,7 @@ MAX_QUEUED_REPLIES = 32
 """Most replies, status and log lines that wait; more than a host may have outstanding."""
 
 LOG_INFO = 20
+"""Level of an informative `Log`."""
 
 HOST_BIT = 0x80
 """Bit set in the type of everything that a host sends. Other unknown types are newer boards'."""

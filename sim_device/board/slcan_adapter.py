@@ -35,6 +35,7 @@ SJA1000_CLOCK_HZ = 8_000_000
 """Hz behind the prescaler; the two registers of command ``s`` divide it."""
 
 TIMESTAMP_WRAP_MS = 60_000
+"""Time stamps count milliseconds and wrap after a minute (LAWICEL manual)."""
 
 MAX_HELD = 1000
 """Most late answers that wait; further answers are given at once."""

@@ -40,8 +40,13 @@ MOTOR_TIME: Final = 0.005
 `authors_sim`. A shorter one is stiffer than a physics step can follow."""
 
 CONTACT_SOLREF: Final = (0.01, 1.0)
+"""Time constant, s, and damping ratio of contacts. Two physics steps are the least MuJoCo takes."""
+
 CONTACT_SOLIMP: Final = (0.95, 0.99, 0.0005, 0.5, 2.0)
+"""Impedance of contacts: least, greatest, width in m, midpoint, power."""
+
 SUPPORT_SOLREF: Final = (0.02, 1.0)
+"""Time constant, s, and damping ratio of what objects rest on."""
 
 # Bits of contype/conaffinity: bodies of the plane touch each other, supports only the ground.
 _PLANAR, _GROUND = 1, 2

@@ -19,6 +19,7 @@ AHEAD = 2
 """Tasks submitted per thread of the cluster: no thread waits, and few tasks are lost at an end."""
 
 CONNECT_S = 10.0
+"""Seconds to wait for the scheduler."""
 
 
 class DaskCluster:

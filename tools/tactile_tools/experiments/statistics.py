@@ -10,8 +10,10 @@ import numpy as np
 from scipy import stats
 
 Z95 = float(stats.norm.ppf(0.975))
+"""Two-sided 95 % quantile of the normal distribution."""
 
 SIGNIFICANT = 0.05
+"""p below which a difference is called significant."""
 
 
 @dataclass(frozen=True, slots=True)

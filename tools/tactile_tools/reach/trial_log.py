@@ -45,7 +45,11 @@ EPOCH_NS = 1_700_000_000_000_000_000
 """Wall-clock time at which every trial begins: a log depends on the trial alone."""
 
 WORLD_PERIOD_NS = 100_000_000
+"""Time between two messages of the world's markers: 10 Hz, as on the bus."""
+
 FRAME_PERIOD_NS = 40_000_000
+"""Time between two transforms of the frame ``ee``: 25 Hz."""
+
 MAX_QUEUED = 8192  # half of the recorder's queue: virtual time outruns a disk, nothing may be lost
 BOARD, ARM, REACH = "finger", "arm", "reach"
 

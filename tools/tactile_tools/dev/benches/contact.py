@@ -15,6 +15,7 @@ SET = "hardware"
 STRATEGY = "hybrid_event"
 REACHES = 100
 REACHES_QUICK = 10
+"""Reaches of the whole bench and of a quick one."""
 
 AIMED_PEAK = 18.0
 """Force that no reach should exceed, N; the limit is 15."""

@@ -18,6 +18,8 @@ from tactile_tools.reach.process_rig import LiveReach, is_moving
 
 TIMES = 20
 TIMES_QUICK = 2
+"""Signals of each kind to each process, in the whole bench and in a quick one."""
+
 WATCH_S = 0.5  # what is watched after the signal; below the 1 s after which the gate latches
 MOVING_S = (0.4, 0.9)  # the arm has moved for so long when the signal comes
 TRIES = 4  # an invalid trial is repeated

@@ -18,6 +18,8 @@ from tactile_tools.reach.process_rig import LiveReach, WatchError, is_moving
 
 SECONDS = 3600.0
 SECONDS_QUICK = 45.0
+"""Length of the whole bench and of a quick one."""
+
 TOO_LATE_S = 0.05  # of a control cycle: from there on it must command zero
 REACH_S = 25.0  # a reach ends by itself within 20 s
 

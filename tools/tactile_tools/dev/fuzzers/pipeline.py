@@ -42,6 +42,8 @@ from tactiled.transports.base import Medium
 Kind = Literal["serial", "can", "floats"]
 
 STEP_NS = NS_PER_S // 200
+"""Virtual time of one step: 200 a second."""
+
 POWER_ON = Instant(500 * NS_PER_S)
 WALL = WallClock(1_700_000_000 * NS_PER_S)
 HONEST_S = 1.0

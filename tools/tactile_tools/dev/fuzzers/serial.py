@@ -20,7 +20,11 @@ BATCH = 256
 """Frames corrupted at a time."""
 
 DRAWS = 6
+"""Random numbers drawn for each frame."""
+
 LONGEST_RUN = 32
+"""Longest run of bytes that a burst, a deletion or a blank covers."""
+
 Draw = list[int]
 
 
