@@ -102,7 +102,7 @@ def test_study_runs_from_command_line_to_report(
     code, out, _ = run(capsys, "trial", "--row", f"{folder}:3")
     assert code == 0
     assert f"{row['strategy']} in scene {row['scene_seed']}" in out
-    assert "the same as its row, to the last bit" in out
+    assert "the same as its row, bit for bit" in out
     code, _, error = run(capsys, "trial", "--row", f"{folder}:4")
     assert code == 2
     assert "has rows 0 to 3" in error

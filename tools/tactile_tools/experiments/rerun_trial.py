@@ -52,7 +52,7 @@ def _compare(recorded: Row, row: Row) -> int:
     before, now = outcome_of(recorded), outcome_of(row)
     different = [name for name in before if before[name] != now[name]]
     if not different:
-        print("the same as its row, to the last bit")
+        print("the same as its row, bit for bit")
         return 0
     for name in different:
         print(f"  {name}: {before[name]!r} in the row, {now[name]!r} now")
