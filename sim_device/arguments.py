@@ -104,7 +104,7 @@ chips), leap=2000@4s+2s (µT of a field that leaps: a magnet near)."""
 
 
 def make_parser(ending: Ending | None = None) -> argparse.ArgumentParser:
-    """Parser of the command line. ``ending``: tells whether the process is to end."""
+    """Parser of the command line; ``ending``: whether the process is told to end."""
     parser = Parser(
         "simdevice",
         description="Simulated taxel boards on pseudo-terminals and CAN buses, on their own or on "

@@ -56,7 +56,7 @@ def plan_cupboard(request: CupboardRequest) -> list[Planned]:
     for name in (request.arm, request.world):
         if not NAME.fullmatch(name):
             raise ValueError(
-                f"{name!r} is not a name; allowed: letters, digits, _ and -, at most 64"
+                f"{name!r} is not a valid name; allowed: letters, digits, _ and -, at most 64"
             )
     make_world = world_maker(request.engine)
     scene = scene_of(request)
