@@ -74,14 +74,14 @@ def test_system_errors_are_distinguished_from_bad_input(
         taken.listen()
         port = taken.getsockname()[1]
         monkeypatch.setitem(sys.modules, "pymunk", None)
-        for arguments, code, message in (
+        for arguments, code, said in (
             (["--engine", "pymunk"], 2, "pip install 'tactile-reach[crosscheck]'"),
             (["--listen", f"tcp/127.0.0.1:{port}"], 3, "is in use: another arm runs"),
             (["--listen", "tcp/0.0.0.0:1"], 3, "leaves this machine unprotected"),
         ):
             quiet = ["--connect", f"tcp/127.0.0.1:{port}"]
             assert main(["cupboard", "--scene", str(scene_file), *quiet, *arguments]) == code
-            assert message in capsys.readouterr().err
+            assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["authors_sim", "hardware"])

@@ -1,4 +1,4 @@
-"""Two engines that share no code must agree on a simple push."""
+"""Two engines that share no code must tell the same story of a simple push."""
 
 from __future__ import annotations
 
@@ -60,5 +60,5 @@ def test_both_engines_agree_on_a_push_into_the_corner(build: Any) -> None:
             world.step(0.01, Twist(0.05, 0.0, 0.0))
         finger = world.finger()
         wrenches.append((finger.fx, finger.fy))
-    # Static friction may be anything within its cone; here it is small beside 10 N.
+    # Friction at rest may be anything within its cone; here it is next to nothing beside 10 N.
     assert wrenches[0] == pytest.approx(wrenches[1], abs=0.3)

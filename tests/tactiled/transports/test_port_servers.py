@@ -1,4 +1,4 @@
-"""What is asked of ``simdevice boards`` becomes boards on ports, stepped here on virtual time."""
+"""Boards on ports as requested from ``simdevice boards``, run on virtual time."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_unpowered_board_disappears_and_reboots(request_of: BoardsRequest) -> No
 
 
 def stepped(plan: Planned, host: SerialTransport, seconds: float, ask: bytes) -> tuple[Any, Any]:
-    """Messages and counters of a host on the adapter of ``plan`` over virtual time."""
+    """Messages and counters of a host at the adapter of ``plan``, on virtual time."""
     lines, decoder, received = SlcanDecoder(), CanDecoder(), []
     for step in range(round(seconds / 0.001)):
         if step == 300:
@@ -125,7 +125,7 @@ def test_overloaded_bus_loses_whole_cycles_and_corrupts_no_message(tmp_path: Pat
     losses = plan.server.losses
     assert losses["bus_overrun"] == 0
     made = plan.server.boards[0].counters["cycles"]
-    assert 0 <= made - len(cycles) - losses["overruns"] < 16  # those are still on their way
+    assert 0 <= made - len(cycles) - losses["overruns"] < 16  # the rest are still on their way
     host.close()
     plan.server.close()
 
@@ -179,7 +179,7 @@ def test_serial_numbers_are_padded_and_validated() -> None:
 def test_virtual_buses_can_be_served() -> None:
     spec = CanSpec.parse("virtual:servers+fd")
     (plan,) = plan_boards(BoardsRequest(cans=(spec,), nodes=(7,)))
-    assert plan.connect == "tactiled --can virtual:stations+fd"
+    assert plan.connect == "tactiled --can virtual:servers+fd"
     plan.server.open()
     for step in range(400):
         plan.server.service(after(START, 0.001 * step))

@@ -124,7 +124,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def reaches(rig: Rig) -> None:
-    """The operator arms, gives a goal, and the arm moves; then it is stopped."""
+    """The operator arms, gives a goal, and the arm moves; then it is told to stop."""
     goal = rig.ask("reset", {}, "world")["goal"]
     deadline = time.monotonic() + PATIENCE_S
     while True:

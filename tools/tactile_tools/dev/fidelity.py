@@ -45,7 +45,7 @@ PERTURBATION_M = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One trial: scene, strategy, and number of its perturbation (0: none)."""
+    """One trial: scene, strategy, and how it was perturbed (0: not at all)."""
 
     seed: int
     strategy: str
