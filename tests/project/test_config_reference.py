@@ -1,4 +1,4 @@
-"""docs/configuration.md is made from the schemas and says what every key means."""
+"""docs/configuration.md is generated from the schemas and explains every key."""
 
 from __future__ import annotations
 

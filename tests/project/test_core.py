@@ -1,4 +1,4 @@
-"""The core stays light: which libraries it needs, and that a board computer has wheels of them."""
+"""The core stays light: its libraries, and their wheels for board computers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_the_core_needs_these_libraries_and_no_other() -> None:
 
 
 def test_every_python_named_has_wheels_of_the_core_on_aarch64() -> None:
-    """As recorded with `pip download --platform manylinux…_aarch64 --only-binary=:all:`."""
+    """Recorded with `pip download --platform manylinux…_aarch64 --only-binary=:all:`."""
     marker = "Programming Language :: Python :: 3."
     named = {c.rpartition(" ")[2] for c in PROJECT["classifiers"] if c.startswith(marker)}
     assert named == set(WHEELS)
@@ -41,6 +41,6 @@ def test_every_extra_that_a_command_names_exists_and_all_holds_them() -> None:
     assert set(EXTRAS.values()) | {"experiments"} <= set(extras)
     (everything,) = extras["all"]
     held = set(re.search(r"\[(.*)\]", everything)[1].split(","))  # type: ignore[index]
-    vendors = {"ur", "franka", "xarm", "flexiv"}  # heavy, and for one robot each
+    vendors = {"ur", "franka", "xarm", "flexiv"}  # large, and each for one robot
     assert held == set(extras) - {"all", "browser", "dev", "docs", "reference"} - vendors
     assert "tactile-reach[all]" in extras["dev"]

@@ -1,4 +1,4 @@
-"""Documents: every link leads somewhere, generated pages and pictures are up to date."""
+"""Documents: every link works; generated pages and pictures are up to date."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 
 
 def anchors(path: Path) -> set[str]:
-    """Anchors of a Markdown file's headings."""
+    """Anchors of the headings of a Markdown file."""
     text = FENCE.sub("", path.read_text(encoding="utf-8"))
     found = set()
     for heading in re.findall(r"^#+ (.*)$", text, re.MULTILINE):
@@ -48,7 +48,7 @@ def test_every_link_of_a_document_leads_somewhere(path: Path) -> None:
 def test_pictures_of_the_structure_are_up_to_date() -> None:
     for name, svg in architecture.pictures(architecture.read_structure()).items():
         kept = (ROOT / "docs" / "pictures" / name).read_text(encoding="utf-8")
-        # Counts of lines change with every commit; what must agree is what imports what.
+        # Line counts change with every commit; only the imports must agree.
         assert without_counts(kept) == without_counts(svg), f"{name}: run `make pictures`"
 
 

@@ -1,4 +1,4 @@
-"""The table of faults in ``tests/README.md`` names tests that there are, for every row."""
+"""The fault table in ``tests/README.md`` names existing tests for every row."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from tests.support.paths import TESTS
 ROW = re.compile(r"\| (\d+) \|")
 NAMED = re.compile(r"`((?:[a-z_0-9]+/)+test_\w+\.py)(?:::(test_\w+))?`")
 ROWS = 54
-"""Rows that there must be."""
+"""Number of rows."""
 
 
 def table() -> dict[int, list[tuple[str, str]]]:
-    """File and function (or "") of each test that a row names."""
+    """File and function (or "") of each test named in a row."""
     found: dict[int, list[tuple[str, str]]] = {}
     for line in (TESTS / "README.md").read_text(encoding="utf-8").splitlines():
         if row := ROW.match(line):

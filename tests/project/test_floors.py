@@ -91,7 +91,7 @@ INSIDE = {
         "dev": {"", "log", "plot", "reach", "experiments"},
     },
 }
-"""What a room may import of its own package: other rooms, and "" for files beside the rooms."""
+"""Imports allowed within a package: other rooms, and "" for files beside the rooms."""
 
 
 @pytest.mark.parametrize(("package", "room"), [(p, r) for p, rs in INSIDE.items() for r in rs])

@@ -1,4 +1,4 @@
-"""The wheel installs into a clean environment: every command starts, no generic name appears."""
+"""The wheel installs into a clean environment: every command starts, and all packages are ours."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def run(*words: str | Path, **kwargs: object) -> subprocess.CompletedProcess[str
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Wheel built from the tracked files alone, so that a forgotten file shows."""
+    """Wheel built from tracked files only, so that a forgotten file is noticed."""
     source = tmp_path_factory.mktemp("source")
     listed = run("git", "-C", ROOT, "ls-files", "-z").stdout.split("\0")
     for name in filter(None, listed):
@@ -65,7 +65,7 @@ def test_every_command_starts_in_a_clean_environment(wheel: Path, tmp_path: Path
     )  # fmt: skip
     installed = {p.name for p in site.iterdir() if not p.name.endswith(".dist-info")}
     assert installed == TOP_LEVEL
-    # The dependencies were resolved once already, for the environment this test runs in.
+    # The dependencies are already resolved for the environment of this test.
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
     for command in COMMANDS:
         for flag in ("--help", "--version"):

@@ -1,4 +1,4 @@
-"""The long runs, cut short: they find nothing, repeat by their seed, and say where to go on."""
+"""Long runs, shortened: they find nothing, repeat by seed, and tell where to continue."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_fuzz_block_repeats_by_number_and_a_run_resumes(monkeypatch: pytest.Monk
 def test_fuzz_failure_names_its_block(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
 ) -> None:
-    """A pipeline that never serves an honest board again is found out."""
+    """A pipeline that never serves a correct board again is detected."""
     monkeypatch.setattr(pipeline, "RECOVERY_S", 0.0)
     out = tmp_path / "f.json"
     words = ["fuzz", "--through", "pipeline", "--frames", "50", "--jobs", "1", "--json", str(out)]

@@ -1,4 +1,4 @@
-"""`tactile service`: files that systemd and udev accept, put in place and taken away."""
+"""`tactile service`: installs and removes files that systemd and udev accept."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RULE = re.compile(r'[A-Z_]+(?:\{\w+\})?(==|!=|\+=|=)"[^"]*"$')
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """A system with everything installed in it."""
+    """A system with everything installed."""
     assert main(["service", "install", "--root", str(tmp_path)]) == 0
     return tmp_path
 

@@ -1,4 +1,4 @@
-"""Files of version 0.1 are read as they are, or refused with a sentence that says what to do."""
+"""Files of version 0.1 are read, or refused with a sentence that names the remedy."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HASHES = {
     "anyskin.cal.toml": "3fdb0c82db68e3ea66911a8d80c851d2bd9232958c1c19d7d65ab0e4ef43e8fd",
     "fitted.cal.toml": "3015a598b8a267bdb36c00a5fad31642c8fdf48dee2f60569945966943856eae",
 }
-"""Of the very values that version 0.1 wrote."""
+"""Hashes of the values that version 0.1 wrote."""
 
 
 @pytest.mark.parametrize("name", HASHES)

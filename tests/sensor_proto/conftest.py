@@ -1,4 +1,4 @@
-"""Reference codecs, written from PROTOCOL.md alone and slow on purpose; shared sample makers."""
+"""Reference codecs, written from PROTOCOL.md alone and deliberately slow; shared sample makers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def crc_bitwise(data: bytes) -> int:
 
 
 def cobs_textbook(data: bytes) -> bytes:
-    """One byte at a time, as in figure 3 of Cheshire & Baker."""
+    """Encode one byte at a time, as in figure 3 of Cheshire & Baker."""
     out, block = bytearray(), bytearray()
     ended_full = False
     for byte in data:

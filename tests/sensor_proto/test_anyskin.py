@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from sensor_proto.anyskin import MAX_BUFFER, AnySkinDecoder, encode_anyskin
 from sensor_proto.packets import Decoder, FloatSamples, Received, TaxelStatus
 
-RELOCK = 3  # frames that are held back until the boundary is certain again
+RELOCK = 3  # frames held back until the boundary is certain again
 
 
 def frame(index: int, n: int, rng: np.random.Generator, celsius: float = 27.0) -> bytes:
-    """Bytes written from sensors.md: n × (t, x, y, z), CR LF; x of the first chip is the index."""
+    """One frame as in sensors.md: n × (t, x, y, z), CR LF; x of the first chip is the index."""
     out = b""
     for chip in range(n):
         x, y = rng.normal(0, 300, 2)
@@ -137,7 +137,7 @@ def test_trailing_counts_bytes_after_each_frame() -> None:
 
 @pytest.mark.parametrize("byte", [b for b in range(80) if b % 16 not in (2, 3, 15)])
 def test_crlf_inside_every_frame_is_not_a_boundary(byte: int) -> None:
-    """The unlucky field: the pair stands at the same place for as long as nothing moves."""
+    """The worst field: CR LF stays at the same place while nothing moves."""
     frames = []
     for raw in stream(30, 5):
         spoilt = bytearray(raw)
@@ -185,7 +185,7 @@ def count_lost(wire: bytes, sent: int, n: int, sizes: list[int]) -> tuple[list[i
 @given(seed=st.integers(0, 10**6), n=st.sampled_from([1, 2, 5, 10, 20]))
 @settings(max_examples=150, deadline=None)
 def test_damage_loses_at_most_one_frame_beyond_those_touched(seed: int, n: int) -> None:
-    """One fault anywhere after the lock: bytes cut out, put in, or both."""
+    """One fault anywhere after the lock: bytes removed, inserted, or both."""
     rng = np.random.default_rng(seed)
     frames = stream(30, n, seed)
     size = len(frames[0])
@@ -196,7 +196,7 @@ def test_damage_loses_at_most_one_frame_beyond_those_touched(seed: int, n: int) 
     touched = (stop - 1) // size - start // size + 1
     got, lost = count_lost(wire[:start] + patch + wire[stop:], 30, n, [83, 7, 300])
     assert lost <= touched + 1
-    # A cut of whole frames' length joins two readings to one that nothing can tell from a good one.
+    # Removing a whole number of frames' lengths can join two readings into a plausible one.
     real = [i for i in got if i in range(30)]
     assert real == sorted(set(real))
 
@@ -305,7 +305,7 @@ def test_board_with_all_chips_dead_is_still_framed(dead: float, n: int) -> None:
 
 
 def test_impossible_readings_neither_stop_the_stream_nor_lose_frames() -> None:
-    """Indeterminate values of three chips of five, for good: the boundary is doubted and kept."""
+    """Permanently invalid values of three of five chips: the boundary is checked and kept."""
     rng = np.random.default_rng(3)
     frames = stream(60, 5)
     for i in range(10, 60):
@@ -318,7 +318,7 @@ def test_impossible_readings_neither_stop_the_stream_nor_lose_frames() -> None:
     assert decoder.counters["discarded_bytes"] == 0
 
 
-# Anything at all
+# Arbitrary bytes
 
 
 @given(chunks=st.lists(st.binary(max_size=3000), max_size=6))

@@ -1,4 +1,4 @@
-"""CAN transfers: interleaved boards come out whole, spoilt transfers do not come out at all."""
+"""CAN transfers: interleaved boards are decoded, corrupted transfers are not."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ u7 = st.integers(0, 127)
 
 
 def numbers(received: list[Received]) -> list[tuple[int, int]]:
-    """(board, sequence) of every samples message."""
+    """Board and sequence of every samples message."""
     return [(r.board, r.message.sequence) for r in received if isinstance(r.message, Samples)]
 
 
@@ -161,11 +161,11 @@ def test_consecutive_equal_messages_are_all_used() -> None:
 
 
 def test_losing_a_whole_round_of_transfer_ids_mixes_nothing(make_samples: MakeSamples) -> None:
-    """The end of a transfer follows the beginning of one 32 before: all tails fit."""
+    """The end of a transfer follows the start of one 32 earlier, so all tails fit."""
     encoder = CanEncoder(1, fd=False)
     sent = [encoder.encode(make_samples(i, taxels=16)) for i in range(33)]
     assert sent[0][0].data[-1] == sent[32][0].data[-1]
-    # The first frames are equal: both hold no more than header, array, taxels and temperature.
+    # The first frames are equal: they hold only header, array, taxels and temperature.
     for cut in range(2, len(sent[0])):
         decoder = CanDecoder()
         assert decoder.feed(sent[0][:cut] + sent[32][cut:]) == []
@@ -196,7 +196,7 @@ def test_classic_and_fd_frames_do_not_mix(make_samples: MakeSamples) -> None:
         ("foreign", CanFrame(start_id() | 0x80, b"\x01\xe0")),
         ("foreign", CanFrame(start_id() | 1 << 29, b"\x01\xe0")),
         ("bad_frame", CanFrame(start_id(), b"")),
-        ("bad_frame", CanFrame(start_id(), b"\x01\xa0")),  # not full, not the end
+        ("bad_frame", CanFrame(start_id(), b"\x01\xa0")),  # neither full nor the last
         ("bad_frame", CanFrame(start_id(), bytes(8) + b"\xe0")),  # nine bytes on CAN 2.0B
         ("unknown_type", CanFrame(start_id() ^ 0x7000, b"\x01\xe0")),
         ("no_start", CanFrame(start_id(), bytes(7) + b"\x20")),
@@ -235,7 +235,7 @@ def test_length_and_bytes_must_match(reference: SimpleNamespace) -> None:
             frames = [CanFrame(start_id(3), d, size == 64) for d in reference.can(wrong, 0, size)]
             decoder = CanDecoder()
             got = decoder.feed(frames)
-            padded = size == 64 and wrong == packet + b"\0"  # indistinguishable from filling
+            padded = size == 64 and wrong == packet + b"\0"  # indistinguishable from padding
             assert len(got) == padded
             assert padded or refused(decoder) == {"length": 1}
 
@@ -258,7 +258,7 @@ def test_memory_is_bounded_for_any_input() -> None:
     kinds = [int(k) for k in MessageType]
 
     def flood(rounds: int) -> None:
-        """Begin and continue, but never end, transfers of every board and type."""
+        """Start and continue, but never end, transfers of every board and type."""
         for _ in range(rounds):
             for board in range(0, 128, 4):
                 for kind in kinds:

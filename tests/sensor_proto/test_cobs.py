@@ -1,4 +1,4 @@
-"""Byte stuffing against the paper's rules and a byte-by-byte program."""
+"""COBS against the paper's rules and a byte-by-byte implementation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sensor_proto import cobs
 
 RUN = bytes(range(1, 255))  # 254 bytes without a zero
 
-# Worked by hand from table I of Cheshire & Baker 1999.
+# Worked out by hand from table I of Cheshire & Baker 1999.
 BY_HAND = [
     (b"", "01"),
     (b"\x00", "01 01"),

@@ -1,4 +1,4 @@
-"""CRC-32C against the published check value, its residue and a bit-by-bit program."""
+"""CRC-32C against the published check value, its residue and a bit-by-bit implementation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sensor_proto.crc import BLOCK, RESIDUE, crc32c, crc32c_each
 
-# RFC 3720, appendix B.4; the first is the check value of every CRC catalogue.
+# RFC 3720, appendix B.4; the first is the check value in CRC catalogues.
 PUBLISHED = [
     (b"123456789", 0xE3069283),
     (bytes(32), 0x8A9136AA),

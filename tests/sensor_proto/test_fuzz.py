@@ -1,4 +1,4 @@
-"""The fuzzer itself: it accepts nothing wrongly, repeats exactly, and would notice a fault."""
+"""The fuzzer: no frame is wrongly accepted, runs repeat exactly, and a fault would be detected."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_no_corrupted_frame_is_accepted() -> None:
         totals = result["media"][medium]
         assert set(totals["kinds"]) == set(kinds)
         assert totals["counters"]["accepted"] == totals["accepted"]
-        assert totals["counters"]["crc"] > 100  # much of it gets as far as the CRC
+        assert totals["counters"]["crc"] > 100  # much of it reaches the CRC check
 
 
 def test_fuzz_run_is_determined_by_its_seed() -> None:

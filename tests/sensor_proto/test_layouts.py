@@ -1,4 +1,4 @@
-"""Boards that write in a way of their own: declared layouts, and what is found out of the bytes."""
+"""Boards with layouts of their own: declared layouts, and layouts detected from the bytes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Write = Callable[[Rows, int], bytes]
 
 
 def rows(chips: int, count: int, seed: int = 0, largest_ut: float = 1500.0) -> list[Rows]:
-    """Readings of a still board: a rest field, the noise of the chips, steps as they have them."""
+    """Readings of an untouched board: rest field, chip noise, and the chips' resolution."""
     rng = np.random.default_rng(seed)
     rest = rng.uniform(-largest_ut, largest_ut, (chips, 3))
     out = []
@@ -84,7 +84,7 @@ def raw_temperatures(r: Rows, number: int) -> bytes:
 
 
 def glued(r: Rows, number: int) -> bytes:
-    """The AnySkin text sketch: nothing between the last number of a chip and the next chip's."""
+    """AnySkin text sketch: no separator between the numbers of one chip and the next."""
     return b"".join(b"%.2f\t%.2f\t%.2f\t%.2f" % chip for chip in r) + b"\r\n"
 
 
@@ -191,7 +191,7 @@ def test_invalid_layout_is_refused_with_the_expected_form(text: str, named: str)
     assert named in str(caught.value)
 
 
-# Bytes by hand
+# Frames written by hand
 
 
 def samples_of(layout: str, frame: bytes) -> FloatSamples:
@@ -219,7 +219,7 @@ def test_raw_temperatures_follow_the_datasheet() -> None:
     frame = bytes.fromhex("feb4 0a00 f6ff e803 0d0a")
     samples = samples_of("int16:1txyz,end=crlf", frame)
     np.testing.assert_allclose(samples.temperature_c, [25 + 90 / 45.2], rtol=1e-6)
-    unsigned = bytes.fromhex("0a80 f67f e883 0d0a")  # 32768 is nought
+    unsigned = bytes.fromhex("0a80 f67f e883 0d0a")  # 32768 is zero
     samples = samples_of("uint16:1xyz,scale=1,end=crlf", unsigned)
     assert samples.field_ut.tolist() == [[10.0, -10.0, 1000.0]]
 
@@ -323,7 +323,7 @@ def test_lost_bytes_do_not_shift_later_frames(layout: str, cut: int) -> None:
     known = {field.tobytes() for field in clean}
     wrong = sum(field.tobytes() not in known for field in got)
     if parsed.framing is not None and parsed.framing.extra < 2 and parsed.kind == "int16":
-        # x of the first chip is 2743 counts, 0x0ab7: its high byte passes for the end.
+        # x of the first chip is 2743 counts, 0x0ab7: its high byte looks like the frame end.
         assert wrong <= 2 * 20
     else:
         assert wrong == 0
@@ -359,7 +359,7 @@ def test_noise_never_raises_and_memory_is_bounded(chunks: list[bytes], layout: s
         assert found is None or found.layout is None or found.what
 
 
-# What is found out
+# Detection
 
 
 @pytest.mark.parametrize(
@@ -443,7 +443,7 @@ def test_ambiguous_layout_is_named_with_its_declaration(
     assert found.what == what
     assert found.declare == declare
     parsed = Layout.parse(declare[0])
-    if parsed.kind != "text":  # what stands round the numbers is found by itself
+    if parsed.kind != "text":  # the bytes around the numbers are detected
         watch = Survey(Layout.parse(declare[0].partition(",")[0] + (",big" * parsed.big)))
         for number, r in enumerate(rows(5, 60)):
             watch.feed(write(r, number))
@@ -483,7 +483,7 @@ def test_chips_with_temperature_are_detected_for_any_count(chips: int) -> None:
 
 
 def test_temperatures_after_the_field_are_not_mistaken_for_it() -> None:
-    """x of the chip right below a magnet is as small as a temperature."""
+    """x of the chip directly below a magnet is as small as a temperature."""
     decoder = AnySkinDecoder()
     for r in rows(5, 60, 1, 30.0):
         assert decoder.feed(floats(xyzt(r)) + b"\r\n") == []

@@ -1,4 +1,4 @@
-"""Every message survives the wire; senseless ones are refused by name; versions mix as promised."""
+"""Every message round-trips, invalid ones are refused by name, and versions mix as specified."""
 
 from __future__ import annotations
 
@@ -136,14 +136,14 @@ def test_shortened_payload_is_refused(
 
 
 def _packet(message: Message) -> bytes:
-    """Packet as it travels on CAN, put together from one long frame after another."""
+    """Packet as sent on CAN, joined from its long frames."""
     frames = CanEncoder(0, fd=True).encode(message)
     raw = b"".join(f.data[:-1] for f in frames)
     return raw[: 8 + raw[2] + (raw[3] << 8)]
 
 
 def _descriptor_payload(**changes: Any) -> bytes:
-    """Payload written field by field from section 4 of PROTOCOL.md."""
+    """Payload composed field by field from section 4 of PROTOCOL.md."""
     f = {
         "major": 1,
         "model": b"pad",
@@ -272,8 +272,8 @@ def test_payload_with_good_crc_is_decoded_or_counted(
     assert sum(decoder.counters.values()) == 1
     for item in received:
         if isinstance(item.message, Log):
-            continue  # its text may have grown by what replaces the unprintable
-        # What was read can be written again: no field holds what its layout does not.
+            continue  # its text may have grown by replacement characters
+        # Decoded messages can be encoded again: no field exceeds its layout.
         (again,) = SerialDecoder().feed(encode_serial(item.message))
         assert type(again.message) is type(item.message)
 

@@ -1,4 +1,4 @@
-"""The serial decoder over evil wires: nothing wrong accepted, losses counted, memory bounded."""
+"""Serial decoder on corrupted lines: nothing wrong accepted, losses counted, memory bounded."""
 
 from __future__ import annotations
 
@@ -177,13 +177,13 @@ def test_unknown_commands_can_be_answered_by_number(reference: SimpleNamespace) 
     assert decoder.take_unknown() == []
 
 
-# Evil wires: name, and what becomes of frame i of the line.
+# Corruptions: name, and effect on frame i.
 
 EVIL = ["whole", "bytewise", "lost", "flipped", "duplicated", "reordered", "spliced", "noisy"]
 
 
 def spoil(kind: str, frames: list[bytes], rng: np.random.Generator) -> tuple[bytes, int]:
-    """The wire and how many frames were damaged."""
+    """Corrupt ``frames``; returns the bytes and the number of damaged frames."""
     wire, damaged = [], 0
     skip = False
     for i, frame in enumerate(frames):
@@ -251,7 +251,7 @@ def test_delayed_frame_is_counted_once_on_arrival(line: list[bytes]) -> None:
 @given(st.integers(0, 10**6))
 @settings(max_examples=120, deadline=None)
 def test_damage_loses_at_most_one_frame_beyond_those_touched(line: list[bytes], seed: int) -> None:
-    """One fault anywhere: bytes cut out, put in, changed, over any number of frames."""
+    """One fault anywhere: bytes removed, inserted or changed, over any number of frames."""
     rng = np.random.default_rng(seed)
     wire = b"".join(line)
     ends = np.cumsum([len(f) for f in line])

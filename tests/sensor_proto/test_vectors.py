@@ -1,4 +1,4 @@
-"""PROTOCOL.md's annotated frames hold for the reference codecs, our encoder and our decoder."""
+"""The vectors of PROTOCOL.md match the reference codecs, our encoder and our decoder."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ NEWER = {
 
 
 def blocks(kind: str) -> dict[str, list[tuple[str, bytes]]]:
-    """Vectors of the document: name to lines of (label, bytes); continued lines are joined."""
+    """Vectors of the document: name → lines of (label, bytes), with continued lines joined."""
     found = {}
     for name, body in re.findall(rf"^```{kind} (\w+)\n(.*?)^```$", DOCUMENT, re.M | re.S):
         lines: list[tuple[str, bytes]] = []

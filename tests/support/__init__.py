@@ -1,1 +1,2 @@
-"""What several test folders share. Import it: ``from support.waiting import wait_until``."""
+"""Helpers shared by several test folders. Import as ``from tests.support.waiting import
+wait_until``."""

@@ -1,4 +1,4 @@
-"""A board's features on the bus, with nothing behind them: run as a process, to be stopped."""
+"""Publish a board's features on the bus without a board. Run as a process, to be stopped."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tactile_core.types import WallClock, monotonic_now
 
 
 def main(endpoint: str, board: str, ahead: float, prefix: str) -> None:
-    """Publish valid features of a free finger at 100 Hz for ever, stamped ``ahead`` s of now."""
+    """Publish valid features of a free finger at 100 Hz, stamped ``ahead`` s from now, forever."""
     session = open_session(BusConfig(listen=(), connect=(endpoint,)))
     wall = WallClock.take()
     publisher = declare_publisher(session, FEATURES, board, prefix)

@@ -28,7 +28,7 @@ from tests.support.waiting import wait_until
 RADIUS = 0.04
 DISC_X = 0.02
 TIP_START = -0.042
-WAY = DISC_X - RADIUS - TIP_START  # m the finger goes until it touches
+WAY = DISC_X - RADIUS - TIP_START  # m that the finger moves until it touches
 LIMITS = {"v_max": 0.05, "omega_max": 0.35, "f_max": 10.0, "m_max": 1.5}
 EXPIRY = 0.06
 
@@ -41,10 +41,9 @@ def disc_scene(mass: float = 2.0) -> Scene:
 
 
 class Commander:
-    """Sends ``twist`` 100 times a second until it is stopped; then nothing, not even a zero.
+    """Sends ``twist`` 100 times a second until stopped; after that nothing, not even a zero.
 
-    It claims the arm, ServiceError where that is not granted; or sends under a grant of its own
-    making, where ``grant`` is given.
+    It claims the arm (ServiceError if refused), or sends under the given ``grant``.
     """
 
     def __init__(
@@ -61,11 +60,11 @@ class Commander:
         self._thread.start()
 
     def delay(self, seconds: float) -> None:
-        """From now on commands take so long on the way; what is under way still comes."""
+        """Delay commands from now on; those already queued are still sent."""
         self._delay = seconds
 
     def stop(self) -> None:
-        """Decide nothing more; what is under way is sent to its end."""
+        """Decide nothing more; queued commands are still sent."""
         self._stop.set()
         self._thread.join()
         self._publisher.close()
@@ -84,13 +83,14 @@ class Commander:
 
 
 def claim(session: zenoh.Session, name: str = "test", clock: str | None = None) -> Grant:
-    """Become the commander of the arm; ServiceError where somebody else is."""
+    """Claim the command of the arm. Raises ServiceError if another commander has it."""
     request = ClaimRequest(name, clock_domain() if clock is None else clock)
     return msgspec.convert(call(session, service_key("arm", "claim", "arm"), request, 20), Grant)
 
 
 class Cupboard:
-    """A running ``simdevice cupboard`` and a session on its bus. ``states``: all that came."""
+    """A running ``simdevice cupboard`` and a session on its bus. ``states``: all received
+    states."""
 
     def __init__(self, folder: Path, scene: str, *arguments: str) -> None:
         self.folder = folder
@@ -125,7 +125,7 @@ class Cupboard:
         return Signer(claim(self.session, name))
 
     def rest(self) -> None:
-        """Wait until no command is under way: a late one sets an arm off that had stopped."""
+        """Wait until no command is queued, as a late one would move an arm that had stopped."""
         since = monotonic_now()
         wait_until(
             lambda: (
@@ -136,14 +136,15 @@ class Cupboard:
         )
 
     def settled(self) -> None:
-        """Arm at rest, another commander welcome, everything back where it was."""
+        """Bring the arm to rest, make it free for another commander, and put everything back in
+        place."""
         self.rest()
         wait_until(lambda: not self.owned())
         self.call("reset", kind="world")
         self.call("limits", LIMITS)
 
     def owned(self) -> bool:
-        """Whether somebody still commands the arm, who must fall silent first."""
+        """Whether the arm still has a commander, who must fall silent first."""
         try:
             self.call("limits", LIMITS)
         except ServiceError:

@@ -1,4 +1,4 @@
-"""An arm that obeys twists without inertia, on a bus of its own."""
+"""An arm that follows twists without inertia, on its own bus."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tactile_core.types import ArmLimits, WallClock, monotonic_now
 
 @dataclass(frozen=True)
 class Heard:
-    """A command and when it came, in s of the monotonic clock."""
+    """A command and when it arrived, in s of the monotonic clock."""
 
     at: float
     vx: float
@@ -42,7 +42,7 @@ class Heard:
 
 
 class FakeArm:
-    """Obeys twists without inertia, each until it expires; its tip starts at the shelf's edge."""
+    """Follows each twist without inertia until it expires; its tip starts at the shelf's edge."""
 
     def __init__(self, endpoint: str, name: str = "arm") -> None:
         self.name = name
@@ -50,8 +50,8 @@ class FakeArm:
         self.force = (0.0, 0.0, 0.0)
         self.mode = "ready"
         self.paused = False
-        self.does = lambda speed: speed  # what it makes of the speed that it is told
-        self.frozen: Any = None  # a state whose values are repeated under fresh stamps
+        self.does = lambda speed: speed  # how it changes the commanded speed
+        self.frozen: Any = None  # a state repeated under fresh stamps
         self.deaf_to_limits = False
         self.limits = ArmLimits(0.5, 1.0, 100.0, 20.0)
         self.heard: list[Heard] = []
@@ -90,7 +90,7 @@ class FakeArm:
         if self.desk.hear(sample.payload.to_bytes(), now) is not None:
             return
         order = self.desk.newest(now)
-        if order is None:  # it expired while this thread waited for the machine
+        if order is None:  # it expired while this thread was not scheduled
             return
         twist = order.twist
         heard = Heard(time.monotonic(), twist.vx, twist.vy, twist.omega, order)
@@ -123,7 +123,7 @@ class FakeArm:
                 publisher.put(data, self._wall.wall_ns(monotonic_now()))
 
     def freeze(self) -> None:
-        """Go on reporting what is the case now, whatever happens."""
+        """Keep reporting the current state, whatever happens."""
         self.frozen = self._state(0)
 
     def _state(self, sequence: int) -> Any:

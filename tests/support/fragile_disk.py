@@ -1,4 +1,4 @@
-"""A disk that is full, fails or hangs when told to."""
+"""A disk that is full, fails or hangs on demand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Write a log again with messages changed, added or left out."""
+"""Rewrite a log with messages changed, added or left out."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mcap.writer import Writer
 from tactile_core.bus.messages import codec
 
 Edit = Callable[[str, int, Any], Iterable[tuple[str, int, Any]]]
-"""Takes topic, log time in ns and message; yields what to write instead."""
+"""Takes topic, log time in ns and message; yields the replacements."""
 
 
 def rewrite(source: Path, out: Path, edit: Edit) -> Path:

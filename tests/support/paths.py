@@ -1,4 +1,4 @@
-"""Folders that tests read from, wherever the test itself lies."""
+"""Folders that tests read from, independent of the test's place."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ from pathlib import Path
 TESTS = Path(__file__).parents[1]
 ROOT = TESTS.parent
 DATA = TESTS / "data"
-"""Small recordings and files that come with the clone."""
+"""Small recordings and files in the repository."""
 SHARED = ROOT.parent / "shared"
-"""Data beside the clone, on machines that have it; tests skip without."""
+"""Data beside the clone, on some machines; tests skip without it."""

@@ -1,4 +1,4 @@
-"""Run our own commands as processes: output kept in a file, always ended after the test."""
+"""Run our commands as processes with their output in a file; always ended after the test."""
 
 from __future__ import annotations
 

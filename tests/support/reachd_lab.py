@@ -1,4 +1,4 @@
-"""reachd as a real process beside a fake arm and a fake board, and what reachd publishes."""
+"""reachd as a real process with a fake arm and a fake board, and its publications."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.support.wire import Wire
 
 
 class ReachdLab:
-    """Starts what a test needs, and hears what reachd says."""
+    """Starts what a test needs and records reachd's publications."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -42,7 +42,7 @@ class ReachdLab:
         return self._arm
 
     def wire(self, target: str) -> Wire:
-        """A way to ``target`` that can be cut."""
+        """A connection to ``target`` that can be cut."""
         self._wires.append(Wire(target))
         return self._wires[-1]
 
@@ -68,7 +68,7 @@ class ReachdLab:
         return call(self.arm.session, service_key("reach", service, "reach"), request, PATIENCE_S)
 
     def arms(self) -> bool:
-        """Ask to arm; False as long as it is refused, as before the arm has granted its command."""
+        """Ask to arm; False while refused, as before the arm has granted its command."""
         try:
             return bool(self.ask("arm")["armed"])
         except ServiceError:
@@ -83,10 +83,10 @@ class ReachdLab:
         assert program.process.poll() is None, program.said
 
     def told_to_stand(self) -> None:
-        """Wait until the last word to the arm is zero: it may be on its way when reachd is gone.
+        """Wait until the last commands to the arm are zero; they may still be under way when reachd
+        ends.
 
-        On a loaded machine the last words may come when they have expired. No arm obeys those, so
-        then the arm must stand by itself.
+        On a loaded machine they may arrive expired. No arm obeys those, so it must stop by itself.
         """
 
         def stands() -> bool:
@@ -97,8 +97,8 @@ class ReachdLab:
         wait_until(stands)
 
     def close(self) -> None:
-        # Daemons end before their boards: one that outlives its board follows the link that is
-        # left to a terminal which may already belong to another test.
+        # Daemons end before their boards: one that outlives its board would follow the remaining
+        # link to a terminal that may already belong to another test.
         for program in reversed(self._programs):
             program.end()
         for wire in self._wires:

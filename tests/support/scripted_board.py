@@ -1,4 +1,4 @@
-"""A board of a few lines, so that links are judged without the simulator's firmware."""
+"""A minimal board, to test links independently of the simulator's firmware."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def at(seconds: float) -> Instant:
 
 @dataclass
 class ScriptedBoard:
-    """Answers as a board does; what it does not do is told by its switches."""
+    """Answers like a board; its switches turn answers off."""
 
     descriptor: Descriptor = DESCRIPTOR
     period: float = 0.01

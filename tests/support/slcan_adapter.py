@@ -11,7 +11,7 @@ from tactile_core.types import monotonic_now
 
 
 class AdapterThread:
-    """A simulated slcan adapter that serves its port until it is stopped."""
+    """A simulated slcan adapter that serves its port until stopped."""
 
     def __init__(self, port: SlcanPort) -> None:
         self.port = port

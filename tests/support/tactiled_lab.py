@@ -36,7 +36,7 @@ class TactiledLab:
         return self._start("tactiled", "--listen", endpoint or self.endpoint, *words)
 
     def calibration(self, *words: str) -> None:
-        """What `simdevice calibration` writes is there."""
+        """Write a calibration with `simdevice calibration`."""
         made = self._start("simdevice", "calibration", *words)
         assert made.wait() == 0, made.said
 
@@ -48,8 +48,8 @@ class TactiledLab:
     def close(self) -> None:
         for session in self._sessions:
             close_session(session)
-        # Daemons end before their boards: one that outlives its board follows the link that is
-        # left to a terminal which may already belong to another test.
+        # Daemons end before their boards: one that outlives its board would follow the remaining
+        # link to a terminal that may already belong to another test.
         for program in reversed(self._programs):
             program.end()
 
@@ -60,7 +60,7 @@ class TactiledLab:
 
 
 class FeatureListener:
-    """Every features message of a board, with the instant at which it came."""
+    """Records every features message of a board with the time of its arrival."""
 
     def __init__(self, session: zenoh.Session, name: str = "board0", prefix: str = "") -> None:
         self.heard: list[tuple[float, Any]] = []
@@ -71,7 +71,7 @@ class FeatureListener:
         self.heard.append((time.monotonic(), message))
 
     def wait(self, count: int = 1, after: float = 0.0) -> Any:
-        """The last of ``count`` valid features that came after an instant."""
+        """Wait for ``count`` valid features after an instant; returns the last."""
         fresh: list[Any] = []
 
         def enough() -> bool:

@@ -1,4 +1,4 @@
-"""Everything that a trial did, as one number. Also a program, to be run as a worker of its own."""
+"""Digest of everything in a trial. Also a program, run in a process of its own."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from sim_device.world.scenes import Scene
 from tactile_tools.reach.lockstep import Result, Step, run_trial
 
 SECONDS = 3.0
-"""Of a trial: long enough for contacts with several objects."""
+"""Length of a trial in s: enough for contacts with several objects."""
 
 
 def crowded(objects: int = 12) -> Scene:
-    """A scene that is full at the front edge, thinned out for speed, its target near the front."""
+    """A scene that is crowded at the front edge, reduced for speed, with its target near the
+    front."""
     scene = generate("authors_sim", 29)
     near = sorted(scene.objects, key=lambda o: abs(o.y) + o.x)[:objects]
     return replace(scene, objects=tuple(near), goal=(0.16, 0.0))
@@ -33,7 +34,7 @@ def traced(
     watched: bool = True,
     seconds: float = SECONDS,
 ) -> tuple[Result, str]:
-    """Run a trial of at most ``seconds``; its result, and a digest of all its numbers."""
+    """Run a trial of at most ``seconds``; returns its result and a digest of all its numbers."""
     digest = hashlib.sha256()
 
     def watch(step: Step) -> None:

@@ -1,4 +1,4 @@
-"""tactiled's own port, line and session round a simulated board, on virtual time, into a log."""
+"""tactiled's own port, line and session with a simulated board, on virtual time, into a log."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def press(seconds: float) -> list[Contact]:
 
 
 class LogSink:
-    """`tactiled.publisher.MessagePublisher` without a bus."""
+    """tactiled's publisher without a bus."""
 
     def __init__(self, recorder: Recorder) -> None:
         self.wall = WALL
@@ -74,7 +74,7 @@ class LogSink:
 
 
 class Source(RecordedSource):
-    """A port whose writes reach the board."""
+    """A port that keeps what is written to it, for the board."""
 
     def __init__(self, medium: Medium) -> None:
         super().__init__("virtual", medium)
@@ -85,7 +85,7 @@ class Source(RecordedSource):
 
 
 class VirtualDaemon:
-    """One port and its boards; `run` it for some seconds, then `close`."""
+    """One port and its boards; `run` it for some seconds, then `close` it."""
 
     def __init__(
         self,
@@ -161,7 +161,7 @@ class VirtualDaemon:
         self.port.note(kinds.RECALIBRATE, self.now, text=told["hash"])
 
     def run(self, seconds: float) -> None:
-        """Boards and host in steps of 2 ms; a stalled pipeline leaves its inbox alone."""
+        """Run boards and host in steps of 2 ms; a stalled pipeline does not read its inbox."""
         for _ in range(round(seconds * 500)):
             self.now = Instant(self.now + STEP_NS)
             self.sink.moment = self.now

@@ -1,4 +1,4 @@
-"""Wait for a condition with a generous deadline; never sleep in hope."""
+"""Wait for a condition with a generous deadline, instead of sleeping."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PATIENCE_S = 60.0
 
 
 def becomes_true(condition: Callable[[], object], timeout_s: float = PATIENCE_S) -> bool:
-    """Return whether ``condition`` came true within ``timeout_s``."""
+    """Return whether ``condition`` became true within ``timeout_s``."""
     deadline = time.monotonic() + timeout_s
     while not condition():
         if time.monotonic() >= deadline:
@@ -24,5 +24,5 @@ def wait_until(
     timeout_s: float = PATIENCE_S,
     explain: Callable[[], object] = lambda: "condition never came true",
 ) -> None:
-    """Wait until ``condition`` is true, or fail with what ``explain`` returns."""
+    """Wait until ``condition`` is true, or fail with the text of ``explain``."""
     assert becomes_true(condition, timeout_s), explain()

@@ -1,4 +1,4 @@
-"""A TCP connection that can be cut or delayed so that neither end is told."""
+"""A TCP connection that can be cut or delayed without notice to either end."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from tests.support.waiting import PATIENCE_S
 
 
 class Wire:
-    """A TCP connection to ``target`` that can be cut so that neither end is told.
+    """A TCP connection to ``target`` that can be cut without notice to either end.
 
-    ``delay``: s that what goes towards ``target`` takes; the other way is as quick as ever.
+    ``delay``: delay in s towards ``target``; the other direction is not delayed.
     """
 
     def __init__(self, target: str) -> None:
@@ -28,11 +28,11 @@ class Wire:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def cut(self) -> None:
-        """Pass nothing on; what is sent stays under way."""
+        """Stop forwarding; data sent meanwhile is held."""
         self._whole.clear()
 
     def mend(self) -> None:
-        """Pass everything on again, and first what was under way."""
+        """Resume forwarding, first what was held."""
         self._whole.set()
 
     def close(self) -> None:
@@ -63,7 +63,7 @@ class Wire:
         try:
             return socket.create_connection(("127.0.0.1", self._target), timeout=PATIENCE_S)
         except OSError:
-            return None  # nobody listens yet; whoever connects tries again
+            return None  # not yet listening; the client tries again
 
     def _hold(self, source: socket.socket, waiting: queue.SimpleQueue[tuple[float, bytes]]) -> None:
         with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""Messages of every kind, free ports, and a disk that fails when told to."""
+"""Example messages, bus sessions, and recorders on a disk that fails on demand."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WALL_NS = 1_700_000_000_123_456_789
 
 
 def example_messages() -> dict[topics.Topic, Any]:
-    """One message of every topic, with values that tell fields apart."""
+    """One message of every topic, with values that distinguish the fields."""
     head = header(WALL_NS, "ee")
     vector, point = MSG.Vector3(0.5, -1.5, 2.25), MSG.Point(0.125, 0.25, -0.5)
     twist, wrench = MSG.Twist(vector, vector), MSG.Wrench(vector, vector)
@@ -112,7 +112,7 @@ def payloads(messages: dict[topics.Topic, Any]) -> dict[topics.Topic, bytes]:
 
 @pytest.fixture
 def bus() -> Iterator[Callable[..., Any]]:
-    """``bus(listen=port)``, ``bus(connect=port)``: sessions that are closed after the test."""
+    """``bus(listen=port)``, ``bus(connect=port)``: sessions, closed after the test."""
     sessions = []
 
     def join(listen: int | None = None, connect: int | None = None) -> Any:
@@ -135,7 +135,8 @@ def disk() -> FragileDisk:
 
 @pytest.fixture
 def record(disk: FragileDisk) -> Iterator[Callable[..., Recorder]]:
-    """``record(path, **settings)``: a recorder on ``disk`` with quick flushes, closed at last."""
+    """``record(path, **settings)``: a recorder on ``disk`` with quick flushes, closed after the
+    test."""
     recorders = []
 
     def start(path: Path, **settings: Any) -> Recorder:
@@ -153,7 +154,7 @@ def record(disk: FragileDisk) -> Iterator[Callable[..., Recorder]]:
 
 @pytest.fixture(scope="session")
 def logs() -> Callable[[Path], list[LogInfo]]:
-    """``logs(directory)``: what is in each log of it, by name."""
+    """``logs(directory)``: content of each log in it, by name."""
 
     def read(directory: Path) -> list[LogInfo]:
         return [info(path) for path in sorted(directory.glob("*.mcap"))]
@@ -163,7 +164,7 @@ def logs() -> Callable[[Path], list[LogInfo]]:
 
 @pytest.fixture(scope="session")
 def sequences() -> Callable[[Path], dict[str, list[int]]]:
-    """Sequence numbers in all logs of a directory, by channel, repeats taken out."""
+    """Sequence numbers in all logs of a directory by channel, without repetitions."""
 
     def read(directory: Path) -> dict[str, list[int]]:
         found = defaultdict(list)

@@ -1,4 +1,4 @@
-"""The command line of every command: options mean the same, load little, and say what is wrong."""
+"""Command lines of all commands: consistent options, fast start, clear errors."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ MEANINGS = {
     "--name": {"NAME"},
     "--out": {"PATH"},
     "--png": {"PATH"},
-    "--port": {"P", "N"},  # of a board; TCP port of what serves a page or a viewer
+    "--port": {"P", "N"},  # port of a board; TCP port of a page or viewer
     "--rate": {"HZ"},
-    "--reach": {"NAME", "N"},  # its name on the bus; in a log, its number
+    "--reach": {"NAME", "N"},  # name on the bus; number within a log
     "--scene": {"SCENE"},
     "--scene-seed": {"N"},
     "--seed": {"N"},
@@ -65,10 +65,12 @@ MEANINGS = {
     "--source": {"SCENE"},
     "--speed": {"X"},
     "--strategy": {"NAME"},
-    "--wait": {"flag", "S"},  # for what is not there; a daemon of boards waits without end
+    "--wait": {"flag", "S"},  # limit for what is missing; the daemon of boards waits without limit
 }
-"""What an option takes, in every command that has it. Options of one command need no row, nor do
-those whose commands agree."""
+"""Values of an option in every command that has it.
+
+Options of a single command need no row, nor do those whose commands agree.
+"""
 
 VALUES = ("-0.25,0.1,0", "-.5,1", "-30deg/10s", "-5", "-1e-3", "-inf", "-NaN", "-0.1")
 
@@ -84,7 +86,7 @@ SLOW = (
     "numpy", "zenoh", "mcap", "msgspec", "rich", "can", "serial", "rosbags", "zstandard", "mujoco",
     "matplotlib", "scipy", "sklearn", "pyarrow", "jinja2", "cryptography", "psutil",
 )  # fmt: skip
-"""What no command imports for --help."""
+"""Modules that no command may import for --help."""
 
 
 def run(capsys: pytest.CaptureFixture[str], line: str) -> tuple[int, str]:
@@ -234,7 +236,7 @@ HIDDEN = tuple(cli.EXTRAS)
 
 @pytest.fixture(scope="module")
 def core_only(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Environment in which no extra is installed, for processes and for those they start."""
+    """Environment without any extra, for processes and their children."""
     folder = tmp_path_factory.mktemp("core")
     (folder / "sitecustomize.py").write_text(
         f"import sys\nfor name in {HIDDEN!r}:\n    sys.modules[name] = None\n"

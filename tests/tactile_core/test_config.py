@@ -1,4 +1,4 @@
-"""Configuration errors name file, line, what was given and what is allowed."""
+"""Configuration errors name file, line, value and what is allowed."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_wrong_value_is_located_with_allowed_values(text: str, message: str) -> 
     got = error_of(text)
     head, _, allowed = message.partition("; allowed: ")
     assert got.startswith(head)
-    # The order in which msgspec lists choices is its own.
+    # msgspec lists choices in an order of its own.
     assert sorted(got.partition("; allowed: ")[2].split(", ")) == sorted(allowed.split(", "))
 
 

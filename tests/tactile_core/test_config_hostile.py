@@ -1,4 +1,4 @@
-"""Whatever a configuration holds, it is read or refused in one sentence, soon (row 33)."""
+"""Any configuration is read, or refused quickly in one sentence (row 33)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ BOMBS: dict[str, str | bytes] = {
 
 
 def lay(folder: Path, name: str) -> Path:
-    """A file with a bomb, or what is not a file at all."""
+    """Create a hostile file, or something that is not a file."""
     path = folder / f"{name}.toml"
     if name == "fifo":
         os.mkfifo(path)
@@ -68,7 +68,7 @@ ALL = (*BOMBS, "fifo", "folder", "loop", "socket", "endless")
 
 
 def commands(path: Path) -> dict[str, tuple[Callable[[list[str]], int], list[str]]]:
-    """Every command that reads TOML, told to read this."""
+    """Every command that reads TOML, with arguments to read ``path``."""
     p = str(path)
     return {
         "tactiled --config": (tactiled, ["--config", p, "--port", "a", "--no-log"]),

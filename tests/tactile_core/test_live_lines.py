@@ -1,4 +1,4 @@
-"""What people see while a daemon runs."""
+"""Display of a running daemon."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_terminal_shows_rows_above_the_log(recorder: Recorder) -> None:
     out = io.StringIO()
     with Lines(Console(file=out, force_terminal=True, width=100), recorder) as lines:
         lines.show()
-        assert "streaming" not in out.getvalue()  # there was nothing to show yet
+        assert "streaming" not in out.getvalue()  # nothing to show yet
         lines.ready = True
         lines.show()
     text = out.getvalue()

@@ -1,4 +1,4 @@
-"""The client on a bus of its own: streams, their bounds, services, errors in words."""
+"""The client on its own bus: streams, their bounds, services, error messages."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def features(sequence: int, normal: float = 1.5) -> bytes:
 
 
 class Daemon:
-    """Publishes and serves as a tactiled does for the boards left and right."""
+    """Publishes and serves like a tactiled for the boards left and right."""
 
     def __init__(self, folder: Path) -> None:
         self.endpoint = f"unixsock-stream/{folder}/d.sock"
@@ -75,7 +75,7 @@ def bus(daemon: Daemon) -> Iterator[tr.Bus]:
 
 
 def connected(publisher: Publisher, stream: tr.Stream[Any]) -> None:
-    """Publish until the stream hears it, then read what came."""
+    """Publish until the stream receives, then read everything received."""
     for number in range(3000):
         publisher.put(features(number), 0)
         if stream.get(0.02) is not None:
@@ -196,7 +196,7 @@ def test_forces_are_arrays(daemon: Daemon, bus: tr.Bus) -> None:
 def test_a_plain_zenoh_program_joins_by_the_documents_lines(
     daemon: Daemon, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """docs/connecting.md: client of an endpoint, with the user and the secret of the rig."""
+    """docs/connecting.md: client of an endpoint, with user and secret of the rig."""
     from tactile_core.bus.runtime import USER, home, token_file
 
     config = zenoh.Config()

@@ -1,4 +1,4 @@
-"""Logs as arrays: columns, pandas-like shapes, and one sentence for what cannot be read."""
+"""Logs as arrays: columns, shapes for pandas, and one sentence for unreadable files."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The C headers built for this machine, behind ctypes; compilers and emulators, or why they lack.
+"""The C headers built for this machine and called through ctypes; compilers and emulators.
 
-``make firmware-test`` sets TACTILE_FIRMWARE=full: as many messages as docs/firmware.md says,
-fuzzers, emulators. Without it the tests need gcc and a few seconds. With
-TACTILE_FIRMWARE_JSON=FILE what was measured is kept there.
+``make firmware-test`` sets TACTILE_FIRMWARE=full: as many messages as in docs/firmware.md, fuzzers,
+emulators. Otherwise the tests need gcc and a few seconds. TACTILE_FIRMWARE_JSON=FILE keeps the
+measurements there.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ PACKAGES = {
     "avr-gcc": "gcc-avr avr-libc",
     "qemu-system-arm": "qemu-system-arm",
 }
-"""Debian's packages that bring each program."""
+"""Debian package of each program."""
 
 EVENTS = [
     "nothing",
@@ -96,11 +96,11 @@ EVENTS = [
     "out_of_order",
     "duplicate",
 ]
-"""`enum tp_event` in the words of PROTOCOL.md section 8."""
+"""Names of `enum tp_event`, as in PROTOCOL.md section 8."""
 
 
 def tool(name: str) -> str:
-    """Path of a program; the test is skipped, saying what to install, where it is not here."""
+    """Path of a program; if it is missing, the test is skipped with a hint what to install."""
     found = shutil.which(name)
     if found is None:
         pytest.skip(f"{name} is not here: apt-get install {PACKAGES[name]}")
@@ -124,7 +124,7 @@ def long_run() -> None:
 
 
 class Notes(dict[str, Any]):
-    """What was measured, for docs/results/firmware.json."""
+    """Measurements for docs/results/firmware.json."""
 
 
 @pytest.fixture(scope="session")
@@ -146,7 +146,8 @@ def notes() -> Iterator[Notes]:
 
 @pytest.fixture(scope="session")
 def build(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
-    """``build(out, source, *flags, compiler="gcc")``: program or library of ``source``."""
+    """``build(out, source, *flags, compiler="gcc")``: build a program or library from
+    ``source``."""
     folder = tmp_path_factory.mktemp("firmware")
 
     def run(out: str, source: str | Path, *flags: str, compiler: str = "gcc") -> Path:
@@ -160,7 +161,7 @@ def build(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
 
 def fields(message: Message) -> tuple[int, list[int], bytes]:
-    """Type, numbers and bytes of ``message`` as the bridge takes them."""
+    """Type, numbers and bytes of ``message`` in the form of the bridge."""
     kind = int(message_type(message))
     match message:
         case Descriptor():
@@ -229,7 +230,7 @@ class Codec:
         return out.raw[:n]
 
     def decode(self, kind: int, payload: bytes, like: Message) -> tuple[str, list[int], bytes]:
-        """Verdict, numbers and bytes; as many as ``like`` has."""
+        """Decode: result, numbers and bytes; as many as ``like`` has."""
         _, numbers, text = fields(like)
         v = (ctypes.c_int64 * 600)()
         blob = ctypes.create_string_buffer(320)
@@ -252,7 +253,7 @@ class Codec:
 
 
 class Receiver:
-    """Receivers of both media. `counters` as PROTOCOL.md section 8 names them."""
+    """Receivers of both media. `counters`: named as in PROTOCOL.md section 8."""
 
     def __init__(self, library: ctypes.CDLL, slots: int, hold: int) -> None:
         self._c = library
@@ -267,7 +268,7 @@ class Receiver:
         return dict(zip(EVENTS, self._counts, strict=True))
 
     def serial(self, data: bytes) -> list[bytes]:
-        """Header and payload of every packet that ended in ``data``."""
+        """Return header and payload of every packet that ended in ``data``."""
         out = ctypes.create_string_buffer(3 * len(data) + 2200)
         n = self._c.bridge_serial_feed(self._r, data, len(data), self._counts, out)
         return _split(out.raw[:n])
@@ -327,7 +328,7 @@ RANDOM_TYPES = (
 
 
 def random_message(rng: np.random.Generator, kind: type) -> Message:
-    """A message of type ``kind`` with any values that it may have, extremes often among them."""
+    """Random message of type ``kind`` with any valid values, often extreme ones."""
 
     def number(bits: int) -> int:
         top = (1 << bits) - 1
@@ -386,7 +387,7 @@ def random_message(rng: np.random.Generator, kind: type) -> Message:
 
 @pytest.fixture(scope="session")
 def draw() -> Callable[[int, int], list[Message]]:
-    """``draw(count, seed)``: random messages, every type in turn."""
+    """``draw(count, seed)``: random messages of all types in turn."""
 
     def messages(count: int, seed: int) -> list[Message]:
         rng = np.random.default_rng([seed, 0])
@@ -396,10 +397,10 @@ def draw() -> Callable[[int, int], list[Message]]:
 
 
 class CBoard:
-    """The reference board in C on a line of memory: `receive` and `tick`, as simulated boards have.
+    """Reference board in C on a simulated line; `receive` and `tick` as in simulated boards.
 
-    Time is that of the host's instants, from 1 ms on, in whole µs; ``room``: bytes (on CAN frames)
-    that the line takes in each poll.
+    Time is that of the host's instants, from 1 ms on, in whole µs; ``room``: bytes (on CAN: frames)
+    that the line takes per poll.
     """
 
     def __init__(self, library: ctypes.CDLL, node: int | None = None, fd: bool = False) -> None:
@@ -450,7 +451,7 @@ class CBoard:
         resets: bool = False,
         slow: int = 0,
     ) -> None:
-        """Break or mend a modelled chip."""
+        """Set or clear faults of a modelled chip."""
         self._c.bench_chip(self._t, number, int(dead), int(stuck), int(resets), slow)
 
     @property
@@ -462,7 +463,7 @@ class CBoard:
 
 
 class VirtualPort:
-    """A port whose other end is a board in this process, and whose time passes while it is read."""
+    """A port with a board in this process at its other end; time passes while it is read."""
 
     name = "virtual"
 
@@ -502,7 +503,7 @@ def c_can_board(can_library: ctypes.CDLL) -> Callable[..., CBoard]:
 
 @pytest.fixture
 def judge() -> Callable[..., list[tuple[str, str, str]]]:
-    """``judge(board, node, fd)``: what ``tactile board-check`` finds, in the board's own time."""
+    """``judge(board, node, fd)``: results of ``tactile board-check``, in the board's own time."""
 
     def run(board: Any, node: int | None = None, fd: bool = False) -> list[tuple[str, str, str]]:
         port: Any = VirtualPort(board, Medium.SERIAL if node is None else Medium.CAN)
@@ -513,5 +514,5 @@ def judge() -> Callable[..., list[tuple[str, str, str]]]:
 
 @pytest.fixture(scope="session")
 def ports() -> Path:
-    """Where the programs for each microcontroller lie."""
+    """Folder of the programs for each microcontroller."""
     return C / "ports"

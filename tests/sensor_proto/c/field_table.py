@@ -2,8 +2,8 @@
 
     python tests/sensor_proto/c/field_table.py field_table.h truth.json
 
-The header holds what each chip of finger number 0 sees, 20 times a second for 16 s, over and over;
-the other file what the skin bears at those instants.
+The header holds the field at each chip of finger number 0, 20 times a second for 16 s, repeated;
+the other file holds the true forces at those instants.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ FORCES_N = (2.0, 4.0, 3.0)
 
 
 def press(ms: float) -> float:
-    """N on the left side: 6 s at rest, then three presses of 2 s, ramps of 0.5 s; rest."""
+    """Force in N on the left side: 6 s at rest, then three presses of 2 s with ramps of 0.5 s,
+    rest."""
     for number, force in enumerate(FORCES_N):
         t = ms / 1000 - 6.0 - 3.0 * number
         if 0 <= t <= 2.0:
@@ -35,7 +36,7 @@ def press(ms: float) -> float:
 
 
 def write(header: Path, truth: Path, seed: int = 0) -> None:
-    """Both files for the finger number ``seed``."""
+    """Write both files for the finger number ``seed``."""
     skin = build_skin("finger", seed)
     around = Environment(temperature=lambda _: TEMPERATURE_C).at(0.0)
     left = skin.geometry.slices[0]

@@ -1,4 +1,4 @@
-"""board.h as a host meets it, in the board's own time: what is said, refused and counted."""
+"""board.h as seen by a host, in the board's own time: messages, refusals and counters."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tactile_core.types import Instant
 
 
 class Talk:
-    """A host that polls a board every half millisecond and keeps what it says."""
+    """A host that polls a board every half millisecond and keeps its messages."""
 
     def __init__(self, board: Any) -> None:
         self.board = board
@@ -61,7 +61,7 @@ def test_a_blocked_line_costs_the_oldest_cycles_and_each_is_counted(c_board: Any
     missing = got[-1] + 1 - len(got)
     assert missing == c_board.counters["overruns"] == host.of(Status)[-1].overruns
     assert 95 <= missing <= 101
-    # What was kept is what was newest when the line was free again.
+    # The newest samples were kept until the line was free again.
     gap = next(i for i, (a, b) in enumerate(pairwise(got)) if b > a + 1)
     assert got[gap + 1] >= 146
 
@@ -115,7 +115,7 @@ def test_a_board_that_was_held_up_counts_the_cycles_it_never_began(c_board: Any)
     host = Talk(c_board)
     host.say(Start(1))
     host.run(300)
-    host.us += 250_000  # nobody called board_poll
+    host.us += 250_000  # board_poll was not called
     host.run(1200)
     got = [s.sequence for s in host.of(Samples)]
     assert got[-1] + 1 - len(got) == c_board.counters["overruns"]

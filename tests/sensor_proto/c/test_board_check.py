@@ -1,4 +1,5 @@
-"""``tactile board-check`` passes boards that keep to PROTOCOL.md, and names others' mistakes."""
+"""``tactile board-check`` passes boards that follow PROTOCOL.md and names the mistakes of
+others."""
 
 from __future__ import annotations
 
@@ -41,7 +42,7 @@ def test_the_simulated_board_passes(judge: Judge) -> None:
 
 
 class Wrong(SerialBoard):
-    """A board with a mistake in what it says: ``mistake`` changes a message, or drops it (None)."""
+    """A faulty board: ``mistake`` changes a message or drops it (None)."""
 
     def __init__(self, mistake: Callable[[Any], Any]) -> None:
         super().__init__(build_skin("anyskin", 1), identity("anyskin", 1))

@@ -1,4 +1,4 @@
-"""Headers and ports compile without a warning, and take no more than docs/firmware.md says."""
+"""Headers and ports compile without warnings, and are no larger than docs/firmware.md says."""
 
 from __future__ import annotations
 
@@ -58,7 +58,8 @@ def test_each_header_stands_alone(header: str, need: Callable[[str], str], tmp_p
 
 
 def test_all_of_it_passes_under_sanitizers(build: Callable[..., Path], need: Any) -> None:
-    """The fuzzer's ways in, with inputs of a fixed seed; libFuzzer itself: make firmware-test."""
+    """The fuzzer's entry points with inputs of a fixed seed; `make firmware-test` runs libFuzzer
+    itself."""
     flags = ["-std=c99", "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     program = build("smoke", "test/smoke.c", *flags)
     subprocess.run([program], check=True, timeout=120)

@@ -1,4 +1,4 @@
-"""tactile_proto.h writes the bytes that the Python codec writes, and refuses what it refuses."""
+"""tactile_proto.h writes the same bytes as the Python codec and refuses the same input."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_messages_both_ways_are_byte_identical(
         (packet,) = receiver.serial(frame)
         kind, numbers, text = codec.fields(m)
         assert codec.decode(kind, packet[4:], m) == ("accepted", numbers, text)
-        # The same on CAN, by turns in both kinds of frames.
+        # The same on CAN, alternating both kinds of frames.
         transfer = transfers[kind] = (transfers.get(kind, 0) + 1) % 32
         fd = bool(transfer % 2)
         plain = codec.encode(m, stuffed=False, board=5)
@@ -98,7 +98,7 @@ def test_messages_both_ways_are_byte_identical(
 
 
 def spoil(rng: np.random.Generator, frame: bytes) -> bytes:
-    """``frame`` after an accident of the line, or none."""
+    """Corrupt ``frame`` as a line may, or leave it intact."""
     at = int(rng.integers(0, len(frame) + 1))
     match int(rng.integers(0, 8)):
         case 0:
@@ -120,7 +120,7 @@ def right_crc(body: bytes) -> bytes:
 
 
 def odd_packet(rng: np.random.Generator, m: Message) -> bytes:
-    """A packet whose CRC is right and whose content need not be."""
+    """A packet with a correct CRC and possibly invalid content."""
     body = bytearray(pack(m)[:-4])
     for _ in range(int(rng.integers(0, 4))):
         body[int(rng.integers(0, len(body)))] = int(rng.integers(0, 256))
@@ -182,7 +182,7 @@ def test_both_receivers_of_a_spoilt_bus_agree(codec: Any, draw: Draw, full: bool
                     frames[at] = CanFrame(f.identifier, f.data[:-1] + bytes([tail]), f.fd)
                 case _:
                     pass
-        # Identifiers of other boards must not take the slots of those that are followed.
+        # Identifiers of other boards must not take the slots of these.
         frames = [f for f in frames if f.identifier & 0x7F in (3, 4, 0x83, 0x84)]
         for f in frames:
             packets, messages = ours.can(f.identifier, f.data, f.fd), theirs.feed([f])
@@ -193,7 +193,7 @@ def test_both_receivers_of_a_spoilt_bus_agree(codec: Any, draw: Draw, full: bool
 
 
 def test_a_packet_longer_than_the_protocol_allows_is_refused_by_both(codec: Any) -> None:
-    """Its bytes would fit a frame: each zero of a packet costs its frame none."""
+    """Its bytes would fit a frame, as zeros of a packet cost no extra byte."""
     payload = b"\1\0" + b"\0" * 1024
     raw = right_crc(b"\x82\0" + len(payload).to_bytes(2, "little") + payload)
     ours, theirs = codec.receiver(), SerialDecoder()
@@ -209,7 +209,8 @@ def test_a_packet_longer_than_the_protocol_allows_is_refused_by_both(codec: Any)
 
 
 def test_a_receiver_checks_what_it_cannot_hold(codec: Any) -> None:
-    """A newer host's longer command is obeyed with sixteen bytes of memory, a spoilt one is not."""
+    """A longer command of a newer host is obeyed with sixteen bytes of memory, a corrupted one is
+    not."""
     payload = pack(SetGain(9, 255, 7, 0, 0, 3))[4:-4] + bytes(range(1, 201))
     raw = right_crc(b"\x85\0" + len(payload).to_bytes(2, "little") + payload)
     receiver = codec.receiver(hold=16)

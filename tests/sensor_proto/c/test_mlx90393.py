@@ -1,4 +1,4 @@
-"""mlx90393.h on a bus of chips modelled at the level of their registers, under simulated fields."""
+"""mlx90393.h on a bus of chips modelled at register level, in simulated fields."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from sim_device.skin.parameters import ChipSetting
 
 SATURATED, STALE, FAILED = 1, 2, 4
 SLOWEST_US = 2900
-"""More than the slowest chip takes for a conversion with filter 3."""
+"""Longer than the slowest chip needs for a conversion with filter 3."""
 
 
 class Rig:
-    """Chips on one bus under the driver; each `cycle` converts, waits and reads."""
+    """Chips on one bus with the driver; each `cycle` converts, waits and reads."""
 
     def __init__(self, library: ctypes.CDLL, chips: int, spi: bool, pin: bool) -> None:
         self._c = library
@@ -31,20 +31,21 @@ class Rig:
         self._c.rig_free(self._r)
 
     def field(self, field_ut: Any, temperature_c: float = 25.0) -> None:
-        """Field (chips, 3) µT at the chips."""
+        """Set the field at the chips, (chips, 3) µT."""
         nt = np.rint(1000 * np.asarray(field_ut)).astype(np.int32).ravel().tolist()
         cc = round(100 * temperature_c)
         self._c.rig_field(self._r, (ctypes.c_int32 * len(nt))(*nt), cc)
 
     def cycle(self, wait_us: int = SLOWEST_US) -> tuple[Any, list[int], float]:
-        """Counts (chips, 3), status of each chip, mean temperature in °C."""
+        """Run a cycle; returns counts (chips, 3), status of each chip and mean temperature in
+        °C."""
         v = (ctypes.c_int64 * 40)()
         self._c.rig_cycle(self._r, wait_us, v)
         rows = np.array(v[: 4 * self.chips]).reshape(self.chips, 4)
         return rows[:, :3], rows[:, 3].tolist(), v[4 * self.chips] / 100
 
     def cycles(self, count: int) -> list[list[int]]:
-        """Status of each chip, cycle by cycle."""
+        """Run cycles; returns the status of each chip for each."""
         return [self.cycle()[1] for _ in range(count)]
 
     def set(self, setting: Sequence[int], rate_hz: float = 10.0) -> int:
@@ -138,7 +139,7 @@ def test_a_chip_that_does_not_answer_fails_alone_and_comes_back(rig: Rig) -> Non
     rig.cycle()
     rig.chip(3, dead=True)
     assert all(s == [0, 0, 0, FAILED, 0] for s in rig.cycles(5))
-    rig.chip(3, resets=True)  # powered anew: with the settings of the factory
+    rig.chip(3, resets=True)  # power-cycled: with factory settings
     back = rig.cycles(5)
     assert back[-1] == [0] * 5
     assert np.abs(rig.cycle()[0][3] - 300.0 / np.array(ChipSetting(gain=4).lsb_ut)).max() < 1
@@ -187,7 +188,7 @@ def test_settings_too_slow_or_unknown_are_refused_and_change_nothing(rig: Rig) -
 
 def test_burst_mode_hands_each_conversion_over_once(i2c: Rig) -> None:
     ok, not_ready = 0, 3
-    said = i2c.burst(interval=1, step_us=5000, steps=40)  # one conversion in 20 ms
+    said = i2c.burst(interval=1, step_us=5000, steps=40)  # one conversion per 20 ms
     assert said.count(ok) == pytest.approx(10, abs=1)
     assert set(said) == {ok, not_ready}
     assert i2c.burst(interval=0, step_us=3000, steps=20).count(ok) == 20

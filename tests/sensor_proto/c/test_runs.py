@@ -1,4 +1,4 @@
-"""The C board as a program, on a pseudo-terminal, in QEMU, in simavr, under the real tactiled."""
+"""The C board as a program: on a pseudo-terminal, in QEMU, in simavr, with the real tactiled."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mcap.reader import make_reader
 from tactile_core.bus.messages import codec
 
 SLOW = 60.0
-"""s that anything may take on a busy machine before a test gives it up."""
+"""Time limit in s for any step on a busy machine."""
 
 TOOL = "import sys; from tactile_tools.cli import main; sys.exit(main())"
 
@@ -56,7 +56,8 @@ def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
 
 
 def stream(start: Any, folder: Path, port: str, seconds: float, *words: str) -> list[Any]:
-    """Features that the real tactiled logs of the board at ``port`` in ``seconds`` of streaming."""
+    """Features logged by the real tactiled from the board at ``port`` in ``seconds`` of
+    streaming."""
     module = [sys.executable, "-c", "import sys; from tactiled.cli import main; sys.exit(main())"]
     daemon = start(*module, "--port", port, "--log", "run.mcap", *words, out="tactiled.txt")
     text = folder / "tactiled.txt"
@@ -166,7 +167,7 @@ def test_forces_from_a_cortex_m3_in_qemu_are_the_simulators(
     notes: dict[str, Any],
     ports: Path,
 ) -> None:
-    """Modelled chips under the simulator's field, this driver, this board, the real tactiled."""
+    """Modelled chips in the simulator's field, this driver, this board, the real tactiled."""
     need("qemu-system-arm")
     script = Path(__file__).with_name("field_table.py")
     subprocess.run(
@@ -198,11 +199,11 @@ def test_forces_from_a_cortex_m3_in_qemu_are_the_simulators(
     captured = np.array([m.captured_ns for m in good]) / 1e9
 
     def expected(begun: float) -> Any:
-        """N at the captured instants if the board's presses began anew at ``begun``, s."""
+        """Force in N at the captured instants if the board's presses started at ``begun``, s."""
         at = ((captured - begun) / frame_s) % len(truth)
         return np.interp(at, np.arange(len(truth) + 1), np.append(truth, truth[0]))
 
-    # When the emulator was started is not known to 10 ms: the one instant is fitted to it all.
+    # The start time of the emulator is not known to 10 ms; this one instant is fitted.
     offsets = captured[0] + np.arange(0, len(truth) * frame_s, 0.01)
     begun = min(offsets, key=lambda b: float(np.abs(force - expected(b)).mean()))
     wanted = expected(begun)
@@ -246,7 +247,7 @@ def test_an_atmega328p_in_simavr_passes_board_check(
     start(out, image, "board0", out="avr.txt")
     until(lambda: (tmp_path / "board0").exists(), "the port")
     told = board_check(str(tmp_path / "board0"))
-    # A machine that is too slow for simavr makes the emulated clock slow, which is then found out.
+    # On a machine too slow for simavr the emulated clock is slow, and the check reports it.
     slow = "answers clock polls with a clock of tick_hz"
     wrong = [line for line in failures(told) if slow not in line]
     assert wrong == []

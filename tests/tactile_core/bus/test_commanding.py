@@ -1,4 +1,4 @@
-"""Who commands an arm: grants, proofs, numbers and expiry, whatever strangers send."""
+"""Command of an arm: grants, proofs, numbers and expiry, under attack."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ LIMITS = ArmLimits(0.05, 0.3, 10.0, 1.5)
 
 
 class Owner:
-    """A commander whose commands take ``way`` s."""
+    """A commander whose commands arrive ``way`` s late."""
 
     def __init__(self, desk: CommandDesk, now: Instant = T0, clock: str | None = None) -> None:
         self.desk = desk
@@ -57,7 +57,7 @@ class Owner:
 
 
 def changed(data: bytes, **values: Any) -> bytes:
-    """The same command with other values, and the old proof."""
+    """The same command with other values but the old proof."""
     message = replace(codec().decode(COMMAND, data), **values)
     return codec().encode(COMMAND, message)
 
@@ -99,7 +99,7 @@ def test_newest_of_several_commands_is_used() -> None:
 
 
 def forgeries(owner: Owner, now: Instant) -> list[tuple[str, bytes]]:
-    """What somebody who reads every command can make of it."""
+    """Forgeries possible to someone who reads every command."""
     own = owner.data(now)
     other = Signer(CommandDesk().claim(ClaimRequest("evil", clock_domain()), T0))
     back = MSG.Twist(MSG.Vector3(-0.3, 0.0, 0.0), MSG.Vector3(0.0, 0.0, 0.0))
@@ -119,7 +119,7 @@ def forgeries(owner: Owner, now: Instant) -> list[tuple[str, bytes]]:
 
 
 def test_forged_commands_are_not_obeyed_and_cost_the_commander_nothing() -> None:
-    """Row 45: names, numbers and stamps can be read on the bus; the secret cannot."""
+    """Row 45: names, numbers and stamps are readable on the bus; the secret is not."""
     owner = Owner(CommandDesk())
     desk, now = owner.desk, T0
     for kind, data in forgeries(owner, now):
@@ -127,7 +127,7 @@ def test_forged_commands_are_not_obeyed_and_cost_the_commander_nothing() -> None
         assert desk.hear(data, now) == kind
         assert desk.refused[kind] == before + 1
         assert desk.newest(now) is None
-    for k in range(1000):  # a flood between every two of the owner's
+    for k in range(1000):  # a flood between the owner's commands
         now = after(T0, 0.01 * k)
         for _, data in forgeries(owner, now)[:3]:
             desk.hear(data, now)
@@ -213,7 +213,7 @@ def test_requests_reserved_for_the_commander() -> None:
     request = asked(owner, "limits", LimitsRequest, **given)
     desk.authorise("limits", request, T0, **given)
     for service, one, fields in (
-        ("limits", request, given),  # the very same again
+        ("limits", request, given),  # exactly the same again
         ("limits", asked(owner, "clear"), {}),
         ("limits", asked(owner, "limits", LimitsRequest, **given), given | {"f_max": 99.0}),
         ("clear", Signed(), {}),
@@ -229,7 +229,7 @@ def test_requests_reserved_for_the_commander() -> None:
     desk.release(asked(owner, "release"))
     assert desk.commander == ""
     desk.release(Signed())
-    desk.authorise("clear", Signed(), T0)  # nobody commands it
+    desk.authorise("clear", Signed(), T0)  # the arm has no commander
     assert owner.send(after(T0, 0.01)) is None
     assert Owner(desk).send(T0) is not None, "at once"
 
@@ -247,7 +247,7 @@ def test_useless_limits_are_refused(bad: float) -> None:
 
 
 def test_remote_commander_clock_is_mapped_by_its_fastest_command() -> None:
-    """A constant way is not seen by the arm, and one that grows is."""
+    """The arm cannot see a constant delay but sees a growing one."""
     owner = Owner(CommandDesk(), clock="another machine")
     assert owner.grant.clock == "remote"
     shift = 3_600_000_000_000
@@ -278,7 +278,7 @@ def test_any_byte_changed_is_refused(index: int, flip: int) -> None:
     owner = Owner(CommandDesk())
     data = bytearray(owner.data(T0))
     data[index % len(data)] ^= flip
-    # The encapsulation's options and padding are not read, but proved like the rest.
+    # The encapsulation's options and padding are not read, but are covered by the proof.
     assert owner.desk.hear(bytes(data), T0) is not None
 
 

@@ -1,4 +1,4 @@
-"""Logs read back by readers that are not ours."""
+"""Logs read by third-party readers."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def path(tmp_path: Path, record: Any, payloads: Any) -> Path:
 
 
 def plain(message: Any) -> Any:
-    """A decoded message of any library as plain values."""
+    """Convert a decoded message of any library to plain values."""
     if dataclasses.is_dataclass(message):
-        # rosbags makes fields of a type's constants and of its name, too.
+        # rosbags also turns a type's constants and name into fields.
         names = [
             f.name for f in dataclasses.fields(message) if f.name.islower() and f.name[0] != "_"
         ]
@@ -88,7 +88,7 @@ def test_the_summary_agrees_with_the_data(path: Path, messages: Any) -> None:
         assert statistics.attachment_count == 1
         assert statistics.message_start_time == WALL_NS
         assert statistics.message_end_time == WALL_NS + 2
-        # Indexed reading: only the chunks and offsets that the summary names.
+        # Indexed reading uses only the chunks and offsets named in the summary.
         topic = topics.FORCES.channel("b0")
         rows = list(make_reader(file).iter_messages(topics=[topic], log_time_order=True))
         assert [message.log_time for _, _, message in rows] == [WALL_NS + i for i in range(3)]
@@ -98,7 +98,7 @@ def test_the_summary_agrees_with_the_data(path: Path, messages: Any) -> None:
 
 
 def test_rosbags_reads_it_as_a_ros2_bag(path: Path, messages: Any) -> None:
-    """As `ros2 bag reindex` would: a metadata.yaml beside the file, and definitions from it."""
+    """Like `ros2 bag reindex`: a metadata.yaml beside the file, with definitions from it."""
     rows = "".join(
         f"""
     - topic_metadata:

@@ -1,4 +1,4 @@
-"""`tactile bus`: keys for a lab, and the secret of a machine's own rigs."""
+"""`tactile bus`: keys for a lab, and the secret of this machine's rigs."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_parties_are_added_renewed_and_removed(
     authority = (lab / "ca.pem").read_bytes()
     assert main(["bus", "keys", str(lab), "--party", "anna=operator", "--days", "30"]) == 0
     assert (lab / "ca.pem").read_bytes() == authority
-    # Everybody's list knows of her, so that her peers let her in.
+    # Every party's list has her name, so her peers admit her.
     for party in ("arm", "operator", "anna"):
         assert load_keys(lab / party).roles.operator == ("operator", "anna")
     anna = certificate(lab / "anna")

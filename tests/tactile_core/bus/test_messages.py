@@ -1,4 +1,4 @@
-"""Messages: bytes as CDR has them, and nothing but DecodeError for garbage."""
+"""Messages: bytes as specified by CDR, and only DecodeError for garbage."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tactile_core.bus.messages import (
 
 
 def fields(message: Any) -> Any:
-    """A message as plain values, so that arrays compare."""
+    """A message as plain values, to compare arrays."""
     if dataclasses.is_dataclass(message):
         return {f.name: fields(getattr(message, f.name)) for f in dataclasses.fields(message)}
     if isinstance(message, np.ndarray):
@@ -37,8 +37,9 @@ def fields(message: Any) -> Any:
 
 
 def test_field_message_bytes_follow_the_cdr_specification() -> None:
-    # OMG CDR, little-endian (encapsulation 00 01 00 00): each number aligned to its own size from
-    # the first byte after the encapsulation, a string with its length and a closing zero.
+    # OMG CDR, little-endian (encapsulation 00 01 00 00): each number is aligned to its size,
+    # counted from the first byte after the encapsulation; a string has its length and a closing
+    # zero.
     expected = (
         b"\x00\x01\x00\x00"
         + struct.pack("<iI", 1_700_000_000, 123_456_789)  # 0: stamp
@@ -146,7 +147,7 @@ def test_schemas_are_complete_definitions_with_hashes() -> None:
 
 def test_channel_names_map_back_to_topics() -> None:
     for topic in topics.TOPICS:
-        name = "b-0" if "{name}" in topic.template else topic.template  # one that all share
+        name = "b-0" if "{name}" in topic.template else topic.template  # a shared topic
         assert topics.find_topic(topic.channel("b-0")) == (topic, name)
         assert topics.find_topic(topic.key("b-0", "replay/run1")) == (topic, name)
     assert topics.find_topic("/rosout") is None
@@ -155,7 +156,7 @@ def test_channel_names_map_back_to_topics() -> None:
 
 
 def test_newer_fields_are_at_the_end_of_their_types() -> None:
-    """Logs from before lack them and are read: so a field is only ever added at the end."""
+    """Fields are only added at the end, so that logs from before can be read without them."""
     for name, later in LATER_FIELDS.items():
         fields = [field for field, _ in codec().fields(name)]
         assert set(fields[-len(later) :]) == later, name

@@ -1,4 +1,4 @@
-"""Who gets on the bus, and what they may do there: folder, secret, certificates, seats."""
+"""Access to the bus and rights on it: folder, secret, certificates, session limits."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ PEER = textwrap.dedent("""
 
 @pytest.fixture
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A runtime folder of the test's own, for this process and those it starts."""
+    """A runtime folder for this test, used by this process and its children."""
     folder = tmp_path / "rig"
     monkeypatch.setenv(runtime.RUNTIME_VARIABLE, str(folder))
     monkeypatch.delenv(runtime.SYSTEMD_VARIABLE, raising=False)
@@ -65,7 +65,7 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def join() -> Iterator[Callable[..., zenoh.Session]]:
-    """``join(role=..., listen=...)``: a session that is closed after the test."""
+    """``join(role=..., listen=...)``: a session, closed after the test."""
     sessions: list[zenoh.Session] = []
 
     def start(**words: Any) -> zenoh.Session:
@@ -79,7 +79,7 @@ def join() -> Iterator[Callable[..., zenoh.Session]]:
 
 @pytest.fixture
 def plain() -> Iterator[Callable[..., zenoh.Session]]:
-    """``plain(endpoint, **settings)``: a zenoh session without anything of ours."""
+    """``plain(endpoint, **settings)``: a plain zenoh session without our defaults."""
     sessions: list[zenoh.Session] = []
 
     def start(endpoint: str, **settings: Any) -> zenoh.Session:
@@ -106,7 +106,7 @@ def plain() -> Iterator[Callable[..., zenoh.Session]]:
 
 @pytest.fixture
 def peer() -> Iterator[Callable[..., subprocess.Popen[str]]]:
-    """``peer(role)``: a process that publishes and listens at its default place."""
+    """``peer(role)``: a process that publishes and listens at its default endpoints."""
     processes = []
 
     def start(role: str) -> subprocess.Popen[str]:
@@ -168,7 +168,7 @@ def test_daemons_and_tools_connect_via_runtime_folder_in_any_order(
     streams = {role: latest(tool, f"tactile/{role}/features") for role in PORTS}
     processes = [peer(role) for role in reversed(list(PORTS))]
     wait_until(lambda: all(stream.received for stream in map(_drained, streams.values())))
-    for process in processes:  # each hears the other two
+    for process in processes:  # each receives from the other two
         assert process.stdout.readline() == "heard\n"
 
 
@@ -293,7 +293,7 @@ def test_plain_tcp_requires_the_secret(join: Any, plain: Any) -> None:
 def test_at_a_unix_socket_a_stranger_without_the_secret_is_not_heard(
     rig: Path, join: Any, plain: Any
 ) -> None:
-    """Somebody who got as far as the socket (its group, a folder opened by mistake)."""
+    """A stranger who reached the socket (by its group, or a folder opened by mistake)."""
     arm = join(role="arm", connect=())
     endpoint = f"unixsock-stream/{rig / 'bus' / 'arm.sock'}"
     obeyed: list[bytes] = []
@@ -341,7 +341,8 @@ def test_secret_is_created_once_and_private(
 def test_secret_folder_of_another_user_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Somebody may have made it first where all users write; the remedy names what moves it."""
+    """Another user may have created it first in a shared folder; the error names the variable to
+    use."""
     monkeypatch.delenv(runtime.SYSTEMD_VARIABLE, raising=False)
     monkeypatch.setenv(runtime.RUNTIME_VARIABLE, str(tmp_path / "rig"))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
@@ -372,14 +373,14 @@ def test_service_folder_is_shared_with_its_group(
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A lab's keys for every role, those of a second lab, and some that are no good."""
+    """Keys of a lab for every role, those of a second lab, and some invalid ones."""
     keys = pytest.importorskip("tactile_tools.operate.lab_keys")
     pytest.importorskip("cryptography", reason="making keys needs cryptography")
     folder = tmp_path_factory.mktemp("lab")
     order, roles = keys.Order, keys.DEFAULT_PARTIES
     keys.make_keys(order(folder / "lab", roles))
     keys.make_keys(order(folder / "lab", [("guest", "operator")]))
-    keys.remove_party(folder / "lab", "guest")  # signed by the lab, and on nobody's list
+    keys.remove_party(folder / "lab", "guest")  # signed by the lab but in no list
     keys.make_keys(order(folder / "foreign", roles))
     long_ago = datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=10)
     keys.make_keys(order(folder / "lab", [("late", "operator")], days=5, now=long_ago))
@@ -388,7 +389,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def secure_arm(lab: Path, join: Any) -> Any:
-    """An arm over TLS: (endpoint, what it obeyed, its publisher of states)."""
+    """An arm over TLS: (endpoint, commands obeyed, publisher of states)."""
     endpoint = f"tls/localhost:{free_port()}"
     arm = join(role="arm", listen=(endpoint,), connect=(), keys=str(lab / "lab" / "arm"))
     obeyed: list[str] = []
@@ -417,7 +418,7 @@ def test_each_role_has_only_its_own_rights(lab: Path, join: Any, secure_arm: Any
         else:
             with pytest.raises(ServiceError, match=f"the role {role} may not ask.*operator's"):
                 call(session, "arm/arm/srv/limits", timeout=1)
-            # Nor does it help to leave our own look at the rights out.
+            # Bypassing our own check of rights does not help.
             assert list(session.get("arm/arm/srv/limits", timeout=0.5)) == []
             assert list(session.get("arm/arm/srv/*", timeout=0.5)) == []
         if role == "reachd":
@@ -429,7 +430,7 @@ def test_each_role_has_only_its_own_rights(lab: Path, join: Any, secure_arm: Any
 
 
 def test_only_the_arm_certificate_publishes_arm_state(lab: Path, join: Any) -> None:
-    """Whoever else listens where the arm is sought, even with keys of the lab, is not believed."""
+    """A process that listens in the arm's place is not believed, even with keys of the lab."""
     endpoint = f"tls/localhost:{free_port()}"
     reach = join(listen=(), connect=(endpoint,), keys=str(lab / "lab" / "reachd"))
     stream = latest(reach, "arm/arm/state")
@@ -528,11 +529,11 @@ def test_every_role_has_a_certificate(lab: Path) -> None:
     assert stat.S_IMODE((lab / "lab" / "ca.key").stat().st_mode) == 0o600
 
 
-# Seats
+# Session limits
 
 
 def test_hundred_strangers_over_plain_tcp_take_no_session(join: Any, plain: Any) -> None:
-    """Half of them try zenoh's handshake again and again, half hold a connection and are silent."""
+    """Half of them repeat zenoh's handshake, half hold a silent connection."""
     port = free_port()
     session = join(listen=(f"tcp/127.0.0.1:{port}",), connect=())
     silent = [
@@ -554,7 +555,7 @@ def test_hundred_strangers_over_plain_tcp_take_no_session(join: Any, plain: Any)
 def test_hundred_strangers_over_tls_leave_room_for_own_peers(
     lab: Path, join: Any, secure_arm: Any
 ) -> None:
-    """With a certificate that the lab signed, which is not on the list: they connect, no more."""
+    """With a certificate signed by the lab but not listed: they connect and get no further."""
     endpoint, obeyed, states, arm = secure_arm
     guest = str(lab / "lab" / "guest")
     strangers = [join(connect=(endpoint,), listen=(), keys=guest) for _ in range(STRANGERS)]

@@ -1,4 +1,4 @@
-"""Services: every request gets an answer, and every failure its reason."""
+"""Services: every request gets an answer, every failure a reason."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_failures_come_back_as_errors(client: Any, request_: Any, reason: str) -
         call(client, KEY, request_, timeout=PATIENCE_S)
     assert call(client, KEY, {"rate": 7}, timeout=PATIENCE_S) == {
         "rate": 7.0
-    }  # and the service lives on
+    }  # the service continues
 
 
 def test_non_json_request_gets_an_error(client: Any) -> None:

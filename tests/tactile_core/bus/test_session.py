@@ -1,4 +1,4 @@
-"""zenoh sessions: safe by default, never hanging, bounded."""
+"""zenoh sessions: secure by default, never blocking, bounded."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ SUBSCRIBER = textwrap.dedent("""
 
 @pytest.fixture
 def subscriber() -> Iterator[Any]:
-    """``subscriber(port, key, pause)``: a real process that prints what it acts on."""
+    """``subscriber(port, key, pause)``: a real process that prints the samples it processes."""
     processes = []
 
     def start(port: int, key: str, pause: float) -> subprocess.Popen[str]:
@@ -71,7 +71,7 @@ def test_default_endpoints_are_local_only() -> None:
         for endpoint in (*config.listen_endpoints(), *config.connect_endpoints()):
             assert endpoint.startswith("unixsock-stream//")
     assert BusConfig(role="tool").listen_endpoints() == ()
-    # Each pair of roles is joined from one side only.
+    # Each pair of roles connects in one direction only.
     assert BusConfig(role="tactiled").connect_endpoints() == ()
     names = [Path(e).stem for e in BusConfig(role="arm").connect_endpoints()]
     assert names == ["tactiled", "reachd"]
@@ -155,7 +155,7 @@ def test_slow_reader_gets_newest_and_counts_skipped(bus: Any) -> None:
 
 
 def test_slow_process_acts_on_newest_sample(bus: Any, subscriber: Any) -> None:
-    """Row 21: a reader that takes 0.2 s over each sample does not fall behind."""
+    """Row 21: a reader that needs 0.2 s per sample does not fall behind."""
     port = free_port()
     publisher = declare_publisher(bus(listen=port), topics.FEATURES, "b0")
     process = subscriber(port, publisher.key, 0.2)
@@ -170,7 +170,7 @@ def test_slow_process_acts_on_newest_sample(bus: Any, subscriber: Any) -> None:
     while publisher.sequence < 1000 or len(seen) < 5:
         publisher.put(bytes(1000), 1)
         time.sleep(0.002)
-    # Had they queued, it would get there after 200 s only.
+    # With a queue it would arrive only after 200 s.
     wait_until(lambda: seen[-1] == publisher.sequence)
     process.kill()
     reader.join()
@@ -179,7 +179,8 @@ def test_slow_process_acts_on_newest_sample(bus: Any, subscriber: Any) -> None:
 
 
 def test_stopped_subscriber_blocks_nobody(bus: Any, subscriber: Any) -> None:
-    """Row 20: with one reader under SIGSTOP, puts go on and the others get everything new."""
+    """Row 20: with one reader under SIGSTOP, publishing continues and the others get everything
+    new."""
     port = free_port()
     session = bus(listen=port)
     publisher = declare_publisher(session, topics.FEATURES, "b0")
@@ -188,8 +189,8 @@ def test_stopped_subscriber_blocks_nobody(bus: Any, subscriber: Any) -> None:
     wait_until(lambda: publisher.put(b"x", 1) or stream.newest())
     os.kill(stopped.pid, signal.SIGSTOP)
     try:
-        # Far more than sockets and queues hold: a publisher that blocks waits 5 s for each of
-        # them, and this test would never end.
+        # Far more than sockets and queues hold. A publisher that blocks would wait 5 s for each,
+        # and this test would not end.
         for _ in range(3000):
             publisher.put(bytes(20_000), 1)
             time.sleep(0.0003)
@@ -209,7 +210,7 @@ def test_oversized_payloads_are_refused(bus: Any) -> None:
     wait_until(lambda: publisher.put(bytes(MAX_PAYLOAD), 1) or stream.newest())
     publisher.put(b"now", 1)
     wait_until(lambda: (sample := stream.newest()) is not None and sample.data == b"now")
-    # A sender that does not keep to the limit: a little above we count, far above zenoh drops.
+    # A sender that ignores the limit: slightly above it we count, far above zenoh drops.
     session.put(publisher.key, bytes(MAX_PAYLOAD + 100))
     wait_until(lambda: stream.newest() is None and stream.refused == 1)
     session.put(publisher.key, bytes(4 << 20))
@@ -238,7 +239,7 @@ def test_daemons_connect_in_any_start_order(bus: Any) -> None:
     token.undeclare()
     wait_until(lambda: list_alive(early, 0.1) == [])
     close_session(late)
-    again = bus(listen=port)  # restarted: found again without anyone's help
+    again = bus(listen=port)  # restarted: found again automatically
     _token = declare_alive(again, "b0")
     assert list_alive(early, 10) == ["b0"]
 
@@ -247,7 +248,7 @@ def test_daemons_connect_in_any_start_order(bus: Any) -> None:
     "way", ["", "close_session(session)", "session.close()", "raise SystemExit(7)"]
 )
 def test_process_that_used_the_bus_exits(way: str) -> None:
-    """With a subscriber callback and a service, which zenoh serves from threads of its own."""
+    """With a subscriber callback and a service, which run on zenoh's own threads."""
     code = textwrap.dedent(f"""
         from tactile_core.bus.session import BusConfig, open_session, close_session
         from tactile_core.bus.services import declare_service
@@ -274,5 +275,5 @@ def test_closing_does_not_wait_for_a_stopped_peer(subscriber: Any) -> None:
         publisher.put(bytes(20_000), 1)
     started = time.monotonic()
     close_session(session, 0.5)
-    assert time.monotonic() - started < 9  # zenoh by itself waits 10 s, whatever the machine
+    assert time.monotonic() - started < 9  # zenoh itself waits 10 s, on any machine
     os.kill(process.pid, signal.SIGCONT)

@@ -1,4 +1,4 @@
-"""Logs of any writer: what the format allows is read whole, what it does not is told."""
+"""Logs of any writer: valid files are read completely, violations are reported."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_every_conformance_vector_is_read_correctly(tmp_path: Path) -> None:
     assert count == 416
 
 
-# The same kind in small, written by hand
+# Small files of the same kind, written by hand
 
 
 def text(value: str | bytes) -> bytes:
@@ -70,7 +70,7 @@ def record(opcode: int, body: bytes, appended: bytes = b"") -> bytes:
 
 
 class HandMade:
-    """Records of a file with ``appended`` bytes behind the fields of each, as far as allowed."""
+    """Records of a file with ``appended`` bytes after the fields of each, where allowed."""
 
     def __init__(self, appended: bytes = b"") -> None:
         self.more = appended
@@ -100,7 +100,7 @@ class HandMade:
         return record(7, struct.pack("<H", 1) + text(entries), self.more)
 
     def end(self, summary: bytes = b"", start: int | None = None) -> bytes:
-        """The whole file; ``start``: where the footer says that the summary begins."""
+        """The whole file; ``start``: start of the summary as stated in the footer."""
         data = self.data + record(15, bytes(4))
         if start is None:
             start = len(data) if summary else 0
@@ -304,7 +304,7 @@ def test_attachments_and_messages_outside_chunks_may_be_large(tmp_path: Path) ->
     assert peak_of(lambda: recover(path, out)) < 8 << 20
 
 
-# What a flipped bit left readable
+# Data still readable after a bit flip
 
 
 @pytest.mark.parametrize("compression", ["", "zstd"])
@@ -316,8 +316,8 @@ def test_data_readable_after_a_bit_flip_is_kept_on_request(
     messages = [message(k, rng.randbytes(40)) for k in range(100)]
     made.data += made.schema + made.channel
     spoilt = bytearray(b"".join(messages))
-    spoilt[71 * 50 + 2] ^= 4  # a length, so that the next message is not where it seems
-    spoilt[71 * 70 + 45] ^= 1  # within the data of another
+    spoilt[71 * 50 + 2] ^= 4  # a length, so that the next message is not at its stated place
+    spoilt[71 * 70 + 45] ^= 1  # in the data of another message
     made.data += made.chunk(bytes(spoilt), compression, crc=zlib.crc32(b"".join(messages)))
     made.data += made.index(100) + record(12, text("m") + text(b""))
     path, out = write(tmp_path, made.end()), tmp_path / "out.mcap"
@@ -332,7 +332,7 @@ def test_data_readable_after_a_bit_flip_is_kept_on_request(
     assert [m.sequence for _, m in read_messages(out)] == [*range(50), *range(51, 100)]
 
 
-# Any legal file of the format's own writer
+# Any valid file of the mcap package's writer
 
 
 @st.composite
@@ -394,7 +394,7 @@ def test_files_of_the_mcap_writer_read_as_with_the_mcap_reader(
         read = [m for e in reader.events() if isinstance(e, Block) for m in reader.messages(e)]
     assert [tuple(m) for m in read] == right
     times = sorted(m[2] for m in right)
-    if times:  # seeking finds the same as reading all
+    if times:  # seeking finds the same messages as reading everything
         first, last = times[len(times) // 3], times[len(times) * 2 // 3]
         with LogReader(path, window=(first, last)) as reader:
             inside = [
@@ -406,7 +406,7 @@ def test_files_of_the_mcap_writer_read_as_with_the_mcap_reader(
             ]
         assert inside == [m for m in right if first <= m[2] <= last]
     if not (right or found.attachment_count or found.table_count):
-        return  # nothing to recover, which is refused
+        return  # nothing to recover: refused
     report = recover(path, path.with_name("r.mcap"))
     assert (report.messages, report.damage_count) == (len(right), 0)
     assert (report.attachments, report.metadata) == (found.attachment_count, found.table_count)
@@ -427,7 +427,7 @@ def test_any_corrupted_file_gives_correct_messages_or_reports_damage(
             drawn.draw(st.integers(0, 7))
         )
     path.write_bytes(spoilt)
-    assert info(path).files == 1  # neither a traceback nor an endless loop
+    assert info(path).files == 1  # no traceback and no endless loop
     assert recover_or_nothing(path) >= 0
 
 

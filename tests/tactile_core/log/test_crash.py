@@ -1,4 +1,5 @@
-"""Row 29: real processes, killed while they log; every file they leave reads and recovers."""
+"""Row 29: real processes killed while logging; every file they leave is readable and
+recoverable."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ KILLS = 12
 
 @pytest.mark.timeout(300)
 def test_kill_9_loses_only_unflushed_messages(tmp_path: Path) -> None:
-    """How much that is in time is the machine's speed; `make crash` measures it."""
+    """The time this spans depends on the machine; `make crash` measures it."""
     result = tmp_path / "crash.json"
     command = [sys.executable, "-m", "tactile_tools.cli", "crash", "--kills", str(KILLS)]
     command += ["--writers", "4", "--seed", "1234", "--json", str(result)]

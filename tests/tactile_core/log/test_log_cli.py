@@ -1,4 +1,4 @@
-"""``tactile log``: what people see, exit codes, and never a traceback."""
+"""``tactile log``: output, exit codes, and never a traceback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The recorder: bounded, never blocking, and nothing lost without a trace."""
+"""The recorder: bounded, never blocking, and without untraced losses."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_last_message_is_readable_within_one_flush(
     recorder = record(tmp_path / "a.mcap")
     recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
     wait_until(lambda: recorder.stats.written == 1)
-    # The file is still open: what a kill at this moment would leave.
+    # The file is still open: this is what a kill would leave now.
     found = info(tmp_path / "a.mcap")
     assert found.messages == 1
     assert not found.closed
@@ -87,7 +87,7 @@ def test_full_queue_drops_oldest_and_the_log_locates_the_gap(
     tmp_path: Path, record: Any, payloads: Any, disk: Any, sequences: Any
 ) -> None:
     recorder = record(tmp_path / "a.mcap", queue_messages=50)
-    disk.moving.clear()  # a disk that hangs
+    disk.moving.clear()  # a hanging disk
     for i in range(400):
         for topic in (topics.FORCES, topics.RAW):
             recorder.write(topic, "b0", payloads[topic], BASE_NS + i, BASE_NS + i)
@@ -107,7 +107,7 @@ def test_full_queue_drops_oldest_and_the_log_locates_the_gap(
         for name, count in gap.channels.items():
             by_channel[name] += count
     assert sum(by_channel.values()) == dropped
-    # The same loss, message by message: numbers that are not there.
+    # The same losses as missing sequence numbers.
     assert {c.topic: c.missing for c in found.channels} == dict(by_channel)
     numbers = sequences(tmp_path)
     assert (
@@ -116,7 +116,7 @@ def test_full_queue_drops_oldest_and_the_log_locates_the_gap(
         )
         == dropped
     )
-    # The newest survive.
+    # The newest messages are kept.
     assert numbers["/tactile/b0/raw"][-1] == 409
     times = [m.log_ns for c, m in read_messages(tmp_path / "a.mcap") if c.topic.endswith("forces")]
     missing = sorted(set(range(BASE_NS, BASE_NS + 400)) - set(times))
@@ -131,7 +131,7 @@ def test_queue_is_bounded_in_bytes(tmp_path: Path, record: Any, disk: Any) -> No
         recorder.write(topics.RAW, "b0", bytes(5000), BASE_NS + i, BASE_NS + i)
     stats = recorder.stats
     assert stats.dropped["queue_full"] >= 90
-    assert stats.queued <= 4  # two queued, and what the writer holds
+    assert stats.queued <= 4  # two in the queue, the rest in the writer
 
 
 def test_writing_never_waits_for_a_hanging_disk(
@@ -150,7 +150,7 @@ def test_writing_never_waits_for_a_hanging_disk(
 
     threading.Thread(target=write, daemon=True).start()
     assert done.wait(20)
-    assert not recorder.close(0.2)  # it says that it could not
+    assert not recorder.close(0.2)  # reported as not closed
 
 
 def test_full_disk_is_reported_and_recorded_in_the_next_file(
@@ -167,7 +167,7 @@ def test_full_disk_is_reported_and_recorded_in_the_next_file(
     recorder.write(topics.FORCES, "b0", data, BASE_NS, BASE_NS)
     wait_until(lambda: recorder.stats.written == 1)
     with caplog.at_level(logging.ERROR):
-        disk.room = 100  # the next chunk does not fit: part of it is written, then ENOSPC
+        disk.room = 100  # the next chunk is partly written, then ENOSPC
         for i in range(1, 50):
             recorder.write(topics.FORCES, "b0", data, BASE_NS + i, BASE_NS + i)
         wait_until(lambda: recorder.stats.state == "disk_full")
@@ -180,11 +180,11 @@ def test_full_disk_is_reported_and_recorded_in_the_next_file(
     assert recorder.close(10)
     first, *later = logs(tmp_path)
     assert later
-    assert first.messages == 1  # nothing of the chunk that did not fit
+    assert first.messages == 1  # nothing of the incomplete chunk
     assert first.damage_count == 0
     assert [g.reason for g in later[-1].gaps] == ["disk_full"]
     assert str(first.path) in later[-1].gaps[0].detail
-    # The chunk in hand was kept, so nothing is missing at all.
+    # The pending chunk was kept, so nothing is missing.
     assert recorder.stats.dropped == {}
     assert sequences(tmp_path)["/tactile/b0/forces"] == list(range(50))
     assert all(found.whole for found in later)
@@ -252,7 +252,7 @@ def test_logging_stops_before_the_disk_is_full_and_resumes(
     wait_until(lambda: logs(tmp_path)[0].whole)  # closed in order
     size = sum(path.stat().st_size for path in tmp_path.iterdir())
     recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS + 1, BASE_NS)
-    time.sleep(0.3)  # six flushes, at any of which it might write
+    time.sleep(0.3)  # time for six flushes, any of which could write
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) == size
     disk.free_bytes = 1 << 40
     wait_until(lambda: recorder.stats.written == 2)
@@ -273,7 +273,7 @@ def test_file_size_limit_is_handled_like_a_full_disk(
 ) -> None:
     """The kernel refuses bytes in the middle of a write: RLIMIT_FSIZE in a process of its own.
 
-    Without a pause the first file fails while far more waits than one file may hold.
+    Without a pause, the first file fails while far more data is queued than one file may hold.
     """
     limit = 40_000
     code = textwrap.dedent("""

@@ -1,4 +1,4 @@
-"""The recorder's files: split, kept or deleted, shared with others, or refused at the start."""
+"""The recorder's files: splitting, retention, sharing, refusal at start."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_files_split_by_size_are_self_contained(
     assert len(found) >= 4
     for number, log in enumerate(found):
         assert log.whole
-        assert log.size < 6000 + 4000  # split_bytes, and the summary
+        assert log.size < 6000 + 4000  # split_bytes plus the summary
         assert log.metadata["board:b0"] == {"serial_number": "0011"}
         assert log.metadata["file"]["file"] == str(number)
         assert log.attachments == {"cal.toml": ("application/toml", 6)}
@@ -107,7 +107,7 @@ def test_retention_includes_files_of_earlier_runs(
         first.close(10)
         old.append(tmp_path / f"tactile_{year}0101T000000Z_0000.mcap")
         (tmp_path / "x.mcap").rename(old[-1])
-    # The last run was killed: its file has no summary, but it can be read.
+    # The last run was killed: its file has no summary but is readable.
     data = old[-1].read_bytes()
     old[-1].write_bytes(data[: len(data) - 100])
     recorder = record(tmp_path, max_files=2)
@@ -130,7 +130,7 @@ def test_nothing_is_deleted_when_newest_file_is_unreadable(
 
 def test_file_being_written_by_another_process_is_kept(tmp_path: Path, record: Any) -> None:
     other = record(tmp_path)
-    time.sleep(1.1)  # names have whole seconds
+    time.sleep(1.1)  # file names have a resolution of one second
     record(tmp_path, max_files=1)
     assert Path(other.stats.path).exists()
 

@@ -1,4 +1,4 @@
-"""Nothing that is handed over ends the log: it is refused or marked, and counted (rows 42, 43)."""
+"""No input ends the log: it is refused or marked, and counted (rows 42, 43)."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_logging_survives_many_hostile_items(tmp_path: Path, record: Any, payloa
     assert found.whole
     assert found.messages == stats.written > ITEMS // 8
     assert 200 < len(found.channels) <= MAX_CHANNELS
-    # Every loss stands in the log, channel by channel as far as one record names them.
+    # Every loss is in the log, by channel as far as one record names them.
     for reason, count in stats.dropped.items():
         gaps = [gap for gap in found.gaps if gap.reason == reason]
         assert sum(gap.messages for gap in gaps) == count
@@ -102,7 +102,7 @@ def test_unexpected_writer_failure_opens_next_file_with_a_gap(
     wait_until(lambda: recorder.stats.written == 1)
     if when == "open":
         monkeypatch.setattr(disk, "open", _fails_once(disk.open))
-        disk.room, disk.error = 0, errno.EIO  # first the disk, then what comes after it
+        disk.room, disk.error = 0, errno.EIO  # first a disk error, then the error under test
     else:
         monkeypatch.setattr(disk, "write", _fails_once(disk.write))
     recorder.write(topics.LOG, "b0", data, BASE_NS + 1, BASE_NS + 1)

@@ -1,4 +1,5 @@
-"""Logs that were cut off, damaged, or are none: a clear outcome, and all that is readable."""
+"""Logs that were cut off or damaged, and files that are not logs: a clear result, and all readable
+data."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ CHUNKS, PER_CHUNK = 6, 20
 
 
 def write_log(path: Path, payload: bytes, chunks: int = CHUNKS, finish: bool = True) -> list[int]:
-    """A log of ``chunks`` chunks; returns the offset of each and of the end of the data."""
+    """Write a log of ``chunks`` chunks; returns the offset of each and of the end of the data."""
     file = McapFile(path, DiskStorage(), "test 1")
     schema = codec().schema(topics.RAW)
     file.add_schema(1, schema.name, schema.encoding, schema.data)
@@ -65,7 +66,7 @@ def log(tmp_path: Path, payload: bytes) -> tuple[Path, list[int]]:
 
 
 def recovered(path: Path) -> Any:
-    """Recover, check that other readers accept the result, and return the report."""
+    """Recover a log, check that other readers accept the result, and return the report."""
     target = path.with_name("out.mcap")
     target.unlink(missing_ok=True)
     report = recover(path, target)
@@ -111,7 +112,7 @@ def test_log_cut_anywhere_is_reported_and_keeps_everything_before(log: Any, tmp_
         found = info(cut)
         assert not found.closed, size
         assert not found.whole
-        # The chunk record may be whole though its index is not.
+        # The chunk record may be complete although its index is not.
         assert found.messages - complete * PER_CHUNK in range(PER_CHUNK + 1), size
         assert recovered(cut).messages == found.messages
     assert len(places) > 100
@@ -141,7 +142,7 @@ def test_messages_with_lost_schema_are_kept_untyped(tmp_path: Path) -> None:
     write_log(path, b"data", finish=False)
     data = bytearray(path.read_bytes())
     at = data.index(b"tactile_msgs/msg/RawChunk")
-    data[at] = 0xFF  # no UTF-8: the schema cannot be read
+    data[at] = 0xFF  # invalid UTF-8: the schema is unreadable
     path.write_bytes(data)
     report = recovered(path)
     assert report.messages == CHUNKS * PER_CHUNK
@@ -326,7 +327,7 @@ def test_memory_use_is_independent_of_log_size(tmp_path: Path) -> None:
         recover(path, target)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert peaks[1] < peaks[0] + 200_000  # the summary's index: 80 bytes a chunk
+    assert peaks[1] < peaks[0] + 200_000  # the summary's index: 80 bytes per chunk
 
 
 def test_progress_runs_from_start_to_end(log: Any) -> None:
