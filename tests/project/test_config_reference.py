@@ -13,11 +13,11 @@ from tests.support.paths import ROOT
 PAGE = ROOT / "docs" / "configuration.md"
 
 
-def test_the_page_is_up_to_date(capsys: pytest.CaptureFixture[str]) -> None:
+def test_configuration_page_is_up_to_date(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(PAGE), "--check"]) == 0, capsys.readouterr().err
 
 
-def test_a_stale_page_is_named_with_the_remedy(
+def test_stale_page_is_named_with_remedy(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = tmp_path / "configuration.md"

@@ -21,11 +21,11 @@ def names(requirements: list[str]) -> set[str]:
     return {re.split(r"[\[<>=!~ ]", each)[0] for each in requirements}
 
 
-def test_the_core_needs_these_libraries_and_no_other() -> None:
+def test_core_dependencies_are_as_listed() -> None:
     assert names(PROJECT["dependencies"]) == CORE
 
 
-def test_every_python_named_has_wheels_of_the_core_on_aarch64() -> None:
+def test_every_python_has_core_wheels_for_aarch64() -> None:
     """Recorded with `pip download --platform manylinux…_aarch64 --only-binary=:all:`."""
     marker = "Programming Language :: Python :: 3."
     named = {c.rpartition(" ")[2] for c in PROJECT["classifiers"] if c.startswith(marker)}
@@ -36,7 +36,7 @@ def test_every_python_named_has_wheels_of_the_core_on_aarch64() -> None:
             assert wheel.endswith(("-none-any.whl", "aarch64.whl")), f"{python}: {wheel}"
 
 
-def test_every_extra_that_a_command_names_exists_and_all_holds_them() -> None:
+def test_extras_exist_and_all_includes_them() -> None:
     extras = PROJECT["optional-dependencies"]
     assert set(EXTRAS.values()) | {"experiments"} <= set(extras)
     (everything,) = extras["all"]

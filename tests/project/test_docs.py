@@ -33,7 +33,7 @@ def anchors(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
-def test_every_link_of_a_document_leads_somewhere(path: Path) -> None:
+def test_document_links_exist(path: Path) -> None:
     text = FENCE.sub("", path.read_text(encoding="utf-8"))
     for link in LINK.findall(text):
         if "://" in link or link.startswith("mailto:"):
@@ -45,7 +45,7 @@ def test_every_link_of_a_document_leads_somewhere(path: Path) -> None:
             assert anchor in anchors(whole), f"{link}: no such heading"
 
 
-def test_pictures_of_the_structure_are_up_to_date() -> None:
+def test_structure_pictures_are_up_to_date() -> None:
     for name, svg in architecture.pictures(architecture.read_structure()).items():
         kept = (ROOT / "docs" / "pictures" / name).read_text(encoding="utf-8")
         # Line counts change with every commit; only the imports must agree.
@@ -56,13 +56,13 @@ def without_counts(svg: str) -> str:
     return re.sub(r"(· |>)[\d,]+( lines)?", r"\1", svg)
 
 
-def test_the_page_of_topics_is_up_to_date() -> None:
+def test_topics_page_is_up_to_date() -> None:
     kept = (ROOT / "docs" / "topics.md").read_text(encoding="utf-8")
     assert kept == topics_page.page(), "run `make pictures`"
 
 
 @pytest.mark.skipif(find_spec("mkdocs") is None, reason="mkdocs is not installed: `make docs`")
-def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+def test_site_builds_without_warnings(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(tmp_path / "site")],
         cwd=ROOT,

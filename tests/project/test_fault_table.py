@@ -24,7 +24,7 @@ def table() -> dict[int, list[tuple[str, str]]]:
     return found
 
 
-def test_every_fault_has_a_row_and_every_row_a_test() -> None:
+def test_every_fault_has_a_row_with_a_test() -> None:
     rows = table()
     assert set(rows) == set(range(1, ROWS + 1))
     assert [row for row, named in rows.items() if not named] == []

@@ -27,20 +27,20 @@ HASHES = {
 
 
 @pytest.mark.parametrize("name", HASHES)
-def test_a_calibration_says_what_it_said_and_is_written_as_it_was(name: str) -> None:
+def test_calibration_is_read_and_written_unchanged(name: str) -> None:
     text = (OLD / name).read_text(encoding="utf-8")
     read = calibration.loads(text, name)
     assert read.hash == HASHES[name]
     assert calibration.saves(read) == text
 
 
-def test_a_press_script_is_played() -> None:
+def test_press_script_is_read() -> None:
     indenter = load_script(OLD / "press.toml")
     assert indenter.duration == 12.0
     assert len(indenter.presses) == 3
 
 
-def test_a_configuration_of_tactiled_is_read() -> None:
+def test_tactiled_configuration_is_read() -> None:
     options = skin_parser().parse_args(["--config", str(OLD / "tactiled.toml")])
     settings = skin_settings(options)
     assert [port.name for port in settings.ports] == ["left", "hand"]
@@ -51,7 +51,7 @@ def test_a_configuration_of_tactiled_is_read() -> None:
     assert settings.bus.listen == ("tcp/127.0.0.1:7447",)
 
 
-def test_a_configuration_of_reachd_is_read() -> None:
+def test_reachd_configuration_is_read() -> None:
     options = reach_parser().parse_args(["--config", str(OLD / "reachd.toml")])
     settings = reach_settings(options)
     assert settings.goal is not None
@@ -61,7 +61,7 @@ def test_a_configuration_of_reachd_is_read() -> None:
     assert settings.parameters.safety.disabled == {"slow_down"}
 
 
-def test_names_let_in_over_tls_are_now_of_roles(tmp_path: Path) -> None:
+def test_former_tls_names_are_refused_with_remedy(tmp_path: Path) -> None:
     path = tmp_path / "tactiled.toml"
     shutil.copy(OLD / "tactiled.toml", path)
     with path.open("a", encoding="utf-8") as file:

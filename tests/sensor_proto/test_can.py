@@ -240,7 +240,7 @@ def test_length_and_bytes_must_match(reference: SimpleNamespace) -> None:
             assert padded or refused(decoder) == {"length": 1}
 
 
-def test_an_endless_transfer_is_dropped(fd: bool) -> None:
+def test_endless_transfer_is_dropped(fd: bool) -> None:
     decoder = CanDecoder()
     full = 63 if fd else 7
     body = b"\x82\x03\xff\xff".ljust(full, b"\1")
@@ -310,7 +310,7 @@ def test_unknown_commands_can_be_answered_by_number(reference: SimpleNamespace) 
     assert decoder.take_unknown() == [(0xF0, 0x1234)]
 
 
-def test_a_broadcast_is_recognised() -> None:
+def test_broadcast_is_recognised() -> None:
     (received,) = CanDecoder().feed(CanEncoder(BROADCAST, fd=False).encode(Start(1)))
     assert received.board == BROADCAST == 127
 

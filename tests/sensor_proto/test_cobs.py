@@ -40,7 +40,7 @@ def test_encoding_matches_hand_worked_examples(data: bytes, stuffed: bytes) -> N
 
 
 @pytest.mark.parametrize("data", [RUN, RUN + RUN])
-def test_a_full_block_may_be_followed_by_an_empty_one(data: bytes) -> None:
+def test_full_block_may_be_followed_by_an_empty_one(data: bytes) -> None:
     assert cobs.decode(cobs.encode(data) + b"\x01") == data
 
 

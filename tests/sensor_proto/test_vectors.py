@@ -133,7 +133,7 @@ def test_decoder_reads_the_vector(name: str, same: Callable[[object, object], bo
     assert decoder.counters["accepted"] == sum(decoder.counters.values()) == 1
 
 
-def test_an_unknown_type_is_skipped_and_counted() -> None:
+def test_unknown_type_is_skipped_and_counted() -> None:
     decoder = SerialDecoder()
     (received,) = decoder.feed(frame_of("newer_type") + frame_of("start"))
     assert received.message == Start(2)

@@ -108,7 +108,7 @@ def takes(action: argparse.Action) -> str:
     return ", ".join(map(str, action.choices))
 
 
-def test_the_same_option_means_the_same_in_every_command() -> None:
+def test_options_mean_the_same_in_every_command() -> None:
     found: dict[str, set[str]] = defaultdict(set)
     for parser in EVERY:
         for action in parser._actions:
@@ -125,7 +125,7 @@ def test_the_same_option_means_the_same_in_every_command() -> None:
     assert set(MEANINGS) <= set(found)
 
 
-def test_former_names_are_not_names_of_the_same_command() -> None:
+def test_former_names_do_not_clash() -> None:
     for parser in EVERY:
         assert isinstance(parser, cli.Parser)
         options = {o for action in parser._actions for o in action.option_strings}
@@ -134,7 +134,7 @@ def test_former_names_are_not_names_of_the_same_command() -> None:
             assert former not in options or former == "--board", f"{parser.prog}: {former} is both"
 
 
-def test_a_former_name_works_and_says_what_it_is_called_now(
+def test_former_name_works_with_a_note(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     options = tactile_cli.make_parser().parse_args(["log", "cat", "x.mcap", "--to=3"])
@@ -142,7 +142,7 @@ def test_a_former_name_works_and_says_what_it_is_called_now(
     assert "--to is now called --until" in capsys.readouterr().err
 
 
-def test_names_that_options_take_are_those_of_the_code() -> None:
+def test_option_values_match_the_code() -> None:
     assert tuple(BUILT_IN) == cli.STRATEGIES
     assert set(SETS) == set(cli.SETS)
     assert tuple(DIALECTS) == simdevice_arguments.DIALECTS
@@ -156,7 +156,7 @@ def test_names_that_options_take_are_those_of_the_code() -> None:
 
 
 @pytest.mark.parametrize("parser", EVERY, ids=lambda parser: parser.prog)
-def test_no_parser_mistakes_a_negative_value_for_a_flag(parser: argparse.ArgumentParser) -> None:
+def test_negative_values_are_not_mistaken_for_flags(parser: argparse.ArgumentParser) -> None:
     flags = [flag for action in parser._actions for flag in action.option_strings]
     for value in VALUES:
         assert parser._parse_optional(value) is None, value
@@ -181,7 +181,9 @@ def test_commands_are_listed_with_one_line_each(
 @pytest.mark.parametrize(
     "line", ["tactile", "tactile log", "tactile experiment", "tactile calibrate", "simdevice"]
 )
-def test_alone_it_lists_its_commands(line: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_without_arguments_lists_subcommands(
+    line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     code, said = run(capsys, line)
     assert code == cli.USAGE
     assert "commands:" in said
@@ -202,7 +204,7 @@ def test_alone_it_lists_its_commands(line: str, capsys: pytest.CaptureFixture[st
         ("tactile health --wait never", "allowed: a finite number of s above 0"),
     ],
 )
-def test_a_wrong_word_gets_one_sentence_that_says_what_may_be_meant(
+def test_unknown_word_gets_one_sentence_with_suggestion(
     line: str, hint: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, said = run(capsys, line)
@@ -211,7 +213,7 @@ def test_a_wrong_word_gets_one_sentence_that_says_what_may_be_meant(
     assert len(said.strip().splitlines()) == 1
 
 
-def test_help_and_version_of_no_command_import_what_is_slow() -> None:
+def test_help_and_version_import_no_slow_module() -> None:
     lines = [each.prog.split() for each in EVERY]
     code = f"""
 import contextlib, io, json, sys
@@ -267,7 +269,7 @@ def core_only(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     ],
     ids=" ".join,
 )
-def test_a_missing_extra_is_named_in_one_sentence(
+def test_missing_extra_is_named_in_one_sentence(
     words: tuple[str, ...], extra: str, core_only: dict[str, str], tmp_path: Path
 ) -> None:
     done = subprocess.run(
@@ -279,7 +281,7 @@ def test_a_missing_extra_is_named_in_one_sentence(
     assert [path for path in tmp_path.iterdir() if path.name != "runs"] == []
 
 
-def test_the_daemons_need_no_extra(core_only: dict[str, str]) -> None:
+def test_daemons_need_no_extra(core_only: dict[str, str]) -> None:
     modules = ("tactiled.daemon", "tactiled.status", "reachd.daemon", "reachd.strategies",
                "sim_device.runner", "sim_device.ports_plan", "tactile_tools.log.info",
                "tactile_tools.operate.status", "tactile_tools.operate.health",
@@ -289,7 +291,7 @@ def test_the_daemons_need_no_extra(core_only: dict[str, str]) -> None:
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
-def test_bash_completes_commands_options_and_choices(tmp_path: Path) -> None:
+def test_bash_completion_covers_commands_options_and_choices(tmp_path: Path) -> None:
     pytest.importorskip("shtab", reason="the extra `completion` is not installed")
     file = tmp_path / "completion.bash"
     file.write_text(script("bash"))

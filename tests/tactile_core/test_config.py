@@ -239,7 +239,7 @@ class Figures:
 FiguresTable = table_of("FiguresTable", "Some figures.", Figures, rename={"speed": "v"})
 
 
-def test_a_dataclass_is_checked_as_a_file_is_and_overridden_by_one() -> None:
+def test_dataclass_is_checked_like_a_file_and_overridden_by_one() -> None:
     with pytest.raises(ConfigError, match=r"speed = nan; allowed: .* above 0 m/s") as caught:
         Figures(speed=float("nan"))
     assert caught.value.keys == ("speed",)

@@ -84,7 +84,7 @@ def connected(publisher: Publisher, stream: tr.Stream[Any]) -> None:
         pass
 
 
-def test_values_are_those_of_the_message(daemon: Daemon, bus: tr.Bus) -> None:
+def test_values_match_the_message(daemon: Daemon, bus: tr.Bus) -> None:
     with bus.board("left").features(timeout_s=SLOW_S) as stream:
         publisher = daemon.publisher()
         connected(publisher, stream)
@@ -98,9 +98,7 @@ def test_values_are_those_of_the_message(daemon: Daemon, bus: tr.Bus) -> None:
     assert f.shear_force == pytest.approx(1.2)
 
 
-def test_the_newest_is_what_a_slow_reader_gets_and_the_rest_is_counted(
-    daemon: Daemon, bus: tr.Bus
-) -> None:
+def test_slow_reader_gets_newest_and_counts_dropped(daemon: Daemon, bus: tr.Bus) -> None:
     board, publisher = bus.board("left"), daemon.publisher()
     with board.features() as newest, board.features(queue=3) as some:
         connected(publisher, newest)
@@ -116,7 +114,7 @@ def test_the_newest_is_what_a_slow_reader_gets_and_the_rest_is_counted(
         assert (newest.dropped - before[1], some.dropped - before[2]) == (9, 7)
 
 
-def test_bytes_that_are_no_message_are_counted_and_passed_over(daemon: Daemon, bus: tr.Bus) -> None:
+def test_undecodable_bytes_are_counted_and_skipped(daemon: Daemon, bus: tr.Bus) -> None:
     publisher = daemon.publisher()
     with bus.board("left").features(queue=10) as stream:
         connected(publisher, stream)
@@ -126,7 +124,7 @@ def test_bytes_that_are_no_message_are_counted_and_passed_over(daemon: Daemon, b
         assert stream.refused == 1
 
 
-def test_silence_ends_in_a_sentence_and_closing_in_the_end_of_the_loop(bus: tr.Bus) -> None:
+def test_silence_raises_error_and_closing_ends_iteration(bus: tr.Bus) -> None:
     with pytest.raises(tr.SilentError, match=r"nothing came on tactile/left/features for 0\.05 s"):
         bus.board("left").newest(0.05)
     stream = bus.board("left").features()
@@ -147,7 +145,7 @@ def test_boards_are_listed_and_chosen(daemon: Daemon, bus: tr.Bus) -> None:
         bus.board()
 
 
-def test_nobody_there_says_where_it_looked(tmp_path: Path) -> None:
+def test_missing_daemon_error_names_searched_endpoints(tmp_path: Path) -> None:
     with tr.connect(f"unixsock-stream/{tmp_path}/none.sock", find_s=0.1) as bus:
         assert bus.boards() == []
         with pytest.raises(tr.NotThereError, match=r"no tactiled answers .*none\.sock.*start it"):
@@ -168,7 +166,7 @@ def test_services(daemon: Daemon, bus: tr.Bus) -> None:
     assert daemon.asked[2][1] == {"action": "start", "name": "press", "limit_s": 3600.0}
 
 
-def test_any_key_is_read_by_the_type_that_its_sender_says(daemon: Daemon, bus: tr.Bus) -> None:
+def test_any_key_is_decoded_by_its_senders_type(daemon: Daemon, bus: tr.Bus) -> None:
     publisher = Publisher(daemon.session, "my/own/key", FEATURES.msgtype)
     with bus.stream("my/own/key") as stream:
         connected(publisher, stream)
@@ -193,7 +191,7 @@ def test_forces_are_arrays(daemon: Daemon, bus: tr.Bus) -> None:
     assert found.shear.tolist() == [[0.0, 1.0], [3.0, 4.0]]
 
 
-def test_a_plain_zenoh_program_joins_by_the_documents_lines(
+def test_plain_zenoh_program_joins_as_documented(
     daemon: Daemon, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """docs/connecting.md: client of an endpoint, with user and secret of the rig."""

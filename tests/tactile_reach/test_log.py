@@ -51,7 +51,7 @@ def write(tmp_path: Path) -> Callable[..., Path]:
     return make
 
 
-def test_columns_hold_what_was_written(write: Callable[..., Path]) -> None:
+def test_columns_match_written_values(write: Callable[..., Path]) -> None:
     path = write(*((FEATURES, features(i, 0.5 * i, i)) for i in range(4)), (FORCES, forces(5)))
     log = tr.read_log(path)
     assert sorted(log) == ["/tactile/left/features", "/tactile/left/forces"]
@@ -66,17 +66,17 @@ def test_columns_hold_what_was_written(write: Callable[..., Path]) -> None:
     assert log.closed
 
 
-def test_lists_of_different_lengths_stay_apart(write: Callable[..., Path]) -> None:
+def test_lists_of_different_lengths_are_objects(write: Callable[..., Path]) -> None:
     log = tr.read_log(write((FORCES, forces(3)), (FORCES, forces(5))))
     assert [len(each) for each in log["/tactile/left/forces"]["force"]] == [9, 15]
 
 
-def test_topics_that_are_asked_for_alone_are_read(write: Callable[..., Path]) -> None:
+def test_only_requested_topics_are_read(write: Callable[..., Path]) -> None:
     path = write((FEATURES, features(1, 1.0)), (FORCES, forces(3)))
     assert list(tr.read_log(path, ["tactile/left/forces"])) == ["/tactile/left/forces"]
 
 
-def test_what_is_not_there_is_named_with_what_is(write: Callable[..., Path]) -> None:
+def test_missing_topic_or_column_lists_available_ones(write: Callable[..., Path]) -> None:
     log = tr.read_log(write((FEATURES, features(1, 1.0))))
     with pytest.raises(KeyError, match=r"available: /tactile/left/features"):
         log["/tactile/right/features"]
@@ -86,7 +86,7 @@ def test_what_is_not_there_is_named_with_what_is(write: Callable[..., Path]) -> 
         log["/tactile/left/features"]["force"]
 
 
-def test_what_cannot_be_read_is_one_sentence(write: Callable[..., Path], tmp_path: Path) -> None:
+def test_unreadable_file_gives_one_sentence(write: Callable[..., Path], tmp_path: Path) -> None:
     no_log = tmp_path / "no.mcap"
     no_log.write_text("no log")
     for path, said in (

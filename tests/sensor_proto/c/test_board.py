@@ -48,7 +48,7 @@ class Talk:
         return [m for m in self.heard if isinstance(m, kind)]
 
 
-def test_a_blocked_line_costs_the_oldest_cycles_and_each_is_counted(c_board: Any) -> None:
+def test_blocked_line_drops_and_counts_oldest_cycles(c_board: Any) -> None:
     host = Talk(c_board)
     host.say(Start(1))
     host.run(500)
@@ -66,7 +66,7 @@ def test_a_blocked_line_costs_the_oldest_cycles_and_each_is_counted(c_board: Any
     assert got[gap + 1] >= 146
 
 
-def test_a_line_of_a_few_bytes_at_a_time_spoils_nothing(c_board: Any) -> None:
+def test_slow_line_corrupts_nothing(c_board: Any) -> None:
     host = Talk(c_board)
     c_board.room = 3  # of 57 bytes every 10 ms: 6 kB/s of 6 kB/s
     host.say(Identify(1), Start(2))
@@ -78,7 +78,7 @@ def test_a_line_of_a_few_bytes_at_a_time_spoils_nothing(c_board: Any) -> None:
     assert len(got) > 200
 
 
-def test_a_clock_reply_leaves_before_samples_and_with_the_stamp_of_its_leaving(
+def test_clock_reply_precedes_samples_and_has_its_send_time(
     c_board: Any,
 ) -> None:
     host = Talk(c_board)
@@ -111,7 +111,7 @@ def test_ticks_wrap_and_periods_stay_exact(c_board: Any) -> None:
     assert all(abs(step - 30_000) <= 1000 for step in steps)
 
 
-def test_a_board_that_was_held_up_counts_the_cycles_it_never_began(c_board: Any) -> None:
+def test_delayed_board_counts_missed_cycles(c_board: Any) -> None:
     host = Talk(c_board)
     host.say(Start(1))
     host.run(300)
@@ -123,7 +123,7 @@ def test_a_board_that_was_held_up_counts_the_cycles_it_never_began(c_board: Any)
     assert c_board.counters["cycles"] in (got[-1] + 1, got[-1] + 2)
 
 
-def test_log_lines_are_cut_between_characters_and_lost_ones_told(c_board: Any) -> None:
+def test_log_lines_are_cut_between_characters_and_losses_reported(c_board: Any) -> None:
     host = Talk(c_board)
     c_board.log(30, "ä" * 30)
     for _ in range(3):
@@ -138,7 +138,7 @@ def test_log_lines_are_cut_between_characters_and_lost_ones_told(c_board: Any) -
     ]
 
 
-def test_a_dead_chip_is_marked_counted_and_comes_back(c_board: Any) -> None:
+def test_dead_chip_is_flagged_counted_and_recovers(c_board: Any) -> None:
     host = Talk(c_board)
     host.say(Start(1))
     host.run(300)
@@ -151,7 +151,7 @@ def test_a_dead_chip_is_marked_counted_and_comes_back(c_board: Any) -> None:
     assert 95 <= host.of(Status)[-1].chip_errors <= 110
 
 
-def test_commands_after_reboot_are_busy_and_the_board_begins_anew(c_board: Any) -> None:
+def test_commands_after_reboot_are_busy_until_restart(c_board: Any) -> None:
     host = Talk(c_board)
     host.say(Start(1))
     host.run(300)
@@ -165,7 +165,7 @@ def test_commands_after_reboot_are_busy_and_the_board_begins_anew(c_board: Any) 
     assert (status.reset_cause, status.cycles, status.rate_mhz) == (1, 0, 0)
 
 
-def test_more_commands_than_it_can_answer_are_refused_and_counted(c_board: Any) -> None:
+def test_excess_commands_are_refused_and_counted(c_board: Any) -> None:
     host = Talk(c_board)
     c_board.room = 0
     host.say(*(Start(n) for n in range(20)), *(ClockPoll(n) for n in range(20)))
@@ -180,7 +180,7 @@ def test_more_commands_than_it_can_answer_are_refused_and_counted(c_board: Any) 
     assert host.of(Descriptor)
 
 
-def test_on_can_boards_of_one_bus_answer_the_question_to_all(
+def test_boards_on_a_can_bus_answer_broadcast_identify(
     c_can_board: Callable[..., Any],
 ) -> None:
     from sensor_proto.can_transfers import BROADCAST, CanDecoder, CanEncoder

@@ -21,20 +21,20 @@ def unhappy(found: list[tuple[str, str, str]]) -> list[tuple[str, str, str]]:
     return [row for row in found if row[1] != "pass"]
 
 
-def test_the_board_in_c_passes_on_a_serial_line(judge: Judge, c_board: Any) -> None:
+def test_c_board_passes_on_a_serial_line(judge: Judge, c_board: Any) -> None:
     found = judge(c_board)
     assert unhappy(found) == []
     assert len(found) == 25
 
 
 @pytest.mark.parametrize("fd", [False, True])
-def test_the_board_in_c_passes_on_a_can_bus(
+def test_c_board_passes_on_a_can_bus(
     judge: Judge, c_can_board: Callable[..., Any], fd: bool
 ) -> None:
     assert unhappy(judge(c_can_board(9, fd), 9, fd)) == []
 
 
-def test_the_simulated_board_passes(judge: Judge) -> None:
+def test_simulated_board_passes(judge: Judge) -> None:
     skin, who = build_skin("anyskin", 1), identity("anyskin", 1)
     assert unhappy(judge(SerialBoard(skin, who))) == []
     skin = build_skin("anyskin", 1)
@@ -85,7 +85,7 @@ class Wrong(SerialBoard):
         ),
     ],
 )
-def test_a_mistake_is_named(
+def test_board_mistake_is_named(
     judge: Judge, mistake: Callable[[Any], Any], title: str, said: str
 ) -> None:
     found = {t: (verdict, text) for t, verdict, text in judge(Wrong(mistake))}
@@ -104,7 +104,7 @@ def test_a_mistake_is_named(
         (["--can", "socketcan:nothing0"], 3, "nothing0"),
     ],
 )
-def test_bad_input_is_one_sentence_with_the_remedy(
+def test_board_check_refuses_bad_input_with_remedy(
     words: list[str], code: int, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     try:

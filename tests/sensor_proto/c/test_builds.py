@@ -34,7 +34,7 @@ MEDIA = {"serial": [], "can": ["-DBOARD_CAN=1", "-DTP_CAN_BYTES=8"], "canfd": ["
 
 @pytest.mark.parametrize("medium", MEDIA)
 @pytest.mark.parametrize("target", TARGETS)
-def test_the_headers_compile_without_a_warning(
+def test_headers_compile_without_warnings(
     target: str, medium: str, need: Callable[[str], str], tmp_path: Path
 ) -> None:
     compiler, *flags = TARGETS[target]
@@ -50,14 +50,16 @@ def test_the_headers_compile_without_a_warning(
 
 
 @pytest.mark.parametrize("header", HEADERS)
-def test_each_header_stands_alone(header: str, need: Callable[[str], str], tmp_path: Path) -> None:
+def test_each_header_compiles_alone(
+    header: str, need: Callable[[str], str], tmp_path: Path
+) -> None:
     source = tmp_path / "one.c"
     source.write_text(f'#include "{header}"\n#include "{header}"\nint one;\n')
     words = [need("gcc"), "-std=c99", *WARNINGS, f"-I{C}", "-fsyntax-only", str(source)]
     subprocess.run(words, check=True)
 
 
-def test_all_of_it_passes_under_sanitizers(build: Callable[..., Path], need: Any) -> None:
+def test_smoke_inputs_pass_under_sanitizers(build: Callable[..., Path], need: Any) -> None:
     """The fuzzer's entry points with inputs of a fixed seed; `make firmware-test` runs libFuzzer
     itself."""
     flags = ["-std=c99", "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
@@ -74,7 +76,7 @@ SMALL = "-std=c99 -Os -ffunction-sections -fdata-sections -Wl,--gc-sections".spl
 
 
 @pytest.mark.parametrize("target", SIZES)
-def test_what_a_board_takes(
+def test_board_size_is_within_documented_limits(
     target: str, need: Callable[[str], str], build: Callable[..., Path], notes: dict[str, Any]
 ) -> None:
     (compiler, *flags), sizer = SIZES[target]
@@ -100,7 +102,7 @@ def test_what_a_board_takes(
         assert rows["board, serial"]["ram_bytes"] <= 512
 
 
-def test_a_million_inputs_of_the_fuzzer(
+def test_libfuzzer_finds_nothing_in_a_million_inputs(
     build: Callable[..., Path], long_run: None, notes: dict[str, Any], tmp_path: Path
 ) -> None:
     flags = ["-std=c99", "-g", "-O1", "-fsanitize=fuzzer,address,undefined"]
@@ -113,7 +115,7 @@ def test_a_million_inputs_of_the_fuzzer(
     notes["fuzz"] = {"runs": int(found[0][0]), "coverage_edges": int(found[0][1]), "failures": 0}
 
 
-def test_the_packages_name_what_is_there() -> None:
+def test_package_manifests_name_existing_files() -> None:
     version = re.search(r"^version=(.+)$", (C / "library.properties").read_text(), re.M)
     assert version
     told = json.loads((C / "library.json").read_text())
@@ -127,7 +129,7 @@ def test_the_packages_name_what_is_there() -> None:
 
 
 @pytest.mark.parametrize("sketch", sorted(p.name for p in (C / "examples").glob("*")))
-def test_the_sketches_compile_against_a_stand_in_of_their_library(
+def test_sketches_compile_against_stand_in_headers(
     sketch: str, need: Callable[[str], str], tmp_path: Path
 ) -> None:
     source = tmp_path / "sketch.cpp"

@@ -29,12 +29,12 @@ Draw = Callable[[int, int], list[Message]]
 DOCUMENT = (Path(sensor_proto.__file__).parent / "PROTOCOL.md").read_text("utf-8")
 
 
-def test_the_crc_is_castagnolis(codec: Any) -> None:
+def test_crc_matches_published_values_in_c(codec: Any) -> None:
     assert codec.crc(b"123456789") == 0xE3069283
     assert codec.crc(pack(Start(7))) == 0x48674BC7
 
 
-def test_every_serial_vector_is_read_and_written_again(codec: Any) -> None:
+def test_serial_vectors_round_trip(codec: Any) -> None:
     vectors = re.findall(r"^```hex (\w+)\n(.*?)^```$", DOCUMENT, re.M | re.S)
     read = 0
     for name, body in vectors:
@@ -57,7 +57,7 @@ def test_every_serial_vector_is_read_and_written_again(codec: Any) -> None:
 
 
 @pytest.mark.parametrize("name", ["samples_classic", "samples_fd", "identify_fd"])
-def test_every_can_vector_is_read_and_written_again(codec: Any, name: str) -> None:
+def test_can_vectors_round_trip(codec: Any, name: str) -> None:
     (body,) = re.findall(rf"^```can {name}\n(.*?)^```$", DOCUMENT, re.M | re.S)
     lines: list[tuple[str, bytes]] = []
     for line in body.splitlines():
@@ -73,7 +73,7 @@ def test_every_can_vector_is_read_and_written_again(codec: Any, name: str) -> No
     assert [p for i, data in frames for p in receiver.can(int(i, 16), data, fd)] == [packet[:-4]]
 
 
-def test_messages_both_ways_are_byte_identical(
+def test_messages_are_byte_identical_in_c_and_python(
     codec: Any, draw: Draw, full: bool, notes: dict[str, Any]
 ) -> None:
     count = 100_000 if full else 1_300
@@ -137,7 +137,7 @@ def stuff(packet: bytes) -> bytes:
     return cobs.encode(packet) + b"\0"
 
 
-def test_both_receivers_of_a_spoilt_line_agree(codec: Any, draw: Draw, full: bool) -> None:
+def test_receivers_agree_on_corrupted_serial_line(codec: Any, draw: Draw, full: bool) -> None:
     rng = np.random.default_rng(5)
     ours, theirs = codec.receiver(), SerialDecoder()
     for m in draw(30_000 if full else 2_000, 2):
@@ -149,7 +149,7 @@ def test_both_receivers_of_a_spoilt_line_agree(codec: Any, draw: Draw, full: boo
     assert min(theirs.counters.values()) > 0, theirs.counters
 
 
-def test_both_receivers_of_a_spoilt_bus_agree(codec: Any, draw: Draw, full: bool) -> None:
+def test_receivers_agree_on_corrupted_can_bus(codec: Any, draw: Draw, full: bool) -> None:
     rng = np.random.default_rng(6)
     ours, theirs = codec.receiver(slots=60), CanDecoder()
     for number, m in enumerate(draw(30_000 if full else 2_000, 3)):
@@ -192,7 +192,7 @@ def test_both_receivers_of_a_spoilt_bus_agree(codec: Any, draw: Draw, full: bool
     assert missing <= {"error_frame", "oversized", "board"}, theirs.counters
 
 
-def test_a_packet_longer_than_the_protocol_allows_is_refused_by_both(codec: Any) -> None:
+def test_oversized_packet_is_refused_by_both(codec: Any) -> None:
     """Its bytes would fit a frame, as zeros of a packet cost no extra byte."""
     payload = b"\1\0" + b"\0" * 1024
     raw = right_crc(b"\x82\0" + len(payload).to_bytes(2, "little") + payload)
@@ -208,7 +208,7 @@ def test_a_packet_longer_than_the_protocol_allows_is_refused_by_both(codec: Any)
     assert bus.counters["oversized"] == 1
 
 
-def test_a_receiver_checks_what_it_cannot_hold(codec: Any) -> None:
+def test_receiver_checks_bytes_it_cannot_hold(codec: Any) -> None:
     """A longer command of a newer host is obeyed with sixteen bytes of memory, a corrupted one is
     not."""
     payload = pack(SetGain(9, 255, 7, 0, 0, 3))[4:-4] + bytes(range(1, 201))
@@ -224,7 +224,7 @@ def test_a_receiver_checks_what_it_cannot_hold(codec: Any) -> None:
         assert [p for f in frames for p in receiver.can(f.identifier, f.data, fd)] == [raw[:16]]
 
 
-def test_a_slot_too_few_costs_the_transfer_used_longest_ago_and_is_counted(codec: Any) -> None:
+def test_missing_slot_drops_least_recent_transfer_and_counts_it(codec: Any) -> None:
     receiver = codec.receiver(slots=2, hold=32)
     begun = [
         segment(pack(m, 4), identifier(message_type(m), 4), 0, False)
@@ -240,7 +240,7 @@ def test_a_slot_too_few_costs_the_transfer_used_longest_ago_and_is_counted(codec
     assert receiver.counters["no_start"] == 1
 
 
-def test_a_writer_never_writes_beyond_its_room(codec: Any, draw: Draw) -> None:
+def test_writer_never_exceeds_its_buffer(codec: Any, draw: Draw) -> None:
     for m in draw(130, 4):
         for stuffed in (True, False):
             size = len(codec.encode(m, stuffed))
@@ -248,7 +248,7 @@ def test_a_writer_never_writes_beyond_its_room(codec: Any, draw: Draw) -> None:
             assert len(codec.encode(m, stuffed, room=size)) == size
 
 
-def test_a_commands_answer_survives_any_chunks(codec: Any) -> None:
+def test_answer_is_independent_of_chunking(codec: Any) -> None:
     receiver = codec.receiver()
     data = encode_serial(Start(1)) + b"\0\0" + encode_serial(Stop(2))
     packets = [p for byte in data for p in receiver.serial(bytes([byte]))]

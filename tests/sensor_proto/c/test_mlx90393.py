@@ -87,7 +87,7 @@ def i2c(library: ctypes.CDLL) -> Iterator[Rig]:
     made.close()
 
 
-def test_what_the_simulators_skin_sees_is_what_the_driver_reads(rig: Rig) -> None:
+def test_driver_reads_the_field_of_the_simulated_skin(rig: Rig) -> None:
     skin = build_skin("anyskin", 2)
     around = Environment().at(0.0)
     for force in (0.0, 1.0, 5.0):
@@ -103,7 +103,7 @@ def test_what_the_simulators_skin_sees_is_what_the_driver_reads(rig: Rig) -> Non
 
 @pytest.mark.parametrize("resolution", range(4))
 @pytest.mark.parametrize("gain", [0, 4, 7])
-def test_every_scale(rig: Rig, gain: int, resolution: int) -> None:
+def test_scales_match_the_datasheet(rig: Rig, gain: int, resolution: int) -> None:
     assert rig.set((gain, resolution, 0, 3)) == 0
     lsb = np.array(ChipSetting(gain, resolution).lsb_ut)
     counts = np.array([[100, -200, 3000], [-9000, 9000, -1], [0, 0, 0], [1, 2, 3], [-5, 6, -7]])
@@ -113,7 +113,7 @@ def test_every_scale(rig: Rig, gain: int, resolution: int) -> None:
     assert np.abs(got - counts).max() <= 1
 
 
-def test_the_registers_are_those_of_the_datasheet(rig: Rig) -> None:
+def test_registers_match_the_datasheet(rig: Rig) -> None:
     rig.cycle()
     assert rig.set((5, 2, 1, 6)) == 0
     for chip in range(5):
@@ -124,7 +124,7 @@ def test_the_registers_are_those_of_the_datasheet(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(("resolution", "limit"), [(0, 32767), (1, 32767), (2, 22000), (3, 11000)])
-def test_over_range_is_flagged(rig: Rig, resolution: int, limit: int) -> None:
+def test_overrange_is_flagged(rig: Rig, resolution: int, limit: int) -> None:
     rig.set((4, resolution, 0, 3))
     lsb = np.array(ChipSetting(4, resolution).lsb_ut)
     field = np.zeros((5, 3))
@@ -134,7 +134,7 @@ def test_over_range_is_flagged(rig: Rig, resolution: int, limit: int) -> None:
     assert rig.cycle()[1] == [0, SATURATED, SATURATED, 0, 0]
 
 
-def test_a_chip_that_does_not_answer_fails_alone_and_comes_back(rig: Rig) -> None:
+def test_silent_chip_fails_alone_and_recovers(rig: Rig) -> None:
     rig.field(np.full((5, 3), 300.0))
     rig.cycle()
     rig.chip(3, dead=True)
@@ -145,7 +145,7 @@ def test_a_chip_that_does_not_answer_fails_alone_and_comes_back(rig: Rig) -> Non
     assert np.abs(rig.cycle()[0][3] - 300.0 / np.array(ChipSetting(gain=4).lsb_ut)).max() < 1
 
 
-def test_a_chip_that_reset_by_itself_is_never_read_with_the_wrong_scale(rig: Rig) -> None:
+def test_chip_that_reset_is_never_read_with_wrong_scale(rig: Rig) -> None:
     rig.field(np.full((5, 3), 600.0))
     wanted = rig.cycle()[0][0]
     rig.chip(0, resets=True)
@@ -159,13 +159,13 @@ def test_a_chip_that_reset_by_itself_is_never_read_with_the_wrong_scale(rig: Rig
     assert status == [0] * 5
 
 
-def test_a_bus_held_down_is_freed_and_costs_nothing(i2c: Rig) -> None:
+def test_blocked_bus_is_freed_without_loss(i2c: Rig) -> None:
     i2c.cycle()
     i2c.chip(2, stuck=True)
     assert i2c.cycles(2) == [[0] * 5] * 2
 
 
-def test_without_a_new_conversion_the_last_one_is_repeated_as_stale(i2c: Rig) -> None:
+def test_missing_conversion_repeats_last_value_as_stale(i2c: Rig) -> None:
     i2c.field(np.full((5, 3), 90.0))
     before = i2c.cycle()[0]
     i2c.chip(4, slow=30)
@@ -176,7 +176,7 @@ def test_without_a_new_conversion_the_last_one_is_repeated_as_stale(i2c: Rig) ->
     assert i2c.cycles(2)[-1] == [0] * 5
 
 
-def test_settings_too_slow_or_unknown_are_refused_and_change_nothing(rig: Rig) -> None:
+def test_slow_or_unknown_settings_are_refused_without_change(rig: Rig) -> None:
     rig.cycle()
     before = [rig.register(0, n) for n in range(3)]
     for bad in ((8, 0, 0, 3), (4, 4, 0, 3), (4, 0, 4, 3), (4, 0, 0, 8)):
@@ -186,7 +186,7 @@ def test_settings_too_slow_or_unknown_are_refused_and_change_nothing(rig: Rig) -
     assert rig.set((4, 0, 3, 7), rate_hz=4) == 0
 
 
-def test_burst_mode_hands_each_conversion_over_once(i2c: Rig) -> None:
+def test_burst_mode_delivers_each_conversion_once(i2c: Rig) -> None:
     ok, not_ready = 0, 3
     said = i2c.burst(interval=1, step_us=5000, steps=40)  # one conversion per 20 ms
     assert said.count(ok) == pytest.approx(10, abs=1)
@@ -194,7 +194,7 @@ def test_burst_mode_hands_each_conversion_over_once(i2c: Rig) -> None:
     assert i2c.burst(interval=0, step_us=3000, steps=20).count(ok) == 20
 
 
-def test_a_board_that_looks_the_other_way_is_turned_about_y(rig: Rig) -> None:
+def test_flipped_board_is_rotated_about_y(rig: Rig) -> None:
     rig.flip()
     rig.field([[30.0, 60.0, 4840.0]] * 5)
     counts, _, _ = rig.cycle()

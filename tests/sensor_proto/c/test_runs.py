@@ -92,7 +92,7 @@ def failures(told: str) -> list[str]:
     return [line for line in told.splitlines() if line.startswith("FAIL")]
 
 
-def test_the_real_tactiled_streams_from_the_board_on_a_pty(
+def test_tactiled_streams_from_board_on_a_pty(
     start: Any, build: Callable[..., Path], tmp_path: Path
 ) -> None:
     program = build("board", "ports/host/main.c", "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
@@ -107,7 +107,7 @@ def test_the_real_tactiled_streams_from_the_board_on_a_pty(
     assert "cycles" in (tmp_path / "board.txt").read_text()
 
 
-def test_bad_use_of_the_program_is_one_sentence(build: Callable[..., Path]) -> None:
+def test_wrong_arguments_give_one_sentence(build: Callable[..., Path]) -> None:
     program = build("board", "ports/host/main.c", "-std=c99", "-O2")
     for words, code, said in (([], 2, "usage"), (["/nowhere/board0"], 3, "give another path")):
         done = subprocess.run([program, *words], capture_output=True, text=True, check=False)
@@ -115,7 +115,7 @@ def test_bad_use_of_the_program_is_one_sentence(build: Callable[..., Path]) -> N
         assert said in done.stderr
 
 
-def test_the_board_on_a_pty_passes_board_check(
+def test_board_on_a_pty_passes_board_check(
     start: Any, build: Callable[..., Path], tmp_path: Path, long_run: None, notes: dict[str, Any]
 ) -> None:
     start(build("board", "ports/host/main.c", "-std=c99", "-O2"), "board0", out="board.txt")
@@ -138,7 +138,7 @@ def qemu(start: Any, folder: Path, image: Path, need: Callable[[str], str]) -> s
     )
 
 
-def test_a_cortex_m3_in_qemu_passes_board_check(
+def test_cortex_m3_in_qemu_passes_board_check(
     start: Any,
     build: Callable[..., Path],
     need: Callable[[str], str],
@@ -157,7 +157,7 @@ def test_a_cortex_m3_in_qemu_passes_board_check(
 
 
 @pytest.mark.parametrize("rate_hz", [25, 100])
-def test_forces_from_a_cortex_m3_in_qemu_are_the_simulators(
+def test_forces_from_cortex_m3_in_qemu_match_the_simulator(
     rate_hz: int,
     start: Any,
     build: Callable[..., Path],
@@ -228,7 +228,7 @@ def test_forces_from_a_cortex_m3_in_qemu_are_the_simulators(
     }
 
 
-def test_an_atmega328p_in_simavr_passes_board_check(
+def test_atmega328p_in_simavr_passes_board_check(
     start: Any,
     build: Callable[..., Path],
     need: Callable[[str], str],

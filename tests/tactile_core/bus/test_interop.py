@@ -53,7 +53,7 @@ def plain(message: Any) -> Any:
     return message
 
 
-def test_the_mcap_library_reads_and_decodes_every_message(path: Path, messages: Any) -> None:
+def test_mcap_library_reads_and_decodes_every_message(path: Path, messages: Any) -> None:
     with path.open("rb") as file:
         factories = [mcap_ros2.decoder.DecoderFactory()]
         reader = make_reader(file, validate_crcs=True, decoder_factories=factories)
@@ -77,7 +77,7 @@ def test_the_mcap_library_reads_and_decodes_every_message(path: Path, messages: 
         assert rows[0][2] == plain(sent)
 
 
-def test_the_summary_agrees_with_the_data(path: Path, messages: Any) -> None:
+def test_summary_matches_the_data(path: Path, messages: Any) -> None:
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
         assert summary is not None
@@ -97,7 +97,7 @@ def test_the_summary_agrees_with_the_data(path: Path, messages: Any) -> None:
     assert kinds[-1] == "Footer"
 
 
-def test_rosbags_reads_it_as_a_ros2_bag(path: Path, messages: Any) -> None:
+def test_rosbags_reads_log_as_a_ros2_bag(path: Path, messages: Any) -> None:
     """Like `ros2 bag reindex`: a metadata.yaml beside the file, with definitions from it."""
     rows = "".join(
         f"""

@@ -290,9 +290,7 @@ def test_plain_tcp_requires_the_secret(join: Any, plain: Any) -> None:
     assert call(join(listen=(), connect=(endpoint,)), "arm/arm/srv/limits") == {}
 
 
-def test_at_a_unix_socket_a_stranger_without_the_secret_is_not_heard(
-    rig: Path, join: Any, plain: Any
-) -> None:
+def test_unix_socket_requires_the_secret(rig: Path, join: Any, plain: Any) -> None:
     """A stranger who reached the socket (by its group, or a folder opened by mistake)."""
     arm = join(role="arm", connect=())
     endpoint = f"unixsock-stream/{rig / 'bus' / 'arm.sock'}"

@@ -88,7 +88,7 @@ def test_info_in_json_is_complete(tactile: Any, path: Path) -> None:
     assert found["metadata"]["board:b0"]["hash"] == "abcd"
 
 
-def test_a_cut_log_is_recovered_to_a_new_file(tactile: Any, path: Path) -> None:
+def test_truncated_log_is_recovered_to_a_new_file(tactile: Any, path: Path) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: len(data) * 2 // 3])
     assert "not closed" in tactile("info", path).stdout
