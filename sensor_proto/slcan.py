@@ -134,7 +134,7 @@ class SlcanDecoder:
         self._counts: Counter[str] = Counter()
         self._last_end = b""
         self._ends_crlf = False
-        self._errors_told = 0
+        self._reported_errors = 0
         self.answers: deque[bytes] = deque(maxlen=MAX_ANSWERS)
         """Answers to commands, without their CR; a refusal is a single BEL."""
 
@@ -146,7 +146,7 @@ class SlcanDecoder:
     def reset(self) -> None:
         """Forget an unfinished line and all answers; the counters continue."""
         self._buffer.clear()
-        self._last_end, self._ends_crlf, self._errors_told = b"", False, 0
+        self._last_end, self._ends_crlf, self._reported_errors = b"", False, 0
         self.answers.clear()
 
     def feed(self, data: bytes) -> list[CanFrame]:
@@ -207,9 +207,9 @@ class SlcanDecoder:
             return []
         frames = [can_transfers.state_frame(state)]
         errors = flags & ERROR_FLAGS
-        if errors and errors != self._errors_told:
+        if errors and errors != self._reported_errors:
             frames.append(_errors_of_flags(errors))
-        self._errors_told = errors
+        self._reported_errors = errors
         return frames
 
 

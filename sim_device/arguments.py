@@ -20,7 +20,7 @@ from tactile_core.cli import (
     seconds,
     whole,
 )
-from tactile_core.daemon import Ending
+from tactile_core.daemon import Shutdown
 
 DIALECTS = (
     "lawicel",
@@ -103,8 +103,8 @@ The whole skin: skinoff@4s+2s, newskin@6s (another skin is on from then), gain=1
 chips), leap=2000@4s+2s (µT of a field that leaps: a magnet near)."""
 
 
-def make_parser(ending: Ending | None = None) -> argparse.ArgumentParser:
-    """Parser of the command line; ``ending``: whether the process is told to end."""
+def make_parser(shutdown: Shutdown | None = None) -> argparse.ArgumentParser:
+    """Parser of the command line; ``shutdown``: whether the process is told to end."""
     parser = Parser(
         "simdevice",
         description="Simulated taxel boards on pseudo-terminals and CAN buses, on their own or on "
@@ -113,7 +113,7 @@ def make_parser(ending: Ending | None = None) -> argparse.ArgumentParser:
     )
     parser.show_version()
     add_commands(parser, COMMANDS)
-    parser.set_defaults(ending=ending)
+    parser.set_defaults(shutdown=shutdown)
     return parser
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from sim_device.arguments import make_parser
 from tactile_core.cli import DONE, REFUSED, USAGE, CommandError, seeds_of, working
-from tactile_core.daemon import Ending, run
+from tactile_core.daemon import Shutdown, run
 
 if TYPE_CHECKING:
     from sim_device.arm.cupboard_plan import CupboardRequest
@@ -235,9 +235,9 @@ def _serve(planned: Sequence[Planned], arguments: argparse.Namespace) -> int:
     from sim_device.runner import Runner
     from sim_device.status import StatusLine
 
-    ending: Ending = arguments.ending or Ending()
+    shutdown: Shutdown = arguments.shutdown or Shutdown()
     # Set before the first port opens: a signal after that must still remove the links.
-    ending.orderly = True
+    shutdown.orderly = True
     runner = Runner([plan.server for plan in planned])
     status = StatusLine(planned)
     try:
@@ -247,7 +247,7 @@ def _serve(planned: Sequence[Planned], arguments: argparse.Namespace) -> int:
         gc.collect()
         gc.freeze()  # boards live as long as the process: the collector need not scan them
         with status:
-            runner.run(ending.told.is_set, arguments.duration, status.show_at)
+            runner.run(shutdown.requested.is_set, arguments.duration, status.show_at)
     finally:
         runner.close()
     status.sum_up()

@@ -19,7 +19,7 @@ from tactile_core.cli import (
     positive,
     set_up_logging,
 )
-from tactile_core.daemon import Ending, leave, run, serve
+from tactile_core.daemon import Shutdown, leave, run, serve
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
-def serve_parser(ending: Ending) -> argparse.ArgumentParser:
+def serve_parser(shutdown: Shutdown) -> argparse.ArgumentParser:
     """Parser of ``armd``."""
     parser = Parser(
         prog="armd",
@@ -58,11 +58,11 @@ def serve_parser(ending: Ending) -> argparse.ArgumentParser:
         "--arm", default="arm", metavar="NAME", help="its name on the bus (default arm)"
     )
     add_bus(parser, "arm")
-    parser.set_defaults(func=partial(_serve, ending))
+    parser.set_defaults(func=partial(_serve, shutdown))
     return parser
 
 
-def teach_parser(_: Ending) -> argparse.ArgumentParser:
+def teach_parser(_: Shutdown) -> argparse.ArgumentParser:
     """Parser of ``armd teach``."""
     parser = Parser(
         prog="armd teach",
@@ -115,7 +115,7 @@ def _teach(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _serve(ending: Ending, options: argparse.Namespace) -> int:
+def _serve(shutdown: Shutdown, options: argparse.Namespace) -> int:
     from rich.console import Console
 
     from armd.config import load_config, plane_of
@@ -144,10 +144,10 @@ def _serve(ending: Ending, options: argparse.Namespace) -> int:
 
     def work() -> int:
         print(f"arm {options.arm}: {options.driver}, ready for reachd", flush=True)
-        daemon.watch(ending.told.is_set)
+        daemon.watch(shutdown.requested.is_set)
         return DONE
 
-    return serve(daemon, ending, f"{options.driver} as arm {options.arm}", work)
+    return serve(daemon, shutdown, f"{options.driver} as arm {options.arm}", work)
 
 
 if __name__ == "__main__":

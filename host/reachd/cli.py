@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from reachd.arguments import make_parser
 from tactile_core.cli import DONE, FAILED, USAGE, CommandError, set_up_logging
-from tactile_core.daemon import Ending, run, serve
+from tactile_core.daemon import Shutdown, run, serve
 
 if TYPE_CHECKING:
     from reachd.daemon import Daemon
@@ -36,15 +36,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     Without ``argv`` this is the whole process, which then ends here.
     """
 
-    def parser(ending: Ending) -> argparse.ArgumentParser:
+    def parser(shutdown: Shutdown) -> argparse.ArgumentParser:
         parser = make_parser()
-        parser.set_defaults(func=partial(_run, ending))
+        parser.set_defaults(func=partial(_run, shutdown))
         return parser
 
     return run(parser, argv)
 
 
-def _run(ending: Ending, options: argparse.Namespace) -> int:
+def _run(shutdown: Shutdown, options: argparse.Namespace) -> int:
     from rich.console import Console
 
     console = Console(stderr=True)
@@ -64,14 +64,14 @@ def _run(ending: Ending, options: argparse.Namespace) -> int:
     cautions = settings.parameters.safety.cautions
 
     def work() -> int:
-        session = _Session(daemon, ending)
+        session = _Session(daemon, shutdown)
         with StatusLine(console, daemon.loop, daemon.recorder, cautions) as line:
             code = session.run(line)
         if code == FAILED:
             session.say_why()
         return code
 
-    return serve(daemon, ending, "disarmed", work)
+    return serve(daemon, shutdown, "disarmed", work)
 
 
 def _load(settings: Settings) -> Strategy:
@@ -89,9 +89,9 @@ def _load(settings: Settings) -> Strategy:
 class _Session:
     """What the main thread does while the daemon runs."""
 
-    def __init__(self, daemon: Daemon, ending: Ending) -> None:
+    def __init__(self, daemon: Daemon, shutdown: Shutdown) -> None:
         self._daemon = daemon
-        self._told = ending.told
+        self._shutdown_requested = shutdown.requested
         self._outcome: Outcome | None = None
         self._beat = 0
         self._looks = 0
@@ -100,11 +100,11 @@ class _Session:
         """Reach once, or serve until told to stop; the exit status."""
         daemon, settings = self._daemon, self._daemon.settings
         if settings.goal is not None:
-            daemon.wait_ready(self._told)
+            daemon.wait_ready(self._shutdown_requested)
             if not self._ended():
                 daemon.reach(settings.goal)
         while not self._ended():
-            self._told.wait(REFRESH_S)
+            self._shutdown_requested.wait(REFRESH_S)
             self._look(line)
             if not settings.serve and not daemon.moving:
                 break
@@ -122,7 +122,7 @@ class _Session:
             print(f"reachd: no reach: {why or 'told to stop before it began'}", file=sys.stderr)
 
     def _ended(self) -> bool:
-        return self._told.is_set() or self._daemon.done.is_set()
+        return self._shutdown_requested.is_set() or self._daemon.done.is_set()
 
     def _look(self, line: StatusLine) -> None:
         self._note_outcome()

@@ -630,23 +630,23 @@ def _sections(info: Any, path: str, header: str) -> Iterator[Section]:
 
 def _key(each: types.Field, owner: Any) -> Key:
     kind, extent = _in_words(each.type)
-    said = _said(each.type)
-    unit, meaning = str(said.get("unit", "")), str(said.get("description", ""))
+    meta = _meta_of(each.type)
+    unit, meaning = str(meta.get("unit", "")), str(meta.get("description", ""))
     return Key(each.encode_name, kind, unit, extent, _default(each, owner), meaning)
 
 
-def _said(info: Any) -> dict[str, Any]:
+def _meta_of(info: Any) -> dict[str, Any]:
     """Unit and description from the `Meta` of a type or of its elements."""
     match info:
         case types.Metadata():
             own = {**(info.extra_json_schema or {}), **(info.extra or {})}
-            return {**_said(info.type), **own}
+            return {**_meta_of(info.type), **own}
         case types.UnionType():
-            return {k: v for t in info.types for k, v in _said(t).items()}
+            return {k: v for t in info.types for k, v in _meta_of(t).items()}
         case types.TupleType():
-            return _said(info.item_types[0])
+            return _meta_of(info.item_types[0])
         case types.CollectionType():
-            return _said(info.item_type)
+            return _meta_of(info.item_type)
     return {}
 
 

@@ -47,30 +47,30 @@ class StartError(CommandError):
         super().__init__(text, REFUSED)
 
 
-class Ending:
-    """Tracks whether a signal asked the process to end; the first one sets ``told``.
+class Shutdown:
+    """Tracks whether a signal asked the process to end; the first one sets ``requested``.
 
     Until ``orderly`` is set there is nothing to stop in order, and a signal ends the process at
     once.
     """
 
     def __init__(self) -> None:
-        self.told = threading.Event()
+        self.requested = threading.Event()
         self.orderly = False
 
-    def _hear(self, number: int, _: FrameType | None) -> None:
-        self.told.set()
+    def _on_signal(self, number: int, _: FrameType | None) -> None:
+        self.requested.set()
         signal.signal(number, signal.SIG_DFL)
         if not self.orderly:
             os.kill(os.getpid(), number)
 
     @contextlib.contextmanager
-    def listening(self) -> Iterator[Ending]:
+    def listening(self) -> Iterator[Shutdown]:
         """Handle the signals. A hang-up that the parent ignores (nohup) stays ignored."""
         former = {}
         for number in SIGNALS:
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
-                former[number] = signal.signal(number, self._hear)
+                former[number] = signal.signal(number, self._on_signal)
         try:
             yield self
         finally:
@@ -79,11 +79,11 @@ class Ending:
 
 
 def run(
-    make_parser: Callable[[Ending], argparse.ArgumentParser], argv: Sequence[str] | None
+    make_parser: Callable[[Shutdown], argparse.ArgumentParser], argv: Sequence[str] | None
 ) -> int:
     """Run a daemon's command and return the exit status. Without ``argv`` the process ends here."""
-    with Ending().listening() as ending:
-        code = run_command(make_parser(ending), argv)
+    with Shutdown().listening() as shutdown:
+        code = run_command(make_parser(shutdown), argv)
     if argv is None:
         leave(code)
     return code
@@ -159,12 +159,12 @@ class Service(ABC):
         return code
 
 
-def serve(service: Service, ending: Ending, status: str, work: Callable[[], int]) -> int:
+def serve(service: Service, shutdown: Shutdown, status: str, work: Callable[[], int]) -> int:
     """Start ``service``, run ``work``, stop it in order; returns the exit status.
 
     ``status``: text for the service manager once ready. A `CommandError` from ``work`` is reported.
     """
-    ending.orderly = True
+    shutdown.orderly = True
     service.start()
     service.watchdog.ready(status)
     try:

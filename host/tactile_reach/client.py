@@ -105,7 +105,7 @@ class Stream(Generic[T]):
         self._last: T | None = None
         self._queue: deque[zenoh.Sample] = deque(maxlen=queue)
         self._arrived = threading.Condition()
-        self._subscriber = session.declare_subscriber(key, self._hear)
+        self._subscriber = session.declare_subscriber(key, self._on_sample)
 
     def __enter__(self) -> Stream[T]:
         return self
@@ -168,7 +168,7 @@ class Stream(Generic[T]):
         with contextlib.suppress(zenoh.ZError):  # the session is already closed
             self._subscriber.undeclare()
 
-    def _hear(self, sample: zenoh.Sample) -> None:
+    def _on_sample(self, sample: zenoh.Sample) -> None:
         if len(sample.payload) > MAX_PAYLOAD:
             self.refused += 1
             return
@@ -338,7 +338,7 @@ class Bus:
         there = self.boards()
         if not there:
             raise NotThereError(
-                f"no tactiled answers{self._config.meets()}: start it, or name its endpoint with "
+                f"no tactiled answers{self._config.where()}: start it, or name its endpoint with "
                 "connect(to=...)"
             )
         if name is None and len(there) == 1:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tactile_core.cli import DONE, REFUSED, USAGE, CommandError, set_up_logging
-from tactile_core.daemon import Ending, run, serve
+from tactile_core.daemon import Shutdown, run, serve
 from tactiled.arguments import make_parser
 
 if TYPE_CHECKING:
@@ -27,15 +27,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     Without ``argv`` this is the whole process, which then ends here.
     """
 
-    def parser(ending: Ending) -> argparse.ArgumentParser:
+    def parser(shutdown: Shutdown) -> argparse.ArgumentParser:
         parser = make_parser()
-        parser.set_defaults(func=partial(_run, ending))
+        parser.set_defaults(func=partial(_run, shutdown))
         return parser
 
     return run(parser, argv)
 
 
-def _run(ending: Ending, options: argparse.Namespace) -> int:
+def _run(shutdown: Shutdown, options: argparse.Namespace) -> int:
     from rich.console import Console
 
     console = Console(stderr=True)
@@ -54,7 +54,7 @@ def _run(ending: Ending, options: argparse.Namespace) -> int:
 
     def work() -> int:
         with StatusLines(console, daemon.ports, daemon.recorder) as status:
-            trouble = _watch(daemon, status, ending)
+            trouble = _watch(daemon, status, shutdown)
         if trouble is not None and daemon.failure is None:
             raise CommandError(trouble, REFUSED)
         return DONE
@@ -73,18 +73,18 @@ def _run(ending: Ending, options: argparse.Namespace) -> int:
         finally:
             page.close()
 
-    return serve(daemon, ending, "running", work_with_page)
+    return serve(daemon, shutdown, "running", work_with_page)
 
 
-def _watch(daemon: Daemon, status: StatusLines, ending: Ending) -> str | None:
+def _watch(daemon: Daemon, status: StatusLines, shutdown: Shutdown) -> str | None:
     """Wait for the end; what kept the job from being done, None when it was."""
     from tactile_core.types import monotonic_now, seconds_between
     from tactiled.status import REFRESH
 
     settings = daemon.settings
     start = monotonic_now()
-    while not ending.told.is_set() and not daemon.done.is_set():
-        ending.told.wait(REFRESH)
+    while not shutdown.requested.is_set() and not daemon.done.is_set():
+        shutdown.requested.wait(REFRESH)
         status.show()
         trouble = None if settings.wait else daemon.trouble()
         if trouble is not None:

@@ -481,16 +481,16 @@ static inline void board_receive_(struct board *b) {
   uint8_t i;
   for (i = 0; i < 16 && b->port->receive(b->port->self, &frame); i++) {
     uint8_t node = (uint8_t)(frame.identifier & 0x7FUL);
-    enum tp_event said;
+    enum tp_event event;
     if (!tp_can_is_ours(frame.identifier) || (node != b->config->node && node != TP_BROADCAST)) {
       continue; /* for another node or protocol */
     }
-    said = tp_can_push(&b->rx_, &frame);
-    if (said == TP_PACKET) {
+    event = tp_can_push(&b->rx_, &frame);
+    if (event == TP_PACKET) {
       board_handle_(b, &b->rx_.packet);
-    } else if (said != TP_NOTHING) {
+    } else if (event != TP_NOTHING) {
       b->rx_errors++;
-      if (said == TP_UNKNOWN_TYPE && (b->rx_.unknown_type & 0x80) && b->acks_ < BOARD_REPLIES) {
+      if (event == TP_UNKNOWN_TYPE && (b->rx_.unknown_type & 0x80) && b->acks_ < BOARD_REPLIES) {
         board_answer_(b, b->rx_.unknown_type, b->rx_.unknown_request, TP_UNKNOWN_COMMAND);
       }
     }
@@ -506,10 +506,10 @@ static inline void board_receive_(struct board *b) {
     size_t n = b->port->read(b->port->self, bytes, sizeof bytes);
     size_t i;
     for (i = 0; i < n; i++) {
-      enum tp_event said = tp_serial_push(&b->rx_, bytes[i]);
-      if (said == TP_PACKET) {
+      enum tp_event event = tp_serial_push(&b->rx_, bytes[i]);
+      if (event == TP_PACKET) {
         board_handle_(b, &b->rx_.packet);
-      } else if (said != TP_NOTHING && said != TP_EMPTY) {
+      } else if (event != TP_NOTHING && event != TP_EMPTY) {
         b->rx_errors++;
       }
     }

@@ -539,8 +539,8 @@ static inline enum tp_event tp_get_descriptor(const uint8_t *p, uint16_t n,
   if (n < (uint16_t)(52U + (uint16_t)m->count * m->stride_bytes)) return TP_SHORT_PAYLOAD;
   for (i = 0; i < m->count; i++) {
     struct tp_array array;
-    enum tp_event said = tp_get_array(p, n, i, &array);
-    if (said != TP_PACKET) return said;
+    enum tp_event event = tp_get_array(p, n, i, &array);
+    if (event != TP_PACKET) return event;
     for (k = 0; k < i; k++) {
       if (p[52U + (uint16_t)k * m->stride_bytes] == array.array) return TP_BAD_VALUE;
     }
@@ -718,34 +718,34 @@ static inline void tp_serial_take_(struct tp_serial_rx *rx, uint8_t byte) {
  * push. TP_COBS and later: something was rejected; the next frame is decoded again.
  */
 static inline enum tp_event tp_serial_push(struct tp_serial_rx *rx, uint8_t byte) {
-  enum tp_event said;
+  enum tp_event event;
   if (rx->raw == 0 && rx->code == 0 && !rx->discarding) {
     tp_serial_clear_(rx); /* discard the packet returned before */
   }
   if (byte == 0) {
     if (rx->discarding) {
-      said = TP_NOTHING;
+      event = TP_NOTHING;
     } else if (rx->raw == 0) {
-      said = TP_EMPTY;
+      event = TP_EMPTY;
     } else if (rx->left != 0) {
-      said = TP_COBS;
+      event = TP_COBS;
     } else if (rx->packet.size < TP_OVERHEAD) {
-      said = TP_RUNT;
+      event = TP_RUNT;
     } else if (tp_get_u16(rx->packet.bytes + 2) != rx->packet.size - TP_OVERHEAD) {
-      said = TP_LENGTH;
+      event = TP_LENGTH;
     } else if (rx->packet.size > TP_MAX_PACKET) {
-      said = TP_OVERSIZED;
+      event = TP_OVERSIZED;
     } else if (rx->crc != TP_CRC_GOOD) {
-      said = TP_CRC;
+      event = TP_CRC;
     } else if (rx->packet.bytes[1] != 0) {
-      said = TP_BOARD;
+      event = TP_BOARD;
     } else {
-      said = TP_PACKET;
+      event = TP_PACKET;
     }
     rx->raw = 0; /* the packet stays readable until the next byte */
     rx->code = 0;
     rx->discarding = false;
-    return said;
+    return event;
   }
   if (rx->discarding) return TP_NOTHING;
   if (++rx->raw > TP_MAX_FRAME) {

@@ -30,13 +30,13 @@ def test_frozen_arm_state_latches_the_gate(lab: Any) -> None:
     """Stamps and sequence go on, values do not: the arm moves, and nobody could see it."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--no-log")
-    lab.reaching(program)
+    lab.wait_until_moving(program)
     wait_until(lambda: arm.travelled > 0.01)
     arm.freeze()
     assert program.wait() == 1, program.said
     assert "does not change although the arm is told to move" in program.said
     assert "arm_frozen" in lab.codes("intervention")
-    lab.told_to_stand()
+    lab.wait_until_told_to_stop()
     # Told to move on for 0.3 s and what a busy machine adds, at 4 cm/s: not far.
     assert arm.travelled < 0.2
 
@@ -82,7 +82,7 @@ def test_silent_network_stops_the_arm(side: str, lab: Any) -> None:
     wire = lab.wire(lab.reachd_at if side == "board" else lab.arm_at)
     lab.board(via=wire.endpoint if side == "board" else None)
     program = lab.reachd(*FAR, "--no-log", via=wire.endpoint if side == "arm" else None)
-    lab.reaching(program)
+    lab.wait_until_moving(program)
     wire.cut()
     if side == "board":
         wait_until(lambda: stopped(lab))
@@ -104,7 +104,7 @@ def test_short_network_silence_is_survived(lab: Any) -> None:
     config = lab.folder / "reach.toml"
     config.write_text("[parameters.safety]\nfeatures_latch = 30.0\n")
     program = lab.reachd(*FAR, "--no-log", "--config", str(config))
-    lab.reaching(program)
+    lab.wait_until_moving(program)
     wire.cut()
     wait_until(lambda: stopped(lab))
     wire.mend()
@@ -117,7 +117,7 @@ def test_load_at_the_limit_stops_motion_against_it(lab: Any) -> None:
     """Row 25, judged on the arm's own state: the features see nothing."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--no-log")
-    lab.reaching(program)
+    lab.wait_until_moving(program)
     wait_until(lambda: arm.travelled > 0.01)
     fast = max(h.vx for h in arm.heard)
     assert fast > 0.03
@@ -139,7 +139,7 @@ def test_timed_out_target_ends_in_zero(lab: Any) -> None:
     assert program.wait() == 1, program.said
     assert "NOT REACHED (timeout)" in program.said
     assert "not reached within 1.5 s" in program.said
-    lab.told_to_stand()
+    lab.wait_until_told_to_stop()
     assert arm.travelled > 0.01
 
 
@@ -205,7 +205,7 @@ def test_commands_delayed_in_transit_latch(delay: float, lab: Any) -> None:
     arm, _ = lab.arm, lab.board()
     wire = lab.wire(lab.arm_at)
     program = lab.reachd(*FAR, "--no-log", via=wire.endpoint)
-    lab.reaching(program)
+    lab.wait_until_moving(program)
     wait_until(lambda: arm.travelled > 0.005)
     wire.delay = delay
     assert program.wait() == 1, program.said

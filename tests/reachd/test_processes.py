@@ -54,7 +54,7 @@ def test_complete_reach_is_held_in_one_log_file(lab: Any, hardware_limits: ArmLi
     assert arm.limits.f_max == hardware_limits.f_max
     assert all(abs(h.omega) <= 0.1 + 1e-9 for h in arm.heard)
     assert all((h.vx**2 + h.vy**2) ** 0.5 <= arm.limits.v_max + 1e-9 for h in arm.heard)
-    lab.told_to_stand()
+    lab.wait_until_told_to_stop()
     assert lab.codes("outcome") == ["reached"]
     assert {"limits", "arm", "goal"} <= set(lab.codes("operator"))
     log = info(lab.folder / "trial.mcap")
@@ -76,7 +76,7 @@ def test_silent_features_stop_the_arm_and_lost_features_end_the_reach(lab: Any) 
     """Rows 4, 13, 14 and 19: a stopped, then a killed, tactiled."""
     _, board = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--no-log")
-    lab.reaching(program)
+    lab.wait_until_moving(program)
     board.signal(signal.SIGSTOP)
     wait_until(lambda: stopped(lab))
     assert "features_stale" in lab.codes("intervention")
@@ -84,7 +84,7 @@ def test_silent_features_stop_the_arm_and_lost_features_end_the_reach(lab: Any) 
     assert program.wait() == 1, program.said
     assert "NOT REACHED (held)" in program.said
     assert "features_lost" in lab.codes("intervention")
-    lab.told_to_stand()
+    lab.wait_until_told_to_stop()
 
 
 def test_short_silence_only_pauses_the_reach(lab: Any) -> None:
@@ -92,7 +92,7 @@ def test_short_silence_only_pauses_the_reach(lab: Any) -> None:
     config = lab.folder / "reach.toml"
     config.write_text("[parameters.safety]\nfeatures_latch = 30.0\n")
     program = lab.reachd(*FAR, "--no-log", "--config", str(config))
-    lab.reaching(program)
+    lab.wait_until_moving(program)
     board.signal(signal.SIGSTOP)
     wait_until(lambda: stopped(lab))
     board.signal(signal.SIGCONT)
@@ -105,7 +105,7 @@ def test_lost_arm_state_stops_motion_and_ends_the_reach(lab: Any) -> None:
     """Row 24, and the latch after a second."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--no-log")
-    lab.reaching(program)
+    lab.wait_until_moving(program)
     arm.paused = True
     wait_until(lambda: stopped(lab))
     assert program.wait() == 1, program.said
@@ -117,11 +117,11 @@ def test_sigterm_stops_arm_before_closing_log(lab: Any, number: signal.Signals) 
     """Row 34."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--log", "trial.mcap")
-    lab.reaching(program)
+    lab.wait_until_moving(program)
     program.signal(number)
     assert program.wait() == 1, program.said
     assert "NOT REACHED (stopped)" in program.said
-    lab.told_to_stand()
+    lab.wait_until_told_to_stop()
     assert info(lab.folder / "trial.mcap").closed
     wait_until(lambda: not arm.moving)
 
@@ -130,7 +130,7 @@ def test_kill_9_stops_the_arm_and_a_new_reachd_starts(lab: Any) -> None:
     """Rows 15 and 29: nothing of it stays in the way."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--log", "trial.mcap")
-    lab.reaching(program)
+    lab.wait_until_moving(program)
     wait_until(lambda: (lab.folder / "trial.mcap").stat().st_size > 20_000)
     program.signal(signal.SIGKILL)
     program.wait()
@@ -145,7 +145,7 @@ def test_sigstop_and_sigcont_do_not_resume_motion(lab: Any) -> None:
     """Row 14 for reachd itself: the arm stops without it, and waits for an operator."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--no-log")
-    lab.reaching(program)
+    lab.wait_until_moving(program)
     program.signal(signal.SIGSTOP)
     time.sleep(1.5)
     assert not arm.moving
@@ -212,7 +212,7 @@ def test_goals_are_served_over_the_bus(lab: Any) -> None:
 
     program.signal(signal.SIGTERM)
     assert program.wait() == 0, program.said
-    lab.told_to_stand()
+    lab.wait_until_told_to_stop()
 
 
 def test_without_features_or_arm_no_reach_starts(lab: Any) -> None:

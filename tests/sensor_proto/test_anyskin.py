@@ -357,7 +357,7 @@ def test_samples_that_fit_no_board_are_refused_locally(
 
 
 @pytest.fixture
-def spoil() -> Callable[[list[bytes], str, np.random.Generator], bytes]:
+def corrupt() -> Callable[[list[bytes], str, np.random.Generator], bytes]:
     def make(frames: list[bytes], kind: str, rng: np.random.Generator) -> bytes:
         wire = list(frames)
         for i in range(12, 60, 6):
@@ -388,10 +388,10 @@ def spoil() -> Callable[[list[bytes], str, np.random.Generator], bytes]:
     ],
 )
 def test_corrupted_streams_never_yield_wrong_frames(
-    kind: str, damaged: int, spoil: Callable[[list[bytes], str, np.random.Generator], bytes]
+    kind: str, damaged: int, corrupt: Callable[[list[bytes], str, np.random.Generator], bytes]
 ) -> None:
     rng = np.random.default_rng(2)
-    wire = spoil(stream(80, 5), kind, rng)
+    wire = corrupt(stream(80, 5), kind, rng)
     for sizes in ([1], [500], rng.integers(1, 200, 9).tolist()):
         got = indices(feed_in(AnySkinDecoder(), wire, sizes))
         assert set(got) <= set(range(80))

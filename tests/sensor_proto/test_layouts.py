@@ -83,7 +83,7 @@ def raw_temperatures(r: Rows, number: int) -> bytes:
     return b"\xaa\x55" + struct.pack(f"<{len(values)}h", *values)
 
 
-def glued(r: Rows, number: int) -> bytes:
+def without_separators(r: Rows, number: int) -> bytes:
     """AnySkin text sketch: no separator between the numbers of one chip and the next."""
     return b"".join(b"%.2f\t%.2f\t%.2f\t%.2f" % chip for chip in r) + b"\r\n"
 
@@ -373,7 +373,7 @@ def test_noise_never_raises_and_memory_is_bounded(chunks: list[bytes], layout: s
             "floats:5txyz,start=aa55,end=crlf",
         ),
         (lambda r, n: struct.pack("<20d", *txyz(r)) + b"\r\n", "doubles:5txyz,end=crlf"),
-        (glued, "text:5txyz"),
+        (without_separators, "text:5txyz"),
         (reskin, "text:5xyzt"),
         (numbered, "text:5_xyzt"),
         (bracketed, "text:5xyz"),

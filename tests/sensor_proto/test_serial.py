@@ -182,7 +182,7 @@ def test_unknown_commands_can_be_answered_by_number(reference: SimpleNamespace) 
 EVIL = ["whole", "bytewise", "lost", "flipped", "duplicated", "reordered", "spliced", "noisy"]
 
 
-def spoil(kind: str, frames: list[bytes], rng: np.random.Generator) -> tuple[bytes, int]:
+def corrupt(kind: str, frames: list[bytes], rng: np.random.Generator) -> tuple[bytes, int]:
     """Corrupt ``frames``; returns the bytes and the number of damaged frames."""
     wire, damaged = [], 0
     skip = False
@@ -221,7 +221,7 @@ def test_corrupted_streams_never_yield_wrong_frames(
     kind: str, seed: int, line: list[bytes]
 ) -> None:
     rng = np.random.default_rng(seed)
-    wire, damaged = spoil(kind, line, rng)
+    wire, damaged = corrupt(kind, line, rng)
     decoder = SerialDecoder()
     sizes = [1] if kind == "bytewise" else rng.integers(1, 800, 20).tolist()
     got = sequences(feed_in(decoder, wire, sizes))

@@ -135,7 +135,7 @@ class Cupboard:
             )
         )
 
-    def settled(self) -> None:
+    def reset(self) -> None:
         """Bring the arm to rest, make it free for another commander, and put everything back in
         place."""
         self.rest()

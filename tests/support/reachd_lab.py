@@ -77,12 +77,12 @@ class ReachdLab:
     def codes(self, kind: str) -> list[str]:
         return [event.code for event in list(self.events) if event.kind == kind]
 
-    def reaching(self, program: Program) -> None:
+    def wait_until_moving(self, program: Program) -> None:
         """Wait until the arm moves."""
         wait_until(lambda: self.arm.moving or program.process.poll() is not None)
         assert program.process.poll() is None, program.said
 
-    def told_to_stand(self) -> None:
+    def wait_until_told_to_stop(self) -> None:
         """Wait until the last commands to the arm are zero; they may still be under way when reachd
         ends.
 

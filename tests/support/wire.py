@@ -54,7 +54,7 @@ class Wire:
                 waiting: queue.SimpleQueue[tuple[float, bytes]] = queue.SimpleQueue()
                 for work, args in (
                     (self._hold, (near, waiting)),
-                    (self._let_go, (waiting, far)),
+                    (self._send, (waiting, far)),
                     (self._pump, (far, near)),
                 ):
                     threading.Thread(target=work, args=args, daemon=True).start()
@@ -71,7 +71,7 @@ class Wire:
                 waiting.put((time.monotonic() + self.delay, data))
         waiting.put((0.0, b""))
 
-    def _let_go(self, waiting: queue.SimpleQueue[tuple[float, bytes]], sink: socket.socket) -> None:
+    def _send(self, waiting: queue.SimpleQueue[tuple[float, bytes]], sink: socket.socket) -> None:
         with contextlib.suppress(OSError):
             while (item := waiting.get())[1]:
                 time.sleep(max(0.0, item[0] - time.monotonic()))

@@ -13,11 +13,11 @@ def parsers() -> list[argparse.ArgumentParser]:
     from armd.cli import serve_parser as armd
     from reachd.arguments import make_parser as reachd
     from sim_device.arguments import make_parser as simdevice
-    from tactile_core.daemon import Ending
+    from tactile_core.daemon import Shutdown
     from tactile_tools.cli import make_parser as tactile
     from tactiled.arguments import make_parser as tactiled
 
-    roots = [tactile(), tactiled(), reachd(), armd(Ending()), simdevice()]
+    roots = [tactile(), tactiled(), reachd(), armd(Shutdown()), simdevice()]
     for root in roots:
         load_all(root)
     return roots

@@ -101,7 +101,7 @@ def run(options: argparse.Namespace) -> int:
                 quiet_until = 0.0
                 if not live.counts["shown"]:
                     print(
-                        f"nothing on the bus yet{config.meets()}: is tactiled running, with the "
+                        f"nothing on the bus yet{config.where()}: is tactiled running, with the "
                         "same keys and TACTILE_RUNTIME_DIR?",
                         file=sys.stderr,
                         flush=True,

@@ -57,9 +57,9 @@ def list_bus(options: argparse.Namespace) -> None:
                 if reply.ok is not None:
                     names.add((kind, str(reply.ok.key_expr).split("/")[1]))
     if not names and not types:
-        meets = bus_config(options, BusTable(), "tool").meets()
+        where = bus_config(options, BusTable(), "tool").where()
         raise NotThereError(
-            f"nothing is on the bus{meets}: start a daemon, or name an endpoint with --connect"
+            f"nothing is on the bus{where}: start a daemon, or name an endpoint with --connect"
         )
     width = max((len(key) for key in types), default=0)
     for key in sorted(types):

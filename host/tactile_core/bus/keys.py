@@ -87,15 +87,15 @@ def load_keys(folder: Path | str) -> TlsConfig:
     if not (folder / PRIVATE_KEY).exists() and parties:
         raise KeysError(f"--keys {folder}: name the folder of one party in it ({parties})")
     try:
-        said = load_toml(folder / ROLES, RolesFile)
+        roles_file = load_toml(folder / ROLES, RolesFile)
     except ConfigError as error:
         raise KeysError(str(error)) from error
     return TlsConfig(
         root_ca=str(folder / CA),
         certificate=str(folder / CERTIFICATE),
         private_key=str(folder / PRIVATE_KEY),
-        roles=said.roles,
-        name=said.name,
+        roles=roles_file.roles,
+        name=roles_file.name,
     )
 
 

@@ -134,7 +134,7 @@ def call(session: zenoh.Session, key: str, payload: object = None, timeout: floa
                 raise NoAnswerError(f"no answer from {key} within {timeout:g} s")
         time.sleep(RETRY_PERIOD)
     config = config_of(session)
-    who = "" if config is None else config.meets()
+    who = "" if config is None else config.where()
     raise NoAnswerError(
         f"nobody serves {key}: is the daemon running, and this bus connected to it{who}?"
     )

@@ -117,7 +117,7 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         earlier = roles[: roles.index(self.role)] if self.role in PORTS else roles
         return tuple(self._endpoint(role) for role in earlier)
 
-    def meets(self) -> str:
+    def where(self) -> str:
         """Where peers are looked for, as words to append to a sentence."""
         places = [*self.connect_endpoints(), *self.listen_endpoints()]
         paths = [path for path in map(socket_path, places) if path is not None]

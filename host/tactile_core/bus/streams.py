@@ -148,13 +148,13 @@ class Tap:
         self.key = key
         self.refused = 0  # above MAX_PAYLOAD
         origin = zenoh.Locality.REMOTE if remote_only else zenoh.Locality.ANY
-        self._subscriber = session.declare_subscriber(key, self._hear, allowed_origin=origin)
+        self._subscriber = session.declare_subscriber(key, self._on_sample, allowed_origin=origin)
 
     def close(self) -> None:
         """Unsubscribe."""
         self._subscriber.undeclare()
 
-    def _hear(self, sample: zenoh.Sample) -> None:
+    def _on_sample(self, sample: zenoh.Sample) -> None:
         if len(sample.payload) > MAX_PAYLOAD:
             self.refused += 1
         else:

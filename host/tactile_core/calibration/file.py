@@ -484,8 +484,8 @@ def _net(document: Document, number: int, table: NetTable) -> NetModel:
                 raise document.wrong((*keys, k), f"{columns} numbers", f"{len(row)} numbers")
         return np.array(rows, np.float64).reshape(len(rows), columns)
 
-    for k, (target, said) in enumerate(zip(table.targets, table.units, strict=False)):
-        if TARGET_UNITS.get(target, said) != said:
+    for k, (target, given) in enumerate(zip(table.targets, table.units, strict=False)):
+        if TARGET_UNITS.get(target, given) != given:
             raise document.wrong((*at, "units", k), f"{TARGET_UNITS[target]} for {target}")
     rest = table.rest
     try:

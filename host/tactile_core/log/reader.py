@@ -506,8 +506,8 @@ class LogReader:
             summary = read_summary(self.read_at, after, footer, None)
             if summary is None:
                 raise BadRecordError("an end mark amid the data")
-            told = f"begins at byte {start}" if start else "is missing"
-            reason = f"the footer says that the summary {told}, but it begins at byte {after}"
+            stated = f"begins at byte {start}" if start else "is missing"
+            reason = f"the footer says that the summary {stated}, but it begins at byte {after}"
             self.note_damage(Damage(footer, FOOTER_SIZE, reason, 0))
             if self.summary is None and not crc:
                 self._take_summary(summary)
@@ -527,10 +527,10 @@ class LogReader:
         statistics = None if self.summary is None else self.summary.statistics
         if statistics is None or self.window is not None or self._read < self._blocks:
             return
-        told, found = statistics.message_count, self._messages + self.messages_lost
-        if told != found and not self.lost_unknown:
-            lost = max(told - found, 0)
-            reason = f"the summary counts {told} messages, but {found} are in the file"
+        stated, found = statistics.message_count, self._messages + self.messages_lost
+        if stated != found and not self.lost_unknown:
+            lost = max(stated - found, 0)
+            reason = f"the summary counts {stated} messages, but {found} are in the file"
             place = 0 if self.summary is None else self.summary.start
             self.note_damage(Damage(place, 0, reason, lost))
 

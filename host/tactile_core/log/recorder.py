@@ -75,14 +75,14 @@ class Repeats:
 
     def is_repeat(self, channel: Hashable, message: Message) -> bool:
         """Whether a message of a latched channel repeats an earlier one."""
-        told = message.sequence, message.publish_ns, zlib.crc32(message.data)
+        identity = message.sequence, message.publish_ns, zlib.crc32(message.data)
         if channel in self._begun:
-            self._last[channel] = told
+            self._last[channel] = identity
             return False
         self._begun.add(channel)
         before = self._last.get(channel)
-        self._last[channel] = told
-        return before == told
+        self._last[channel] = identity
+        return before == identity
 
 
 __all__ = ["Recorder", "RecorderError", "RecorderSettings", "RecorderStats"]

@@ -470,7 +470,7 @@ def unpack(read_at: ReadAt, packed: Packed) -> bytes:
     data: bytes | None = None
     if head.compression == "":
         data = raw
-    elif head.compression == "zstd" and _told_size(raw) == head.size > 0:
+    elif head.compression == "zstd" and _stated_size(raw) == head.size > 0:
         try:  # one frame that states its size, as from nearly every writer: decompress at once
             data = zstandard.ZstdDecompressor().decompress(raw, max_output_size=head.size)
         except (zstandard.ZstdError, MemoryError):
@@ -492,7 +492,7 @@ def unpack_what_can_be(read_at: ReadAt, packed: Packed) -> bytes:
     return bytes(data)
 
 
-def _told_size(raw: bytes) -> int:
+def _stated_size(raw: bytes) -> int:
     try:
         return zstandard.frame_content_size(raw)
     except zstandard.ZstdError:

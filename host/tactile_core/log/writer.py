@@ -319,7 +319,7 @@ class LogWriter:
                 self._write_waiting()
         except OSError as error:
             self._fail(error)
-        except Exception as error:  # noqa: BLE001 - whatever it is, the log goes on without this
+        except Exception as error:  # noqa: BLE001 - any error: the log continues without this
             self.give_up(error)
 
     def give_up(self, error: Exception) -> None:
@@ -345,7 +345,7 @@ class LogWriter:
             self._end_file()
         except OSError as error:
             self._fail(error)
-        except Exception as error:  # noqa: BLE001 - whatever it is, it must be told
+        except Exception as error:  # noqa: BLE001 - any error must be reported
             self.give_up(error)
         if not self.waiting and self.state == "recording":
             self.state = "closed"

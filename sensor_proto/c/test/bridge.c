@@ -147,13 +147,13 @@ int bridge_encode(int type, int board, const int64_t *v, const uint8_t *blob, in
 
 int bridge_decode(int type, const uint8_t *p, int size, int64_t *v, uint8_t *blob) {
   uint16_t n = (uint16_t)size;
-  enum tp_event said;
+  enum tp_event event;
   int i;
   switch (type) {
     case TP_DESCRIPTOR: {
       struct tp_descriptor m;
-      said = tp_get_descriptor(p, n, &m);
-      if (said != TP_PACKET) return (int)said;
+      event = tp_get_descriptor(p, n, &m);
+      if (event != TP_PACKET) return (int)event;
       v[0] = m.major;
       v[1] = m.minor;
       v[2] = m.tick_hz;
@@ -165,8 +165,8 @@ int bridge_decode(int type, const uint8_t *p, int size, int64_t *v, uint8_t *blo
       for (i = 0; i < m.count; i++) {
         struct tp_array a;
         int64_t *to = v + 5 + 7 * i;
-        said = tp_get_array(p, n, (uint8_t)i, &a);
-        if (said != TP_PACKET) return (int)said;
+        event = tp_get_array(p, n, (uint8_t)i, &a);
+        if (event != TP_PACKET) return (int)event;
         to[0] = a.array;
         to[1] = a.chip;
         to[2] = a.rows;
@@ -176,12 +176,12 @@ int bridge_decode(int type, const uint8_t *p, int size, int64_t *v, uint8_t *blo
         to[6] = a.lsb_z_nt;
         memcpy(blob + 40 + 16 * i, a.name, 16);
       }
-      return (int)said;
+      return (int)event;
     }
     case TP_SAMPLES: {
       struct tp_samples m;
-      said = tp_get_samples(p, n, &m);
-      if (said != TP_PACKET) return (int)said;
+      event = tp_get_samples(p, n, &m);
+      if (event != TP_PACKET) return (int)event;
       v[0] = m.array;
       v[1] = m.taxels;
       v[2] = m.temperature_cc;
@@ -194,12 +194,12 @@ int bridge_decode(int type, const uint8_t *p, int size, int64_t *v, uint8_t *blo
         v[7 + 3 * i] = t.z;
         v[5 + 3 * m.taxels + i] = t.status;
       }
-      return (int)said;
+      return (int)event;
     }
     case TP_STATUS: {
       struct tp_status m;
-      said = tp_get_status(p, n, &m);
-      if (said != TP_PACKET) return (int)said;
+      event = tp_get_status(p, n, &m);
+      if (event != TP_PACKET) return (int)event;
       v[0] = m.uptime_ms_low;
       v[1] = m.uptime_ms_high;
       v[2] = m.cycles;
@@ -208,78 +208,78 @@ int bridge_decode(int type, const uint8_t *p, int size, int64_t *v, uint8_t *blo
       v[5] = m.chip_errors;
       v[6] = m.rate_mhz;
       v[7] = m.reset_cause;
-      return (int)said;
+      return (int)event;
     }
     case TP_CLOCK_REPLY: {
       struct tp_clock_reply m;
-      said = tp_get_clock_reply(p, n, &m);
-      if (said != TP_PACKET) return (int)said;
+      event = tp_get_clock_reply(p, n, &m);
+      if (event != TP_PACKET) return (int)event;
       v[0] = m.token;
       v[1] = m.ticks_received;
       v[2] = m.ticks_sent;
-      return (int)said;
+      return (int)event;
     }
     case TP_LOG: {
       struct tp_log m;
-      said = tp_get_log(p, n, &m);
-      if (said != TP_PACKET) return (int)said;
+      event = tp_get_log(p, n, &m);
+      if (event != TP_PACKET) return (int)event;
       v[0] = m.level;
       v[1] = m.size_bytes;
       v[2] = m.ticks;
       memcpy(blob, m.text, m.size_bytes);
-      return (int)said;
+      return (int)event;
     }
     case TP_ACK: {
       struct tp_ack m;
-      said = tp_get_ack(p, n, &m);
-      if (said != TP_PACKET) return (int)said;
+      event = tp_get_ack(p, n, &m);
+      if (event != TP_PACKET) return (int)event;
       v[0] = m.command;
       v[1] = m.result;
       v[2] = m.request;
-      return (int)said;
+      return (int)event;
     }
     case TP_IDENTIFY: {
       struct tp_identify m;
-      said = tp_get_identify(p, n, &m);
-      if (said != TP_PACKET) return (int)said;
+      event = tp_get_identify(p, n, &m);
+      if (event != TP_PACKET) return (int)event;
       v[0] = m.request;
       v[1] = m.major;
       v[2] = m.minor;
-      return (int)said;
+      return (int)event;
     }
     case TP_SET_RATE: {
       struct tp_set_rate m;
-      said = tp_get_set_rate(p, n, &m);
-      if (said != TP_PACKET) return (int)said;
+      event = tp_get_set_rate(p, n, &m);
+      if (event != TP_PACKET) return (int)event;
       v[0] = m.request;
       v[1] = m.rate_mhz;
-      return (int)said;
+      return (int)event;
     }
     case TP_SET_GAIN: {
       struct tp_set_gain m;
-      said = tp_get_set_gain(p, n, &m);
-      if (said != TP_PACKET) return (int)said;
+      event = tp_get_set_gain(p, n, &m);
+      if (event != TP_PACKET) return (int)event;
       v[0] = m.request;
       v[1] = m.array;
       v[2] = m.gain;
       v[3] = m.resolution;
       v[4] = m.oversampling;
       v[5] = m.filter;
-      return (int)said;
+      return (int)event;
     }
     case TP_CLOCK_POLL: {
       uint32_t token;
-      said = tp_get_clock_poll(p, n, &token);
-      if (said == TP_PACKET) v[0] = token;
-      return (int)said;
+      event = tp_get_clock_poll(p, n, &token);
+      if (event == TP_PACKET) v[0] = token;
+      return (int)event;
     }
     case TP_START:
     case TP_STOP:
     case TP_REBOOT: {
       uint16_t request;
-      said = tp_get_request(p, n, &request);
-      if (said == TP_PACKET) v[0] = request;
-      return (int)said;
+      event = tp_get_request(p, n, &request);
+      if (event == TP_PACKET) v[0] = request;
+      return (int)event;
     }
     default: return (int)TP_UNKNOWN_TYPE;
   }
@@ -326,17 +326,17 @@ void bridge_receiver_free(struct receiver *r) {
 }
 
 /** Count the event, and append a whole packet, as far as it was held, to `out`. */
-static int told(enum tp_event said, const struct tp_packet *p, uint32_t *counts, uint8_t *out) {
+static int keep_packet(enum tp_event event, const struct tp_packet *p, uint32_t *counts, uint8_t *out) {
   int64_t v[600];
   uint8_t blob[320];
   uint16_t held;
-  if (said == TP_NOTHING) return 0;
-  if (said == TP_PACKET) {
-    said = (enum tp_event)bridge_decode(tp_packet_type(p), tp_payload(p), tp_payload_size(p), v,
+  if (event == TP_NOTHING) return 0;
+  if (event == TP_PACKET) {
+    event = (enum tp_event)bridge_decode(tp_packet_type(p), tp_payload(p), tp_payload_size(p), v,
                                         blob);
   }
-  counts[said]++;
-  if (said != TP_PACKET) return 0;
+  counts[event]++;
+  if (event != TP_PACKET) return 0;
   held = (uint16_t)(TP_HEADER + tp_payload_size(p));
   out[0] = (uint8_t)(held & 255);
   out[1] = (uint8_t)(held >> 8);
@@ -349,8 +349,8 @@ int bridge_serial_feed(struct receiver *r, const uint8_t *bytes, int n, uint32_t
   int size = 0;
   int i;
   for (i = 0; i < n; i++) {
-    enum tp_event said = tp_serial_push(&r->serial, bytes[i]);
-    size += told(said, &r->serial.packet, counts, out + size);
+    enum tp_event event = tp_serial_push(&r->serial, bytes[i]);
+    size += keep_packet(event, &r->serial.packet, counts, out + size);
   }
   return size;
 }
@@ -358,14 +358,14 @@ int bridge_serial_feed(struct receiver *r, const uint8_t *bytes, int n, uint32_t
 int bridge_can_feed(struct receiver *r, uint32_t identifier, const uint8_t *data, int size, int fd,
                     uint32_t *counts, uint8_t *out) {
   struct tp_can_frame frame;
-  enum tp_event said;
+  enum tp_event event;
   frame.identifier = identifier;
   frame.size = (uint8_t)((size > 64) ? 255 : size);
   frame.fd = fd != 0;
   if (size <= 64) memcpy(frame.data, data, (size_t)size);
-  said = tp_can_push(&r->can, &frame);
+  event = tp_can_push(&r->can, &frame);
   counts[TP_INTERRUPTED] = r->can.interrupted;
-  return told(said, &r->can.packet, counts, out);
+  return keep_packet(event, &r->can.packet, counts, out);
 }
 
 int bridge_segment(const uint8_t *packet, int size, int k, int fd, int transfer,
@@ -491,7 +491,7 @@ void bench_free(struct bench *t) {
  */
 int bench_poll(struct bench *t, uint32_t now_us, uint32_t room, const uint8_t *in, int n,
                uint8_t *out) {
-  int said;
+  int sent;
   if (n > 0) {
     uint8_t *grown = (uint8_t *)malloc(t->in_size - t->in_at + (size_t)n);
     if (grown == NULL) return -1;
@@ -506,9 +506,9 @@ int bench_poll(struct bench *t, uint32_t now_us, uint32_t room, const uint8_t *i
   t->room = room;
   board_poll(&t->reference.board);
   memcpy(out, t->out, t->out_size);
-  said = (int)t->out_size;
+  sent = (int)t->out_size;
   t->out_size = 0;
-  return said;
+  return sent;
 }
 
 void bench_log(struct bench *t, int level, const char *text) {
@@ -651,11 +651,11 @@ void rig_flip(struct rig *r, int flipped) { r->array.flipped = flipped != 0; }
 /** Burst: try to read every `step_us`; v: the result of each try (enum mlx_result). */
 int rig_burst(struct rig *r, int chip, int interval, uint32_t step_us, int steps, int64_t *v) {
   struct mlx_chip *c = &r->chips[chip];
-  enum mlx_result said = MLX_OK;
+  enum mlx_result result = MLX_OK;
   int i;
-  if (c->state != MLX_UP) said = mlx_configure(&r->bus, c, &r->array.setting);
-  if (said == MLX_OK) said = mlx_burst(&r->bus, c, (uint8_t)interval);
-  if (said != MLX_OK) return (int)said;
+  if (c->state != MLX_UP) result = mlx_configure(&r->bus, c, &r->array.setting);
+  if (result == MLX_OK) result = mlx_burst(&r->bus, c, (uint8_t)interval);
+  if (result != MLX_OK) return (int)result;
   for (i = 0; i < steps; i++) {
     r->now_us += step_us;
     v[i] = (int64_t)mlx_read(&r->bus, c, &r->array.setting, false);

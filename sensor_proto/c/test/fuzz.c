@@ -17,7 +17,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 static uint32_t now_us;
 static const uint8_t *input;
 static size_t left;
-static size_t said;
+static size_t sent;
 
 static uint32_t micros(void *self) {
   (void)self;
@@ -26,8 +26,8 @@ static uint32_t micros(void *self) {
 
 static size_t put(void *self, const uint8_t *bytes, size_t count) {
   (void)self;
-  if (said + count > 3000) return 0;
-  said += count;
+  if (sent + count > 3000) return 0;
+  sent += count;
   return bytes[count - 1] == 0 ? count : count / 2 + 1;
 }
 
@@ -98,7 +98,7 @@ static void on_a_line(const uint8_t *data, size_t size) {
   now_us = 0;
   input = data;
   left = size;
-  said = 0;
+  sent = 0;
   r.self = &r;
   r.micros = micros;
   r.port.self = &r;

@@ -123,8 +123,8 @@ static inline enum tp_answer reference_set_gain_(void *self, uint8_t array,
   for (i = 0; i < REFERENCE_ARRAYS; i++) {
     if (array == i || array == BOARD_ALL_ARRAYS) {
       /* The first array refuses if any does: codes and rate are the same for all. */
-      enum tp_answer said = mlx_array_set(&r->arrays[i], &setting, rate_mhz, REFERENCE_BUS_US);
-      if (said != TP_OK) return said;
+      enum tp_answer result = mlx_array_set(&r->arrays[i], &setting, rate_mhz, REFERENCE_BUS_US);
+      if (result != TP_OK) return result;
     }
   }
   return TP_OK;

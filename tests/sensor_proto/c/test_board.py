@@ -25,7 +25,7 @@ from sensor_proto.packets import (
 from tactile_core.types import Instant
 
 
-class Talk:
+class PollingHost:
     """A host that polls a board every half millisecond and keeps its messages."""
 
     def __init__(self, board: Any) -> None:
@@ -49,7 +49,7 @@ class Talk:
 
 
 def test_blocked_line_drops_and_counts_oldest_cycles(c_board: Any) -> None:
-    host = Talk(c_board)
+    host = PollingHost(c_board)
     host.say(Start(1))
     host.run(500)
     c_board.room = 0
@@ -67,7 +67,7 @@ def test_blocked_line_drops_and_counts_oldest_cycles(c_board: Any) -> None:
 
 
 def test_slow_line_corrupts_nothing(c_board: Any) -> None:
-    host = Talk(c_board)
+    host = PollingHost(c_board)
     c_board.room = 3  # of 57 bytes every 10 ms: 6 kB/s of 6 kB/s
     host.say(Identify(1), Start(2))
     host.run(3000)
@@ -81,7 +81,7 @@ def test_slow_line_corrupts_nothing(c_board: Any) -> None:
 def test_clock_reply_precedes_samples_and_has_its_send_time(
     c_board: Any,
 ) -> None:
-    host = Talk(c_board)
+    host = PollingHost(c_board)
     host.say(Start(1))
     host.run(200)
     c_board.room = 0
@@ -99,7 +99,7 @@ def test_clock_reply_precedes_samples_and_has_its_send_time(
 
 
 def test_ticks_wrap_and_periods_stay_exact(c_board: Any) -> None:
-    host = Talk(c_board)
+    host = PollingHost(c_board)
     host.us = (1 << 32) - 600_000
     host.run(1)
     host.say(SetRate(1, 33_333), Start(2))
@@ -112,7 +112,7 @@ def test_ticks_wrap_and_periods_stay_exact(c_board: Any) -> None:
 
 
 def test_delayed_board_counts_missed_cycles(c_board: Any) -> None:
-    host = Talk(c_board)
+    host = PollingHost(c_board)
     host.say(Start(1))
     host.run(300)
     host.us += 250_000  # board_poll was not called
@@ -124,7 +124,7 @@ def test_delayed_board_counts_missed_cycles(c_board: Any) -> None:
 
 
 def test_log_lines_are_cut_between_characters_and_losses_reported(c_board: Any) -> None:
-    host = Talk(c_board)
+    host = PollingHost(c_board)
     c_board.log(30, "ä" * 30)
     for _ in range(3):
         c_board.log(20, "too much")
@@ -139,7 +139,7 @@ def test_log_lines_are_cut_between_characters_and_losses_reported(c_board: Any) 
 
 
 def test_dead_chip_is_flagged_counted_and_recovers(c_board: Any) -> None:
-    host = Talk(c_board)
+    host = PollingHost(c_board)
     host.say(Start(1))
     host.run(300)
     c_board.chip(2, dead=True)
@@ -152,7 +152,7 @@ def test_dead_chip_is_flagged_counted_and_recovers(c_board: Any) -> None:
 
 
 def test_commands_after_reboot_are_busy_until_restart(c_board: Any) -> None:
-    host = Talk(c_board)
+    host = PollingHost(c_board)
     host.say(Start(1))
     host.run(300)
     host.say(Reboot(2), Start(3))
@@ -166,7 +166,7 @@ def test_commands_after_reboot_are_busy_until_restart(c_board: Any) -> None:
 
 
 def test_excess_commands_are_refused_and_counted(c_board: Any) -> None:
-    host = Talk(c_board)
+    host = PollingHost(c_board)
     c_board.room = 0
     host.say(*(Start(n) for n in range(20)), *(ClockPoll(n) for n in range(20)))
     host.run(20)

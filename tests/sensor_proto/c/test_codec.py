@@ -97,7 +97,7 @@ def test_messages_are_byte_identical_in_c_and_python(
     notes["messages"] = {"serial_each_way": count, "can_each_way": count, "differences": 0}
 
 
-def spoil(rng: np.random.Generator, frame: bytes) -> bytes:
+def corrupt(rng: np.random.Generator, frame: bytes) -> bytes:
     """Corrupt ``frame`` as a line may, or leave it intact."""
     at = int(rng.integers(0, len(frame) + 1))
     match int(rng.integers(0, 8)):
@@ -142,7 +142,7 @@ def test_receivers_agree_on_corrupted_serial_line(codec: Any, draw: Draw, full: 
     ours, theirs = codec.receiver(), SerialDecoder()
     for m in draw(30_000 if full else 2_000, 2):
         data = stuff(odd_packet(rng, m)) if rng.random() < 0.5 else encode_serial(m)
-        data = spoil(rng, data)
+        data = corrupt(rng, data)
         packets, messages = ours.serial(data), theirs.feed(data)
         assert [p[0] for p in packets] == [message_type(r.message) for r in messages]
         assert {k: ours.counters[k] for k in theirs.counters} == theirs.counters

@@ -33,7 +33,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory, scene_file: Path) -> Iterat
 @pytest.fixture
 def cupboard(shared: Cupboard) -> Cupboard:
     """The one process of a module, as new."""
-    shared.settled()
+    shared.reset()
     return shared
 
 

@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
         close_session(bus)
         return REFUSED
     try:
-        _serve(options, node, bus, config.meets(), stopping)
+        _serve(options, node, bus, config.where(), stopping)
     finally:
         node.close()
         close_session(bus)

@@ -80,7 +80,7 @@ class LiveSource:
 
     def __init__(self, config: BusConfig) -> None:
         """`BusError` when the bus cannot be joined."""
-        self.meets = config.meets()
+        self.meets = config.where()
         self.undecodable = 0
         self._codec = codec()
         self._session = open_session(config)

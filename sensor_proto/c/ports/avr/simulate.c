@@ -31,21 +31,21 @@ static void end(int number) {
   ended = 1;
 }
 
-static void said(struct avr_irq_t *irq, uint32_t value, void *self) {
+static void on_output(struct avr_irq_t *irq, uint32_t value, void *self) {
   unsigned char byte = (unsigned char)value;
   (void)irq;
   (void)self;
   if (write(master, &byte, 1) != 1) return; /* a UART does not know whether anyone listens */
 }
 
-static void takes(struct avr_irq_t *irq, uint32_t value, void *self) {
+static void on_ready(struct avr_irq_t *irq, uint32_t value, void *self) {
   (void)irq;
   (void)value;
   (void)self;
   room = 1;
 }
 
-static void full(struct avr_irq_t *irq, uint32_t value, void *self) {
+static void on_full(struct avr_irq_t *irq, uint32_t value, void *self) {
   (void)irq;
   (void)value;
   (void)self;
@@ -85,9 +85,9 @@ int main(int argc, char **argv) {
   flags &= ~(uint32_t)(AVR_UART_FLAG_STDIO | AVR_UART_FLAG_POLL_SLEEP);
   avr_ioctl(avr, AVR_IOCTL_UART_SET_FLAGS('0'), &flags);
   in = avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT);
-  avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), said, NULL);
-  avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUT_XON), takes, NULL);
-  avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUT_XOFF), full, NULL);
+  avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), on_output, NULL);
+  avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUT_XON), on_ready, NULL);
+  avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUT_XOFF), on_full, NULL);
   (void)printf("simavr -> %s\n", argv[2]);
   (void)fflush(stdout);
   (void)clock_gettime(CLOCK_MONOTONIC, &begun);

@@ -50,13 +50,13 @@ static uint32_t ticks(void *self) {
 
 static enum mlx_result transfer(void *self, uint8_t address, const uint8_t *out, uint8_t out_count,
                                 uint8_t *in, uint8_t in_count) {
-  int said;
+  int count;
   (void)self;
   if (!gpio_get(SDA)) return MLX_STUCK;
-  said = i2c_write_timeout_us(i2c0, address, out, out_count, true, TRANSFER_US);
-  if (said != out_count) return MLX_NACK;
-  said = i2c_read_timeout_us(i2c0, address, in, in_count, false, TRANSFER_US);
-  return (said == in_count) ? MLX_OK : MLX_NACK;
+  count = i2c_write_timeout_us(i2c0, address, out, out_count, true, TRANSFER_US);
+  if (count != out_count) return MLX_NACK;
+  count = i2c_read_timeout_us(i2c0, address, in, in_count, false, TRANSFER_US);
+  return (count == in_count) ? MLX_OK : MLX_NACK;
 }
 
 /** Nine clocks by hand, so that a chip in the middle of a byte releases the data line. */

@@ -155,7 +155,7 @@ def bench_client(*, quick: bool = False) -> dict[str, float]:
                     start = time.perf_counter_ns()
                     codec().decode(FEATURES, sample.payload.to_bytes())
                     middle = time.perf_counter_ns()
-                    stream._hear(sample)
+                    stream._on_sample(sample)
                     next(stream)
                     client.append(time.perf_counter_ns() - middle)
                     bare.append(middle - start)
