@@ -699,7 +699,7 @@ class LayoutDecoder:
 
     def __init__(self, layout: Layout) -> None:
         if layout.framing is None:
-            raise ValueError(f"{layout} does not say what stands round the numbers")
+            raise ValueError(f"{layout} does not declare the bytes around the numbers")
         self.layout = layout
         self._framing: Framing = layout.framing
         self._size = layout.size

@@ -73,7 +73,7 @@ class CanSpec:
         """Parse a bus as written by users. The ValueError it raises names what is allowed."""
         match = _SPEC.fullmatch(text)
         if match is None:
-            raise ValueError(f"{text!r} is no CAN bus; allowed: {FORM}")
+            raise ValueError(f"invalid CAN bus {text!r}; expected {FORM}")
         bitrate = int(match["bitrate"]) if match["bitrate"] else None
         data = int(match["data"]) if match["data"] else None
         if bitrate == 0 or data == 0:
@@ -98,8 +98,8 @@ def open_bus(spec: CanSpec) -> can.BusABC:
     if spec.interface not in VALID_INTERFACES:
         raise CanUnavailable(
             Trouble.UNSUITABLE,
-            f"there is no CAN interface {spec.interface!r}",
-            f"allowed: {', '.join(sorted(VALID_INTERFACES))}",
+            f"no such CAN interface: {spec.interface!r}",
+            f"available: {', '.join(sorted(VALID_INTERFACES))}",
         )
     options: dict[str, Any] = {}
     if spec.interface == "socketcan":
@@ -144,10 +144,10 @@ def can_links() -> list[str]:
 def _check_link(channel: str) -> None:
     links = can_links()
     if channel not in links:
-        there = f"CAN links there are: {', '.join(links)}" if links else "this kernel has none"
+        there = f"available: {', '.join(links)}" if links else "this kernel has none"
         raise CanUnavailable(
             Trouble.MISSING,
-            f"there is no CAN link {channel!r} ({there})",
+            f"no such CAN link: {channel!r} ({there})",
             "plug the adapter in; for a test `sudo modprobe vcan && sudo ip link add dev vcan0 "
             "type vcan && sudo ip link set vcan0 up`",
         )

@@ -691,7 +691,7 @@ class LiveLines(ABC):
         """
         try:
             self._show()
-        except Exception as error:
+        except Exception as error:  # a fault of the display must not stop the daemon
             if not self._failed:
                 self._failed = True
                 log.error("the state cannot be shown", exc_info=error)

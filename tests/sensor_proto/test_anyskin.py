@@ -140,9 +140,9 @@ def test_crlf_inside_every_frame_is_not_a_boundary(byte: int) -> None:
     """The worst field: CR LF stays at the same place while nothing moves."""
     frames = []
     for raw in stream(30, 5):
-        spoilt = bytearray(raw)
-        spoilt[byte : byte + 2] = b"\r\n"
-        frames.append(bytes(spoilt))
+        damaged_frame = bytearray(raw)
+        damaged_frame[byte : byte + 2] = b"\r\n"
+        frames.append(bytes(damaged_frame))
     wire = b"".join(frames)
     for offset in (0, 1, 41, byte + 2):
         decoder = AnySkinDecoder()
@@ -158,11 +158,11 @@ def test_crlf_inside_a_third_of_the_frames_is_not_a_boundary() -> None:
     rng = np.random.default_rng(7)
     frames = []
     for raw in stream(400, 5):
-        spoilt = bytearray(raw)
+        damaged_frame = bytearray(raw)
         if rng.random() < 0.31:
             at = int(rng.choice([8, 9, 12, 13, 24, 28, 40, 72, 76, 77]))
-            spoilt[at : at + 2] = b"\r\n"
-        frames.append(bytes(spoilt))
+            damaged_frame[at : at + 2] = b"\r\n"
+        frames.append(bytes(damaged_frame))
     decoder = AnySkinDecoder()
     assert indices(feed_in(decoder, b"".join(frames), [64, 200, 3])) == list(range(400))
     assert decoder.counters["lost_lock"] == 0

@@ -119,8 +119,8 @@ def test_boards_and_types_may_interleave(
 def test_lost_frame_drops_only_its_transfer(transfers: list[Frames]) -> None:
     for at in range(len(transfers[2])):
         decoder = CanDecoder()
-        spoilt = transfers[2][:at] + transfers[2][at + 1 :]
-        got = numbers(decoder.feed(flat([*transfers[:2], spoilt, *transfers[3:]])))
+        damaged = transfers[2][:at] + transfers[2][at + 1 :]
+        got = numbers(decoder.feed(flat([*transfers[:2], damaged, *transfers[3:]])))
         assert got == [(3, i) for i in range(8) if i != 2]
         assert refused(decoder)
 
@@ -129,10 +129,10 @@ def test_swapped_frames_drop_only_their_transfer(transfers: list[Frames]) -> Non
     frames = transfers[2]
     for a in range(len(frames)):
         for b in range(a + 1, len(frames)):
-            spoilt = list(frames)
-            spoilt[a], spoilt[b] = spoilt[b], spoilt[a]
+            damaged = list(frames)
+            damaged[a], damaged[b] = damaged[b], damaged[a]
             decoder = CanDecoder()
-            got = numbers(decoder.feed(flat([*transfers[:2], spoilt, *transfers[3:]])))
+            got = numbers(decoder.feed(flat([*transfers[:2], damaged, *transfers[3:]])))
             assert got == [(3, i) for i in range(8) if i != 2]
             assert refused(decoder)
 
@@ -140,9 +140,9 @@ def test_swapped_frames_drop_only_their_transfer(transfers: list[Frames]) -> Non
 def test_repeated_frame_is_used_once_and_counted(transfers: list[Frames]) -> None:
     for at in range(len(transfers[2])):
         decoder = CanDecoder()
-        spoilt = list(transfers[2])
-        spoilt.insert(at, spoilt[at])
-        got = numbers(decoder.feed(flat([*transfers[:2], spoilt, *transfers[3:]])))
+        damaged = list(transfers[2])
+        damaged.insert(at, damaged[at])
+        got = numbers(decoder.feed(flat([*transfers[:2], damaged, *transfers[3:]])))
         assert got == [(3, i) for i in range(8)]
         assert refused(decoder) == {"duplicate": 1}
 

@@ -335,12 +335,12 @@ def test_lost_bytes_do_not_shift_later_frames(layout: str, cut: int) -> None:
 def test_line_with_missing_text_is_dropped_and_counted() -> None:
     lines = [reskin(r, i) for i, r in enumerate(rows(5, 40))]
     whole = len(read("text:5xyzt", lines))
-    spoilt = list(lines)
-    spoilt[10] = spoilt[10].partition(b"\t")[2]
-    spoilt[20] = spoilt[20].replace(b".", b"", 1)
-    spoilt[30] = spoilt[30][:-2]
+    damaged = list(lines)
+    damaged[10] = damaged[10].partition(b"\t")[2]
+    damaged[20] = damaged[20].replace(b".", b"", 1)
+    damaged[30] = damaged[30][:-2]
     decoder = TextDecoder(Layout.parse("text:5xyzt"))
-    got = [r for line in spoilt for r in decoder.feed(line)]
+    got = [r for line in damaged for r in decoder.feed(line)]
     assert len(got) == whole - 4  # the third joins two lines
     assert decoder.counters["discarded_bytes"] > 4 * 100
 

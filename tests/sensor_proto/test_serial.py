@@ -200,9 +200,9 @@ def corrupt(kind: str, frames: list[bytes], rng: np.random.Generator) -> tuple[b
             skip = True
         elif kind == "flipped":
             at, bit = int(rng.integers(len(frame) - 1)), int(rng.integers(8))
-            spoilt = bytearray(frame)
-            spoilt[at] ^= 1 << bit
-            wire.append(bytes(spoilt))
+            damaged_frame = bytearray(frame)
+            damaged_frame[at] ^= 1 << bit
+            wire.append(bytes(damaged_frame))
             damaged += 1
         elif kind == "spliced" and i + 1 < len(frames):
             wire.append(frame[: rng.integers(len(frame))] + frames[i + 1][rng.integers(1, 9) :])

@@ -228,7 +228,7 @@ def test_health_summarises_a_rig(lab: Any, capsys: pytest.CaptureFixture) -> Non
         ("board", "board0", "OK")
     ]
     assert main(["health", "--connect", lab.endpoint, "--board", "other", "--timeout", "1"]) == 4
-    assert "CRITICAL: board other: nobody serves" in capsys.readouterr().out
+    assert "CRITICAL: board other: no service at" in capsys.readouterr().out
 
 
 def test_health_without_daemons_fails(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -81,7 +81,7 @@ def load_keys(folder: Path | str) -> TlsConfig:
     folder = Path(folder)
     if not folder.is_dir():
         raise KeysError(
-            f"--keys {folder}: there is no such folder; `tactile bus keys` makes one for each party"
+            f"--keys {folder}: no such folder; `tactile bus keys` makes one for each party"
         )
     parties = ", ".join(sorted(p.name for p in folder.iterdir() if (p / ROLES).exists()))
     if not (folder / PRIVATE_KEY).exists() and parties:

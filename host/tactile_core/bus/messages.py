@@ -150,7 +150,7 @@ class Codec:
             checks = self._arrays[msgtype] = self._find_arrays(msgtype)
         try:
             if message.__msgtype__ != msgtype:
-                raise TypeError(f"a {message.__msgtype__} is no {msgtype}")
+                raise TypeError(f"expected a {msgtype}, got a {message.__msgtype__}")
             for name, dtype in checks:
                 array = getattr(message, name)
                 if array.dtype != dtype or array.ndim != 1:
@@ -160,7 +160,9 @@ class Codec:
                     )
             data = bytes(self._store.serialize_cdr(message, msgtype))
         except (AttributeError, struct.error, SerdeError) as error:
-            raise TypeError(f"{type(message).__name__} is no valid {msgtype}: {error}") from error
+            raise TypeError(
+                f"{type(message).__name__} is not a valid {msgtype}: {error}"
+            ) from error
         if len(data) > MAX_PAYLOAD:
             raise ValueError(f"{msgtype} of {len(data)} bytes: {MAX_PAYLOAD} allowed")
         return data

@@ -136,7 +136,7 @@ def call(session: zenoh.Session, key: str, payload: object = None, timeout: floa
     config = config_of(session)
     who = "" if config is None else config.where()
     raise NoAnswerError(
-        f"nobody serves {key}: is the daemon running, and this bus connected to it{who}?"
+        f"no service at {key}: is the daemon running, and this bus connected to it{who}?"
     )
 
 
@@ -157,4 +157,4 @@ def _decode(key: str, payload: bytes) -> Any:
     try:
         return msgspec.json.decode(payload)
     except msgspec.DecodeError as error:
-        raise ServiceError(f"reply of {key} is no JSON: {error}") from error
+        raise ServiceError(f"reply of {key} is not JSON: {error}") from error

@@ -27,7 +27,7 @@ class Topic:
     def key(self, name: str, prefix: str = "") -> str:
         """Key expression for ``name``. Raises ValueError unless it is a single plain chunk."""
         if not NAME.fullmatch(name):
-            raise ValueError(f"{name!r} is no name: letters, digits, _ and -, at most 64")
+            raise ValueError(f"{name!r} is not a valid name: letters, digits, _ and -, at most 64")
         key = self.template.format(name=name)
         return f"{prefix}/{key}" if prefix else key
 

@@ -448,7 +448,7 @@ class LogReader:
                     "reads version '0': update it"
                 )
             if first is None:
-                raise LogError(f"{self.path} is no MCAP file")
+                raise LogError(f"{self.path} is not an MCAP file")
             self.note_damage(Damage(0, first, "the start of the file is overwritten"))
             self._read_end()
             return first
@@ -495,7 +495,7 @@ class LogReader:
             raise BadRecordError("an end mark that is too short")
         if self._footer is None:
             if self._bytes.find_chunk(after) is not None:
-                raise BadRecordError("an end mark amid the data")
+                raise BadRecordError("an end mark within the data")
             reason = "cut off within the summary"
             self.note_damage(Damage(position, self.size - position, reason, 0))
         elif self._bad_crc and after == self._footer[0]:
@@ -505,7 +505,7 @@ class LogReader:
             start, crc = self._footer
             summary = read_summary(self.read_at, after, footer, None)
             if summary is None:
-                raise BadRecordError("an end mark amid the data")
+                raise BadRecordError("an end mark within the data")
             stated = f"begins at byte {start}" if start else "is missing"
             reason = f"the footer says that the summary {stated}, but it begins at byte {after}"
             self.note_damage(Damage(footer, FOOTER_SIZE, reason, 0))
@@ -611,9 +611,9 @@ class LogReader:
                 raise BadRecordError(f"a record of {length} bytes")
             return after, self._small(opcode, self.read_at(position + 9, length))
         elif 0 < opcode <= op.DATA_END:
-            raise BadRecordError(f"record type {opcode} amid the data")
+            raise BadRecordError(f"record type {opcode} within the data")
         elif opcode == 0:
-            raise BadRecordError("record type 0, which there is not")
+            raise BadRecordError("record type 0, which does not exist")
         else:
             return after, self._unknown(position, length)
         return after, None
@@ -878,7 +878,7 @@ class LogReader:
         elif opcode == op.CHUNK:
             self.note_damage(Damage(block.offset, 0, "a chunk within a chunk"))
         elif opcode == 0:
-            self.note_damage(Damage(block.offset, 0, "record type 0, which there is not"))
+            self.note_damage(Damage(block.offset, 0, "record type 0, which does not exist"))
             return False
         return True
 

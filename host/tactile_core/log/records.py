@@ -172,7 +172,7 @@ class Cursor:
         try:
             return self.bytes(*self.take(U32)).decode()
         except UnicodeDecodeError:
-            raise BadRecordError("a text is no UTF-8") from None
+            raise BadRecordError("a text is not UTF-8") from None
 
     def map(self) -> dict[str, str]:
         """Read a table of texts preceded by its length."""
@@ -239,7 +239,7 @@ class LogBytes:
         """Open the file. Raises `LogError` if it is not a file or cannot be read."""
         try:
             if not stat.S_ISREG(os.stat(self.path).st_mode) and not self.path.is_dir():
-                raise LogError(f"{self.path} is no file but a device or a pipe")
+                raise LogError(f"{self.path} is a device or a pipe, not a file")
             self._file = open(self.path, "rb")  # noqa: SIM115 - closed by close()
             self.size = self.end = os.fstat(self._file.fileno()).st_size
         except OSError as error:

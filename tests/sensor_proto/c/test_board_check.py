@@ -48,11 +48,11 @@ class Wrong(SerialBoard):
         super().__init__(build_skin("anyskin", 1), identity("anyskin", 1))
         take = self.controller.take
 
-        def spoilt(now: Any) -> list[Any]:
+        def faulty_take(now: Any) -> list[Any]:
             said = [mistake(m) for m in take(now)]
             return [m for m in said if m is not None] if said else []
 
-        self.controller.take = spoilt  # type: ignore[method-assign]
+        self.controller.take = faulty_take  # type: ignore[method-assign]
 
 
 @pytest.mark.parametrize(

@@ -147,7 +147,7 @@ def test_violations_of_the_format_are_reported(tmp_path: Path) -> None:
 
     assert told(message(0) + record(0, b"") + message(1)) == (
         2,
-        "record type 0, which there is not",
+        "record type 0, which does not exist",
     )
     assert told(made.chunk(message(0)[:-2]))[1] == "a chunk whose records do not fit into it"
     assert told(made.chunk(message(0) + made.chunk(message(1)))) == (1, "a chunk within a chunk")
@@ -185,8 +185,8 @@ def test_data_checksum_is_verified_when_present(tmp_path: Path) -> None:
     writer.finish()
     data = stream.getvalue()
     assert info(write(tmp_path, data)).whole
-    spoilt = info(write(tmp_path, data.replace(b"payload", b"pAyload")))
-    assert spoilt.damages[0].reason == "the checksum over all the data is wrong"
+    damaged = info(write(tmp_path, data.replace(b"payload", b"pAyload")))
+    assert damaged.damages[0].reason == "the checksum over all the data is wrong"
 
 
 def test_summary_with_more_messages_than_data_reports_a_loss(tmp_path: Path) -> None:
@@ -315,10 +315,10 @@ def test_data_readable_after_a_bit_flip_is_kept_on_request(
     rng = random.Random(3)
     messages = [message(k, rng.randbytes(40)) for k in range(100)]
     made.data += made.schema + made.channel
-    spoilt = bytearray(b"".join(messages))
-    spoilt[71 * 50 + 2] ^= 4  # a length, so that the next message is not at its stated place
-    spoilt[71 * 70 + 45] ^= 1  # in the data of another message
-    made.data += made.chunk(bytes(spoilt), compression, crc=zlib.crc32(b"".join(messages)))
+    damaged = bytearray(b"".join(messages))
+    damaged[71 * 50 + 2] ^= 4  # a length, so that the next message is not at its stated place
+    damaged[71 * 70 + 45] ^= 1  # in the data of another message
+    made.data += made.chunk(bytes(damaged), compression, crc=zlib.crc32(b"".join(messages)))
     made.data += made.index(100) + record(12, text("m") + text(b""))
     path, out = write(tmp_path, made.end()), tmp_path / "out.mcap"
     strict = recover(path, out)
@@ -420,13 +420,13 @@ def test_files_of_the_mcap_writer_read_as_with_the_mcap_reader(
 def test_any_corrupted_file_gives_correct_messages_or_reports_damage(
     tmp_path_factory: pytest.TempPathFactory, data: bytes, drawn: st.DataObject
 ) -> None:
-    path = tmp_path_factory.mktemp("spoilt") / "x.mcap"
-    spoilt = bytearray(data[: drawn.draw(st.integers(20, len(data)))])
+    path = tmp_path_factory.mktemp("damaged") / "x.mcap"
+    damaged = bytearray(data[: drawn.draw(st.integers(20, len(data)))])
     for _ in range(drawn.draw(st.integers(0, 3))):
-        spoilt[drawn.draw(st.integers(8, max(8, len(spoilt) - 1))) % len(spoilt)] ^= 1 << (
+        damaged[drawn.draw(st.integers(8, max(8, len(damaged) - 1))) % len(damaged)] ^= 1 << (
             drawn.draw(st.integers(0, 7))
         )
-    path.write_bytes(spoilt)
+    path.write_bytes(damaged)
     assert info(path).files == 1  # no traceback and no endless loop
     assert recover_or_nothing(path) >= 0
 

@@ -119,8 +119,8 @@ def test_recover_reports_in_json(tactile: Any, path: Path, tmp_path: Path) -> No
     [
         (b"", "is empty"),
         (b"\x89MC", "cut off after 3 bytes"),
-        (b"\x7fELF" + bytes(5000), "is no MCAP file"),
-        (os.urandom(200_000), "is no MCAP file"),
+        (b"\x7fELF" + bytes(5000), "is not an MCAP file"),
+        (os.urandom(200_000), "is not an MCAP file"),
     ],
 )
 def test_non_log_file_exits_with_2(tactile: Any, tmp_path: Path, content: bytes, text: str) -> None:
@@ -141,8 +141,8 @@ def test_missing_files_directories_and_devices_are_refused(tactile: Any, tmp_pat
     for place, text in (
         (tmp_path / "none.mcap", "none.mcap does not exist; name a file, a folder of logs"),
         (tmp_path, "is a folder without a readable .mcap file"),
-        (Path("/dev/zero"), "no file but a device or a pipe"),
-        (tmp_path / "pipe", "no file but a device or a pipe"),
+        (Path("/dev/zero"), "is a device or a pipe, not a file"),
+        (tmp_path / "pipe", "is a device or a pipe, not a file"),
     ):
         result = tactile("info", place)
         assert result.returncode == 2

@@ -236,10 +236,10 @@ def test_damaged_attachment_is_dropped_and_reported(log: Any) -> None:
     [
         (b"", "is empty"),
         (MAGIC[:5], "cut off after 5 bytes"),
-        (b"GIF89a" + bytes(5000), "is no MCAP file"),
-        (bytes(100_000), "is no MCAP file"),
-        (random.Random(3).randbytes(3_000_000), "is no MCAP file"),
-        (b"time,x,y,z\n1,2,3,4\n", "is no MCAP file"),
+        (b"GIF89a" + bytes(5000), "is not an MCAP file"),
+        (bytes(100_000), "is not an MCAP file"),
+        (random.Random(3).randbytes(3_000_000), "is not an MCAP file"),
+        (b"time,x,y,z\n1,2,3,4\n", "is not an MCAP file"),
     ],
 )
 def test_non_log_file_is_refused(tmp_path: Path, content: bytes, reason: str) -> None:

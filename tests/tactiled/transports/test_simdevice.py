@@ -247,9 +247,9 @@ BAD = [
     (["boards", "--slcan", "c", "--board", "anyskin"], "use --pty"),
     (["boards", "--slcan", "c", "--unplug", "1s+1s"], "--faults busoff"),
     (["boards", "--slcan", "c", "--node", "127"], "a whole number from 0 to 126"),
-    (["boards", "--can", "can0"], "is no CAN bus; allowed: INTERFACE:CHANNEL"),
+    (["boards", "--can", "can0"], "invalid CAN bus 'can0'; expected INTERFACE:CHANNEL"),
     (["boards", "--can", "slcan:/dev/ttyACM0"], "use --slcan LINK"),
-    (["boards", "--can", "toaster:0"], "no CAN interface 'toaster'"),
+    (["boards", "--can", "toaster:0"], "no such CAN interface: 'toaster'"),
     (["replay", "none.csv", "--pty", "p"], "none.csv: cannot be read"),
     (["replay", "bad.csv", "--pty", "p"], "bad.csv:1: 2 columns given"),
     (["replay", "bad.csv", "--pty", "p", "--speed", "0"], "'0' given"),
@@ -292,7 +292,7 @@ def test_system_errors_are_distinguished_from_bad_input(
     for arguments, said in (
         (["boards", "--pty", "board0"], "board0 is served by another simdevice; end that one"),
         (["boards", "--pty", "fresh", "--pty", "no/board0"], "a folder that exists"),
-        (["boards", "--can", "socketcan:can77"], "no CAN link 'can77'"),
+        (["boards", "--can", "socketcan:can77"], "no such CAN link: 'can77'"),
         (["calibration", "--out", "no/x.toml", "--board", "anyskin"], "cannot be written"),
     ):
         assert main(arguments) == 3

@@ -124,7 +124,7 @@ def test_bad_arguments_are_refused(
         ([skin_log, "--dpi", "9"], 2, "--dpi 9; allowed: 30 to 600"),
         ([skin_log, "--what", "forces", "--reach", "1"], 2, "leave them out with forces"),
         ([skin_log, "--reach", "1"], 3, "holds no reach"),
-        ([note], 3, "is no MCAP file"),
+        ([note], 3, "is not an MCAP file"),
         ([tmp_path / "none.mcap"], 2, "does not exist"),
     ):
         assert main(["plot", *map(str, words)]) == code, words
