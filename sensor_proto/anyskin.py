@@ -83,25 +83,25 @@ class Search:
         One frame is enough if all its temperatures are plausible, or most of them are and it
         directly follows the end of a frame.
         """
-        return self._first(count, 2)
+        return self._first_frame(count, 2)
 
     def new(self, counts: Iterable[int]) -> tuple[int, int] | None:
         """Offset of the first of `LOCK_FRAMES` consecutive frames, and their number of
         magnetometers."""
-        if not len(self._ends) or not self._warm.any():
+        if not len(self._ends) or not self._plausible_at.any():
             return None
         for count in counts:
-            start = self._first(count, LOCK_FRAMES)
+            start = self._first_frame(count, LOCK_FRAMES)
             if start is None:
                 continue
-            sure = self._sure(start, count)
+            sure = self._column_is_temperature(start, count)
             if sure:
                 return start, count
             if sure is None:
                 return None
         return None
 
-    def _sure(self, start: int, count: int) -> bool | None:
+    def _column_is_temperature(self, start: int, count: int) -> bool | None:
         """Whether the first column holds temperatures; None when more data is needed to tell.
 
         The fields of a bare board are as small as temperatures. Data in the order x, y, z, t could
@@ -124,7 +124,7 @@ class Search:
             return True
         return None if first.likely and whole < SURE_FRAMES else False
 
-    def _first(self, count: int, depth: int) -> int | None:
+    def _first_frame(self, count: int, depth: int) -> int | None:
         """Best supported of the first overlapping candidates; None when more data may change it."""
         size = frame_size(count)
         starts = self._ends + len(END) - size
@@ -137,7 +137,7 @@ class Search:
             starts, fits = starts[fits == depth], fits[fits == depth]
         if not len(starts):
             return None
-        shares = self._shares(starts, count, depth)
+        shares = self._plausible_shares(starts, count, depth)
         after_end = (starts >= len(END)) & self._mark[starts - len(END)]
         if known:
             # The bytes before were consumed up to the end of a frame.
@@ -159,7 +159,7 @@ class Search:
         return best if best + (depth + 1) * size <= self._size else None
 
     @cached_property
-    def _warm(self) -> Flags:
+    def _plausible_at(self) -> Flags:
         """(bytes,): whether the float that starts at each byte is a plausible temperature."""
         words = np.zeros(self._size, dtype="<u4")
         whole = max(0, self._size - 3)
@@ -170,10 +170,12 @@ class Search:
         warm[whole:] = False
         return warm
 
-    def _shares(self, starts: NDArray[np.intp], count: int, depth: int) -> NDArray[np.float64]:
+    def _plausible_shares(
+        self, starts: NDArray[np.intp], count: int, depth: int
+    ) -> NDArray[np.float64]:
         """Fraction of plausible temperatures in each of the ``depth`` frames after each start."""
         nth = np.arange(depth)[:, None] * frame_size(count) + np.arange(count) * READING
-        shares: NDArray[np.float64] = self._warm[starts[:, None, None] + nth].mean(axis=2)
+        shares: NDArray[np.float64] = self._plausible_at[starts[:, None, None] + nth].mean(axis=2)
         return shares
 
 
@@ -272,7 +274,7 @@ class AnySkinDecoder:
         at = 0
         while True:
             if self._locked:
-                at += self._take(buffer, at, later, fed, bursts)
+                at += self._append_frames(buffer, at, later, fed, bursts)
                 if self._locked:
                     break
             found = self._search(buffer[at:])
@@ -302,7 +304,9 @@ class AnySkinDecoder:
         counts = range(1, MAX_MAGNETOMETERS + 1) if self._given is None else (self._given,)
         return search.new(counts)
 
-    def _take(self, buffer: bytes, at: int, later: int, fed: int, bursts: list[FloatBurst]) -> int:
+    def _append_frames(
+        self, buffer: bytes, at: int, later: int, fed: int, bursts: list[FloatBurst]
+    ) -> int:
         """Append the frames from ``at`` on and return the bytes consumed. Unlock where they stop
         fitting."""
         n = self._count or 0
@@ -321,11 +325,11 @@ class AnySkinDecoder:
                 if not fitting:
                     return 0
         values = raw[:fitting, : -len(END)].copy().view(FLOAT).reshape(fitting, n, 4)
-        if _all_good(values):
+        if _all_plausible(values):
             self._suspect = 0
             status = np.zeros((fitting, n), dtype=np.uint8)
         else:
-            fitting = self._trusted(values[:, :, 0])
+            fitting = self._trusted_frames(values[:, :, 0])
             status = _status(values[:fitting])
         values.flags.writeable = status.flags.writeable = False
         self._tally[ACCEPTED] += fitting
@@ -336,7 +340,7 @@ class AnySkinDecoder:
         bursts.append(FloatBurst(values[:fitting], status[:fitting], trailing))
         return fitting * size
 
-    def _trusted(self, temperature_c: NDArray[np.float32]) -> int:
+    def _trusted_frames(self, temperature_c: NDArray[np.float32]) -> int:
         """Number of frames up to the one at which the temperatures, (k, n) °C, cast doubt on the
         boundary."""
         with np.errstate(invalid="ignore"):
@@ -349,7 +353,7 @@ class AnySkinDecoder:
         return len(likely)
 
 
-def _all_good(values: NDArray[np.float32]) -> bool:
+def _all_plausible(values: NDArray[np.float32]) -> bool:
     """Whether every reading of (k, n, 4) is plausible without a closer look; False for any NaN."""
     temperature_c = values[:, :, 0]
     return bool(

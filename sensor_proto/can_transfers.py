@@ -277,13 +277,13 @@ class CanDecoder:
         packets: list[bytes] = []
         keys: list[int] = []
         for frame in frames:
-            raw = self._take(frame)
+            raw = self._accept(frame)
             if raw is not None:
                 packets.append(raw)
                 keys.append(frame.identifier & 0xFFFF)
-        return self._read(packets, keys) if packets else []
+        return self._decode(packets, keys) if packets else []
 
-    def _take(self, frame: CanFrame) -> bytes | None:
+    def _accept(self, frame: CanFrame) -> bytes | None:
         """Packet completed by ``frame``, without padding; None if it completes none."""
         can_id, data = frame.identifier, frame.data
         tally = self._tally
@@ -363,7 +363,7 @@ class CanDecoder:
             return None
         return raw[:size]
 
-    def _read(self, packets: list[bytes], keys: list[int]) -> list[Received]:
+    def _decode(self, packets: list[bytes], keys: list[int]) -> list[Received]:
         tally = self._tally
         received = []
         for raw, key, good in zip(packets, keys, intact(packets), strict=True):

@@ -87,15 +87,15 @@ class SerialDecoder:
             frames += 1
         elif head:
             frames += 1
-            self._open(head, size - first - 1, packets, trailing)
+            self._unpack(head, size - first - 1, packets, trailing)
         for run in _RUN.finditer(data, first + 1, last):
             frames += 1
-            self._open(run[0], size - run.end() - 1, packets, trailing)
+            self._unpack(run[0], size - run.end() - 1, packets, trailing)
         # Counted once per chunk, so that a flood of zeros costs nothing per zero.
         self._tally[Reject.EMPTY] += data.count(0) - frames
         self._partial = b""
         self._hold(data[last + 1 :])
-        return self._read(packets, trailing) if packets else []
+        return self._decode(packets, trailing) if packets else []
 
     def _hold(self, data: bytes) -> None:
         """Keep the beginning of a frame unless it is already too long."""
@@ -108,7 +108,7 @@ class SerialDecoder:
         else:
             self._partial += data
 
-    def _open(self, frame: bytes, after: int, packets: list[bytes], trailing: list[int]) -> None:
+    def _unpack(self, frame: bytes, after: int, packets: list[bytes], trailing: list[int]) -> None:
         """Append the packet in ``frame`` if its size is right; otherwise count the reason."""
         if len(frame) > MAX_FRAME:
             self._tally[Reject.OVERSIZED] += 1
@@ -124,7 +124,7 @@ class SerialDecoder:
         packets.append(raw)
         trailing.append(after)
 
-    def _read(self, packets: list[bytes], trailing: list[int]) -> list[Received]:
+    def _decode(self, packets: list[bytes], trailing: list[int]) -> list[Received]:
         tally = self._tally
         received = []
         for raw, after, good in zip(packets, trailing, intact(packets), strict=True):

@@ -598,7 +598,7 @@ class TextDecoder:
                 return
             part = join(self._record)
         self._record_bytes += len(line) if self.layout.lines == 1 else 0
-        numbers = self._fitting(part)
+        numbers = self._matching_numbers(part)
         if numbers is None:
             self._drop_record()
             return
@@ -630,7 +630,7 @@ class TextDecoder:
         self._tally[Reject.DISCARDED_BYTES] += self._record_bytes
         self._record, self._record_bytes = [], 0
 
-    def _fitting(self, part: Tokens) -> tuple[float, ...] | None:
+    def _matching_numbers(self, part: Tokens) -> tuple[float, ...] | None:
         """Numbers of a record, if their count and decimals match the layout; otherwise None."""
         numbers, decimals = part.numbers, part.decimals
         missing = self._wanted - len(numbers)
@@ -728,7 +728,7 @@ class LayoutDecoder:
         back."""
         out: list[Received] = []
         if self._bare or self._weak:
-            self._look_at_read(data)
+            self._synchronise_on_read(data)
         step = max(len(data), 1) if self._bare else PIECE  # only whole reads show the boundary
         for begin in range(0, len(data), step):
             piece = data[begin : begin + step]
@@ -756,7 +756,7 @@ class LayoutDecoder:
             self._suspect = 0
         self._buffer = buffer[at:]
 
-    def _look_at_read(self, data: bytes) -> None:
+    def _synchronise_on_read(self, data: bytes) -> None:
         """Synchronise on reads that hold whole frames, where the marks do not suffice.
 
         Without marks, one such read is enough: data before it was lost. With one byte of marks,
@@ -785,9 +785,9 @@ class LayoutDecoder:
             fits &= np.append(self._begins(raw[1:]), self._may_begin(buffer, at + whole * size))
         fitting = whole if fits.all() else int(fits.argmin())
         if fitting < whole:
-            self._lose(raw[fitting])
+            self._lose_lock(raw[fitting])
         field, temperature, values = self._samples(raw[:fitting])
-        fitting = self._trusted(temperature, values)
+        fitting = self._trusted_frames(temperature, values)
         status = self._status(field, temperature)
         self._tally[ACCEPTED] += fitting
         for i in range(fitting):
@@ -797,7 +797,7 @@ class LayoutDecoder:
             out.append(Received(FloatSamples(field[i], temperature[i], status[i]), 0, trailing))
         return fitting * size
 
-    def _lose(self, frame: NDArray[np.uint8]) -> None:
+    def _lose_lock(self, frame: NDArray[np.uint8]) -> None:
         self._locked = False
         self._tally[Reject.LOST_LOCK] += 1
         if self._framing.check and self._marked(frame[None], check=False).all():
@@ -841,7 +841,7 @@ class LayoutDecoder:
         field, temperature = self.layout.samples(values)
         return field, temperature, values
 
-    def _likely(
+    def _plausible_frames(
         self, temperature: NDArray[np.float32], values: NDArray[np.generic]
     ) -> NDArray[np.bool_]:
         """Which of k frames hold mostly numbers that a chip can produce."""
@@ -857,9 +857,9 @@ class LayoutDecoder:
         mostly: NDArray[np.bool_] = good.mean(axis=1) >= 0.5
         return mostly
 
-    def _trusted(self, temperature: NDArray[np.float32], values: NDArray[np.generic]) -> int:
+    def _trusted_frames(self, temperature: NDArray[np.float32], values: NDArray[np.generic]) -> int:
         """Number of frames up to the one, if any, that casts doubt on the boundary."""
-        likely = self._likely(temperature, values).tolist()
+        likely = self._plausible_frames(temperature, values).tolist()
         for i, good in enumerate(likely):
             self._suspect = 0 if good else self._suspect + 1
             if self._suspect >= SUSPECT_FRAMES:
@@ -888,7 +888,7 @@ class LayoutDecoder:
         size = self._size
         if self._bare:
             enough = len(buffer) - at >= LOCK_FRAMES * size and (len(buffer) - at) % size == 0
-            return at if enough and self._run(buffer, at) >= LOCK_FRAMES else None
+            return at if enough and self._count_frames(buffer, at) >= LOCK_FRAMES else None
         last = len(buffer) - size
         if last < at:
             return None
@@ -900,7 +900,7 @@ class LayoutDecoder:
         for start in starts.tolist():
             if best is not None and start >= best[1] + size:
                 break
-            run = self._run(buffer, start)
+            run = self._count_frames(buffer, start)
             if not run:
                 continue
             end = self._framing.end
@@ -919,7 +919,7 @@ class LayoutDecoder:
                 best = score, start
         return None if best is None else best[1]
 
-    def _run(self, buffer: bytes, start: int) -> int:
+    def _count_frames(self, buffer: bytes, start: int) -> int:
         """Number of consecutive frames from ``start`` on that fit and are plausible, up to a
         maximum."""
         most = 2 * LOCK_FRAMES if self._weak else LOCK_FRAMES
@@ -928,5 +928,5 @@ class LayoutDecoder:
             return 0
         raw = np.frombuffer(buffer, np.uint8, whole * self._size, start).reshape(whole, -1)
         _, temperature, values = self._samples(raw)
-        good = self._marked(raw) & self._likely(temperature, values)
+        good = self._marked(raw) & self._plausible_frames(temperature, values)
         return whole if good.all() else int(good.argmin())

@@ -49,15 +49,19 @@ UNITS_UT = {"ut": 1.0, "µt": 1.0, "mt": 1000.0, "gauss": 100.0, "g": 100.0}
 
 
 @dataclass(frozen=True, slots=True)
-class TextFinding:
-    """What lines of text hold; fields as in `Finding`."""
+class Finding:
+    """Result of a survey.
+
+    ``what``: the data in words. ``layout``: None unless it is certain. ``declare``: possible
+    layouts, as ``--kind`` takes them.
+    """
 
     layout: Layout | None
     what: str
     declare: tuple[str, ...] = ()
 
 
-def read_text(data: bytes) -> TextFinding | None:
+def read_text(data: bytes) -> Finding | None:
     """Assess the whole lines in ``data``; None if they hold no repeating numbers."""
     lines = [line for line in re.split(rb"[\r\n]+", data)[1:-1] if line.strip()]
     taken = [tokens(line) for line in lines]
@@ -67,7 +71,7 @@ def read_text(data: bytes) -> TextFinding | None:
     numbers = len(records[0].numbers)
     values = np.array([r.numbers for r in records])
     lead, columns = _lead(values)
-    return _of(records, values[:, lead:], lead, count, numbers, columns)
+    return _find_in_text(records, values[:, lead:], lead, count, numbers, columns)
 
 
 def _form(record: Tokens) -> tuple[int, tuple[bytes, ...]]:
@@ -111,14 +115,14 @@ def _lead(values: np.ndarray) -> tuple[int, int]:
     return 0, count
 
 
-def _of(
+def _find_in_text(
     records: list[Tokens],
     values: np.ndarray,
     lead: int,
     lines: int,
     numbers: int,
     count: int,
-) -> TextFinding | None:
+) -> Finding | None:
     between = records[0].between[lead:]
     unit = _unit(between)
 
@@ -133,12 +137,12 @@ def _of(
         found = layout(labelled)
         field, _ = found.samples(values)
         if np.nanmedian(np.linalg.norm(field, axis=2)) < WEAKEST_UT:
-            return TextFinding(
+            return Finding(
                 None,
                 f"{what} labelled {', '.join(labelled)}, too small for fields in µT",
                 (str(found),),
             )
-        return TextFinding(found, f"{what}, labelled {', '.join(labelled)}", (str(found),))
+        return Finding(found, f"{what}, labelled {', '.join(labelled)}", (str(found),))
     if numbers < 3:
         return None
     grouped = _grouped(between, values)
@@ -153,10 +157,10 @@ def _of(
         fields = plain.get("_" if numbered else "")
         if fields and count // width <= MAX_CHIPS:
             found = layout(fields)
-            return TextFinding(found, f"{what} in groups of {width}", (str(found),))
+            return Finding(found, f"{what} in groups of {width}", (str(found),))
     if order in ("txyz", "xyzt") and count // 4 <= MAX_CHIPS:
         found = layout(order)
-        return TextFinding(found, f"{what}, {count // 4} chips with temperatures", (str(found),))
+        return Finding(found, f"{what}, {count // 4} chips with temperatures", (str(found),))
     fits = [f for f in ("txyz", "xyz") if count % len(f) == 0 and count // len(f) <= MAX_CHIPS]
     if order == "xyz":
         fits = ["xyz"]
@@ -165,7 +169,7 @@ def _of(
         what += f": {count // 4} chips with temperatures, or {count // 3} without"
     elif fits == ["txyz"]:
         fits = ["txyz", "xyzt"]
-    return TextFinding(None, what, tuple(str(layout(f)) for f in fits))
+    return Finding(None, what, tuple(str(layout(f)) for f in fits))
 
 
 def _labelled(axes: list[str]) -> str:
@@ -255,19 +259,6 @@ _PRINTABLE[[9, 10, 13, 0xB0, 0xB5, 0xC2]] = True
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
-    """Result of a survey.
-
-    ``what``: the data in words. ``layout``: None unless it is certain. ``declare``: possible
-    layouts, as ``--board`` takes them.
-    """
-
-    layout: Layout | None
-    what: str
-    declare: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class _Frame:
     """Repeating frames, (k, size) bytes. Each row is one frame as far as ``framing`` tells."""
 
@@ -314,26 +305,26 @@ class Survey:
         if not len(values):
             return None
         if declared is not None and declared.kind is not Kind.TEXT:
-            placed = self._place(values, declared)
+            placed = self._fit_declared(values, declared)
             if placed is not None:
                 return placed
-        found = self._free(values)
+        found = self._judge_undeclared(values)
         if declared is None or found is None:
             return found
         other = [layout for layout in found.declare if layout != str(declared)]
         return Finding(None, f"{found.what}, not {declared} as declared", tuple(other))
 
-    def _free(self, values: NDArray[np.uint8]) -> Finding | None:
+    def _judge_undeclared(self, values: NDArray[np.uint8]) -> Finding | None:
         """Assess the bytes without the declared layout."""
         if _PRINTABLE[values].mean() >= MOSTLY:
-            return _of_text(read_text(self._data))
+            return read_text(self._data)
         size = _period(values, None)
         if size is None:
             return None
         rows = _rows(values, size)
-        return None if (rows == rows[0, 0]).all() else _of_frames(rows)
+        return None if (rows == rows[0, 0]).all() else _find_numbers(rows)
 
-    def _place(self, values: NDArray[np.uint8], declared: Layout) -> Finding | None:
+    def _fit_declared(self, values: NDArray[np.uint8], declared: Layout) -> Finding | None:
         """Find the framing around the declared numbers; None if they do not fit anywhere."""
         size = _period(values, declared.payload)
         if size is None:
@@ -341,11 +332,11 @@ class Survey:
         rows = _rows(values, size)
         if (rows == rows[0, 0]).all():
             return None
-        for frame in _framed(rows):
-            for around in _around(frame, declared.payload):
+        for frame in _possible_frames(rows):
+            for around in _variants(frame, declared.payload):
                 whole = replace(declared, framing=around.framing)
-                if whole.size == frame.size and _sensible(whole, around.body(whole)):
-                    return Finding(whole, _words(around, f"{declared.numbers} {declared.kind}"))
+                if whole.size == frame.size and _plausible(whole, around.body(whole)):
+                    return Finding(whole, _describe(around, f"{declared.numbers} {declared.kind}"))
         return None
 
 
@@ -382,7 +373,7 @@ def _rows(values: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
     return values[end - count * size : end].reshape(count, size)
 
 
-def _framed(rows: NDArray[np.uint8]) -> list[_Frame]:
+def _possible_frames(rows: NDArray[np.uint8]) -> list[_Frame]:
     """Frames cut at every possible start or end, the most significant first."""
     still = (rows == rows[0]).all(axis=0)
     modes = rows[0]
@@ -414,7 +405,7 @@ def _framed(rows: NDArray[np.uint8]) -> list[_Frame]:
     return [frame for *_, frame in out[:40]] + [_Frame(rows, Framing())]
 
 
-def _around(frame: _Frame, payload: int | None = None) -> list[_Frame]:
+def _variants(frame: _Frame, payload: int | None = None) -> list[_Frame]:
     """Variants of a frame with leading and trailing bytes that are not numbers excluded."""
     rows, plain = frame.rows, frame.framing
     room = frame.size - len(plain.start) - len(plain.end)
@@ -422,7 +413,7 @@ def _around(frame: _Frame, payload: int | None = None) -> list[_Frame]:
     marked = bool(plain.start or plain.end)
     out: list[_Frame] = []
     for skip in range(5 if marked else 1):
-        if skip and not _idle(rows[:, begin : begin + skip]):
+        if skip and not _constant_or_counting(rows[:, begin : begin + skip]):
             break
         for tail in range(3 if marked else 1):
             if payload is not None and room - skip - tail != payload:
@@ -442,7 +433,7 @@ def _around(frame: _Frame, payload: int | None = None) -> list[_Frame]:
     return out
 
 
-def _idle(columns: NDArray[np.uint8]) -> bool:
+def _constant_or_counting(columns: NDArray[np.uint8]) -> bool:
     """Whether every column is constant or counts frames."""
     for column in columns.T:
         steps = np.diff(column.astype(np.int16)) % 256
@@ -451,26 +442,26 @@ def _idle(columns: NDArray[np.uint8]) -> bool:
     return True
 
 
-def _sensible(layout: Layout, values: NDArray[np.generic]) -> bool:
+def _plausible(layout: Layout, values: NDArray[np.generic]) -> bool:
     """Whether the numbers are credible for a board."""
     if layout.kind in (Kind.FLOATS, Kind.DOUBLES):
-        return _floats(values)
+        return _plausible_floats(values)
     return True
 
 
-def _floats(values: NDArray[np.generic]) -> bool:
+def _plausible_floats(values: NDArray[np.generic]) -> bool:
     with np.errstate(invalid="ignore", over="ignore"):
         size = np.abs(values.astype(np.float64))
         good = (size <= MOST_UT) & ((size >= LEAST_UT) | (size == 0))
         return bool(good.mean() >= 0.97 and (size > 0).any())
 
 
-def _of_frames(rows: NDArray[np.uint8]) -> Finding | None:
+def _find_numbers(rows: NDArray[np.uint8]) -> Finding | None:
     """Assess frames with the first kind of number that makes sense."""
-    frames = _framed(rows)
+    frames = _possible_frames(rows)
     for kind, big in ((Kind.FLOATS, False), (Kind.DOUBLES, False), (Kind.FLOATS, True)):
         for frame in frames:
-            for around in _around(frame):
+            for around in _variants(frame):
                 framing = around.framing
                 probe = Layout(kind, 1, "xyz", big=big)
                 room = around.size - framing.extra
@@ -479,12 +470,12 @@ def _of_frames(rows: NDArray[np.uint8]) -> Finding | None:
                     continue
                 probe = replace(probe, fields="x" * count)
                 values = around.body(probe)
-                if _floats(values):
-                    return _of_floats(around, kind, big, values)
-    return _of_counts(frames)
+                if _plausible_floats(values):
+                    return _describe_floats(around, kind, big, values)
+    return _find_counts(frames)
 
 
-def _of_floats(frame: _Frame, kind: Kind, big: bool, values: NDArray[np.generic]) -> Finding:
+def _describe_floats(frame: _Frame, kind: Kind, big: bool, values: NDArray[np.generic]) -> Finding:
     count = values.shape[1]
     framing = frame.framing
     order = with_or_without(np.asarray(values, np.float64))
@@ -499,29 +490,29 @@ def _of_floats(frame: _Frame, kind: Kind, big: bool, values: NDArray[np.generic]
 
     fits = [f for f in ("txyz", "xyz") if count % len(f) == 0 and count // len(f) <= MAX_CHIPS]
     if order in ("txyz", "xyzt") and count // 4 <= MAX_CHIPS:
-        what = _words(frame, f"{number}, {count // 4} chips with temperatures")
+        what = _describe(frame, f"{number}, {count // 4} chips with temperatures")
         plain = marked and not framing.tail
         whole = replace(layout(order), framing=framing)
         return Finding(whole if plain else None, what, (str(layout(order)),))
     if order == "xyz" and "xyz" in fits:
-        return Finding(None, _words(frame, f"{number}, no temperatures"), (str(layout("xyz")),))
+        return Finding(None, _describe(frame, f"{number}, no temperatures"), (str(layout("xyz")),))
     if len(fits) == 2:
         what = f"{number}: {count // 4} chips with temperatures, or {count // 3} without"
-        return Finding(None, _words(frame, what), tuple(str(layout(f)) for f in fits))
+        return Finding(None, _describe(frame, what), tuple(str(layout(f)) for f in fits))
     if fits == ["txyz"]:
         fits = ["txyz", "xyzt"]
-    return Finding(None, _words(frame, number), tuple(str(layout(f)) for f in fits))
+    return Finding(None, _describe(frame, number), tuple(str(layout(f)) for f in fits))
 
 
-def _of_counts(frames: list[_Frame]) -> Finding | None:
+def _find_counts(frames: list[_Frame]) -> Finding | None:
     """Assess frames of integers: 32 bits if they are small, else 16 bits in the byte order that
     varies least."""
-    wide = _of_wide_counts(frames)
+    wide = _find_wide_counts(frames)
     if wide is not None:
         return wide
     best: tuple[float, _Frame, bool, int] | None = None
     for frame in frames:
-        for around in _around(frame):
+        for around in _variants(frame):
             framing = around.framing
             count, rest = divmod(around.size - framing.extra, 2)
             if rest or count < 3 or (count % 3 and count % 4):
@@ -540,38 +531,38 @@ def _of_counts(frames: list[_Frame]) -> Finding | None:
     if best is None:
         if not frames[0].framing.start and not frames[0].framing.end:
             return None
-        return Finding(None, _words(frames[0], "numbers of a kind that is not known"))
+        return Finding(None, _describe(frames[0], "numbers of a kind that is not known"))
     _, frame, big, count = best
     values = frame.body(Layout(Kind.INT16, 1, "x" * count, big)).astype(np.int32)
     # Values around 32768 come from a converter with unsigned output.
     kind = Kind.UINT16 if float(np.median(np.abs(values))) > UNSIGNED_FROM else Kind.INT16
-    return _named_counts(frame, kind, big, count)
+    return _describe_counts(frame, kind, big, count)
 
 
-def _of_wide_counts(frames: list[_Frame]) -> Finding | None:
+def _find_wide_counts(frames: list[_Frame]) -> Finding | None:
     """Assess frames of 32-bit integers: all are small, which pairs of 16-bit integers never are."""
     for frame in frames:
-        for around in _around(frame):
+        for around in _variants(frame):
             count, rest = divmod(around.size - around.framing.extra, 4)
             if rest or count < 3 or (count % 3 and count % 4):
                 continue
             for big in (False, True):
                 values = around.body(Layout(Kind.INT32, 1, "x" * count, big)).astype(np.int64)
                 if np.abs(values).max() < MOST_COUNTS and np.abs(values).max() > 1:
-                    return _named_counts(around, Kind.INT32, big, count)
+                    return _describe_counts(around, Kind.INT32, big, count)
     return None
 
 
-def _named_counts(frame: _Frame, kind: Kind, big: bool, count: int) -> Finding:
+def _describe_counts(frame: _Frame, kind: Kind, big: bool, count: int) -> Finding:
     fits = [f for f in ("txyz", "xyz") if count % len(f) == 0 and count // len(f) <= MAX_CHIPS]
     declared = [str(Layout(kind, count // len(f), f, big, COUNT_UT, frame.framing)) for f in fits]
     order = "big-endian" if big else "little-endian"
     words = {Kind.INT32: "32-bit integers", Kind.UINT16: "16-bit integers without sign"}
     numbers = f"{count} {order} {words.get(kind, '16-bit integers')}"
-    return Finding(None, _words(frame, numbers), tuple(declared))
+    return Finding(None, _describe(frame, numbers), tuple(declared))
 
 
-def _words(frame: _Frame, numbers: str) -> str:
+def _describe(frame: _Frame, numbers: str) -> str:
     """Describe frames in words."""
     framing = frame.framing
     words = []
@@ -587,7 +578,3 @@ def _words(frame: _Frame, numbers: str) -> str:
     if framing.tail:
         words.append(f"with {framing.tail} bytes behind the numbers that may be a check")
     return f"frames of {frame.size} bytes {' and '.join(words)}: {numbers}"
-
-
-def _of_text(found: TextFinding | None) -> Finding | None:
-    return None if found is None else Finding(found.layout, found.what, found.declare)

@@ -19,7 +19,7 @@ from tactile_core.cli import (
     positive,
     set_up_logging,
 )
-from tactile_core.daemon import Shutdown, leave, run, serve
+from tactile_core.daemon import Shutdown, exit_process, run, serve
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     code = run(teach_parser, words[1:]) if words[:1] == ["teach"] else run(serve_parser, words)
     if argv is None:
-        leave(code)
+        exit_process(code)
     return code
 
 

@@ -85,11 +85,11 @@ def run(
     with Shutdown().listening() as shutdown:
         code = run_command(make_parser(shutdown), argv)
     if argv is None:
-        leave(code)
+        exit_process(code)
     return code
 
 
-def leave(code: int) -> NoReturn:
+def exit_process(code: int) -> NoReturn:
     """End the process with ``code``; the last call of a command.
 
     The interpreter is not shut down step by step: a thread of zenoh or of a driver that re-enters
@@ -177,7 +177,7 @@ def serve(service: Service, shutdown: Shutdown, status: str, work: Callable[[], 
     code = service.verdict(code)
     if not clean:
         log.warning("a thread did not end in time; leaving without it")
-        leave(code)
+        exit_process(code)
     return code
 
 

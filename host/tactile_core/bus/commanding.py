@@ -234,7 +234,7 @@ class Signer:
     def sign(self, service: str, **fields: object) -> dict[str, object]:
         """Sign a request to the arm's ``service``; returns the fields to be sent as JSON."""
         self._number += 1
-        about = _about(service, self.commander, self._number, fields)
+        about = _signed_bytes(service, self.commander, self._number, fields)
         signed = {"commander": self.commander, "number": self._number}
         return fields | signed | {"proof": _proof(self._key, about).hex()}
 
@@ -253,9 +253,9 @@ class CommandDesk:
         self._name = ""
         self._key = b""
         self._clock: RemoteClock | None = None  # None if it is this machine's clock
-        self._until = Instant(0)  # nobody else is granted before
-        self._taken = 0  # sequence of the newest authentic command
-        self._asked = 0  # number of the newest granted request
+        self._reserved_until = Instant(0)  # nobody else is granted before
+        self._last_sequence = 0  # sequence of the newest authentic command
+        self._last_request = 0  # number of the newest granted request
         self._order: Order | None = None
         self._counts: Counter[str] = Counter()
 
@@ -275,7 +275,7 @@ class CommandDesk:
             if not NAME.fullmatch(request.name):
                 self._counts["not_granted"] += 1
                 raise NotGrantedError(f"{request.name[:80]!r} cannot be the name of a commander")
-            if self._commander and now < self._until:
+            if self._commander and now < self._reserved_until:
                 self._counts["not_granted"] += 1
                 raise NotGrantedError(f"commanded by another reachd (reach {self._name!r})")
             own = request.clock == clock_domain()
@@ -283,8 +283,8 @@ class CommandDesk:
             self._commander = f"{request.name}-{secrets.token_hex(4)}"
             self._name, self._key = request.name, key
             self._clock = None if own else RemoteClock()
-            self._until = after(now, FIRST_COMMAND)
-            self._taken = self._asked = 0
+            self._reserved_until = after(now, FIRST_COMMAND)
+            self._last_sequence = self._last_request = 0
             self._order = None
             return Grant(self._commander, key.hex(), "same" if own else "remote")
 
@@ -294,7 +294,7 @@ class CommandDesk:
         with self._lock:
             if not self._commander:
                 return
-            self._prove("release", request, {})
+            self._verify("release", request, {})
             self._forget()
 
     def forget(self) -> None:
@@ -313,13 +313,13 @@ class CommandDesk:
         While the arm has no commander, or one that has long been silent, any request passes.
         """
         with self._lock:
-            if self._commander and (request.commander or now < self._until):
-                self._prove(service, request, fields)
+            if self._commander and (request.commander or now < self._reserved_until):
+                self._verify(service, request, fields)
 
     def hear(self, data: bytes, now: Instant) -> Refusal | None:
         """Check a command received at ``now``; returns and counts the reason if it is refused."""
         with self._lock:
-            found = self._judge(data, now)
+            found = self._check(data, now)
             if isinstance(found, Order):
                 self._order = found
                 return None
@@ -335,7 +335,7 @@ class CommandDesk:
                 return None
             return order
 
-    def _judge(self, data: bytes, now: Instant) -> Order | Refusal:
+    def _check(self, data: bytes, now: Instant) -> Order | Refusal:
         try:
             message = self._codec.decode(COMMAND, data)
         except DecodeError:
@@ -347,10 +347,10 @@ class CommandDesk:
             return "forged"
         # From here on the command is authentic.
         sequence = int(message.sequence)
-        if sequence <= self._taken:
+        if sequence <= self._last_sequence:
             return "repeated"
-        self._taken = sequence
-        self._until = max(self._until, after(now, TAKEOVER))
+        self._last_sequence = sequence
+        self._reserved_until = max(self._reserved_until, after(now, TAKEOVER))
         expiry = float(message.expiry)
         if not 0.0 < expiry <= LONGEST_EXPIRY:
             return "bad_expiry"
@@ -369,23 +369,23 @@ class CommandDesk:
         twist = Twist(float(linear.x), float(linear.y), float(angular.z))
         return Order(twist, self._commander, sequence, stamp, expires)
 
-    def _prove(self, service: str, request: Signed, fields: dict[str, object]) -> None:
+    def _verify(self, service: str, request: Signed, fields: dict[str, object]) -> None:
         """Raise NotGrantedError unless ``request`` is new and the commander's; needs the lock."""
-        about = _about(service, request.commander, request.number, fields)
+        about = _signed_bytes(service, request.commander, request.number, fields)
         good = hmac.compare_digest(_proof(self._key, about).hex().encode(), request.proof.encode())
-        if request.commander != self._commander or not good or request.number <= self._asked:
+        if request.commander != self._commander or not good or request.number <= self._last_request:
             self._counts["not_granted"] += 1
             raise NotGrantedError(
                 f"{service} is for the arm's commander (reach {self._name!r}) while it has one"
             )
-        self._asked = request.number
+        self._last_request = request.number
 
 
 def _proof(key: bytes, data: bytes) -> bytes:
     return hmac.digest(key, data, "sha256")[:PROOF_BYTES]
 
 
-def _about(service: str, commander: str, number: int, fields: dict[str, object]) -> bytes:
+def _signed_bytes(service: str, commander: str, number: int, fields: dict[str, object]) -> bytes:
     plain = {k: float(v) if isinstance(v, int | float) else v for k, v in fields.items()}
     return msgspec.json.encode([service, commander, number, plain], order="sorted")
 

@@ -262,7 +262,7 @@ def open_session(config: BusConfig) -> zenoh.Session:
         for endpoint in config.listen_endpoints():
             path = socket_path(endpoint)
             if path is not None:
-                locks.append(_hold(path, config.role))
+                locks.append(_lock_socket(path, config.role))
         session = _open(settings, config)
         for lock in locks:
             # A service with its own group admits that group; otherwise only the owner is admitted.
@@ -294,7 +294,7 @@ def _prepare_sockets(config: BusConfig) -> Runtime:
     return runtime
 
 
-def _hold(path: Path, role: str) -> SocketLock:
+def _lock_socket(path: Path, role: str) -> SocketLock:
     """Lock a socket until the session has closed."""
     lock = SocketLock(path)
     try:
@@ -305,11 +305,11 @@ def _hold(path: Path, role: str) -> SocketLock:
             "--listen unixsock-stream//FOLDER/NAME.sock"
         ) from error
     if not held:
-        raise BusError(_taken(path, role))
+        raise BusError(_in_use_text(path, role))
     return lock
 
 
-def _taken(path: Path, role: str) -> str:
+def _in_use_text(path: Path, role: str) -> str:
     pid = listener_of(path)
     who = "another process" if pid is None else f"process {pid}"
     return (

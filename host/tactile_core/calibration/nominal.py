@@ -70,10 +70,10 @@ def nominal(
     if model == "finger":
         if magnetometers is not None:
             raise ValueError("magnetometers is a property of anyskin boards alone")
-        return _typical(finger(), serial_number, "finger of the default end-effector")
+        return _with_typical_figures(finger(), serial_number, "finger of the default end-effector")
     if model == "anyskin":
         count = sum(arrays) if magnetometers is None and arrays else magnetometers or ANYSKIN_CHIPS
-        return _typical(_anyskin_controller(count, arrays), serial_number, "AnySkin")
+        return _with_typical_figures(_anyskin_controller(count, arrays), serial_number, "AnySkin")
     raise ValueError(f"no nominal figures for model {model!r}; there are {NOMINAL_MODELS}")
 
 
@@ -87,16 +87,20 @@ def nominal_from_descriptor(descriptor: Descriptor) -> BoardCalibration:
     if descriptor.model == "finger":
         geometry = finger()
         if shapes == [(a.rows, a.columns) for a in geometry.arrays]:
-            return _typical(geometry, descriptor.serial_number, "finger, by its descriptor")
+            return _with_typical_figures(
+                geometry, descriptor.serial_number, "finger, by its descriptor"
+            )
     geometry = SkinGeometry(
         descriptor.model, "ee", tuple(_flat(array) for array in descriptor.arrays)
     )
-    return _typical(
+    return _with_typical_figures(
         geometry, descriptor.serial_number, "flat grids from the descriptor, place unknown"
     )
 
 
-def _typical(geometry: SkinGeometry, serial_number: str, what: str) -> BoardCalibration:
+def _with_typical_figures(
+    geometry: SkinGeometry, serial_number: str, what: str
+) -> BoardCalibration:
     sensitivity = SENSITIVITY_UT_PER_N.get(geometry.model, SENSITIVITY_UT_PER_N["anyskin"])
     return BoardCalibration(
         serial_number=serial_number,

@@ -291,7 +291,7 @@ def info_of(
     watch: Callable[[ChannelRecord, SchemaRecord | None, Message], None] | None = None,
 ) -> LogInfo:
     """Like `info`, for a log in several files, in order. ``watch``: called with every message."""
-    taker = _Taker(LogInfo(paths[0], len(paths)), watch)
+    collector = _Collector(LogInfo(paths[0], len(paths)), watch)
     sizes = [_size(path) for path in paths]
     numbers: list[int] = []
     for index, path in enumerate(paths):
@@ -302,11 +302,11 @@ def info_of(
                 progress(before + done, total)
 
         with LogReader(path, report if progress is not None else None) as reader:
-            taker.take(reader, index > 0)
-        number = taker.result.metadata.get("file", {}).get("file", "")
+            collector.take(reader, index > 0)
+        number = collector.result.metadata.get("file", {}).get("file", "")
         if number.isdecimal():
             numbers.append(int(number))
-    result = taker.finish()
+    result = collector.finish()
     if len(numbers) == len(paths):
         result.missing_files = sorted(set(range(numbers[0], numbers[-1])) - set(numbers))
     return result
@@ -344,7 +344,7 @@ class Extras:
         return not self._amid and key in self._seen
 
 
-class _Taker:
+class _Collector:
     """Collects the information from the files of a log."""
 
     def __init__(
@@ -355,7 +355,7 @@ class _Taker:
         self.result = result
         self._watch = watch
         self._channels: dict[tuple[str, str], ChannelInfo] = {}
-        self._numbers: dict[int, _Taking] = {}  # by channel number in this file
+        self._numbers: dict[int, _ChannelState] = {}  # by channel number in this file
         self._without: set[int] = set()  # channels whose data is no longer needed
         self._repeats = Repeats()
         self._extras = Extras()
@@ -431,13 +431,13 @@ class _Taker:
         unneeded = without if block.packed is None else _Unneeded(self, reader, without)
         for message in reader.messages(block, unneeded):
             number = message.channel
-            taking = numbers.get(number)
-            if taking is None:
+            state = numbers.get(number)
+            if state is None:
                 record = reader.channels.get(number)
                 if record is None:
                     result.orphans += 1
                     continue
-                taking = numbers[number] = _Taking(
+                state = numbers[number] = _ChannelState(
                     self._channel(reader, record),
                     record,
                     reader.schemas.get(record.schema),
@@ -446,7 +446,7 @@ class _Taker:
                 first = True
             else:
                 first = False
-            if taking.latched and self._repeats.is_repeat(taking.key, message) and later:
+            if state.latched and self._repeats.is_repeat(state.key, message) and later:
                 continue
             sequence = message.sequence
             if number != last_channel:
@@ -456,16 +456,16 @@ class _Taker:
             if 1 < (sequence - last) & MASK < HALF and last >= 0:
                 result.numbers_missing += (sequence - last - 1) & MASK
             last = sequence
-            channel = taking.channel
+            channel = state.channel
             channel.take(message, from_start)
             if channel.msgtype == DIAGNOSTICS_TYPE:
                 _take_diagnostics(result, message)
             elif channel.msgtype == EVENT_TYPE:
                 _take_event(result, message)
-            elif not taking.latched:
+            elif not state.latched:
                 without.add(number)
             if first and self._watch is not None:
-                self._watch(taking.record, taking.schema, message)
+                self._watch(state.record, state.schema, message)
         self._number = last_channel, last
 
     def _table(self, record: MetadataRecord, later: bool) -> None:
@@ -498,8 +498,8 @@ class _Unneeded:
     """Channels whose data is not needed, decided before their first message is read, which in a
     large chunk may fill the memory."""
 
-    def __init__(self, taker: _Taker, reader: LogReader, known: set[int]) -> None:
-        self._taker = taker
+    def __init__(self, collector: _Collector, reader: LogReader, known: set[int]) -> None:
+        self._collector = collector
         self._reader = reader
         self._known = known
 
@@ -507,14 +507,14 @@ class _Unneeded:
         if number in self._known:
             return True
         record = self._reader.channels.get(number) if isinstance(number, int) else None
-        if record is None or self._taker.watched or is_latched(record.topic, record.metadata):
+        if record is None or self._collector.watched or is_latched(record.topic, record.metadata):
             return False
         schema = self._reader.schemas.get(record.schema)
         return schema is None or schema.name not in (DIAGNOSTICS_TYPE, EVENT_TYPE)
 
 
 @dataclass(slots=True)
-class _Taking:
+class _ChannelState:
     """State for the messages of one channel of a file."""
 
     channel: ChannelInfo

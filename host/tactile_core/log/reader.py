@@ -375,7 +375,7 @@ class LogReader:
             if after <= position:
                 break
             position = after
-        self._settle_lost_chunk()
+        self._report_lost_chunk()
         self._check_end()
         if self.progress is not None:
             self.progress(self.size, self.size)
@@ -386,10 +386,10 @@ class LogReader:
         ``without``: channels whose messages are returned without data, for counting.
         """
         if block.suspect:
-            yield from self._suspected(block)
+            yield from self._suspect_messages(block)
             return
         if block.packed is not None:
-            yield from self._streamed(block, without)
+            yield from self._streamed_messages(block, without)
             self._read += 1
             return
         data, at, end = block.data, 0, len(block.data)
@@ -405,7 +405,7 @@ class LogReader:
                 count += 1
                 payload = b"" if channel in without else data[at + 31 : after]
                 yield Message(channel, sequence, log_ns, publish_ns, payload)
-            elif not self._take_inner(block, opcode, data[at + 9 : after]):
+            elif not self._handle_inner(block, opcode, data[at + 9 : after]):
                 break
             at = after
         self._read += 1
@@ -592,7 +592,7 @@ class LogReader:
         opcode, length = op.RECORD.unpack(head)
         after = position + 9 + length
         if opcode != op.MESSAGE_INDEX:
-            self._settle_lost_chunk()
+            self._report_lost_chunk()
         unknown_at, self._unknown_at = self._unknown_at, None
         if opcode == op.CHUNK:
             return self._chunk(position, length)
@@ -605,11 +605,11 @@ class LogReader:
         elif opcode == op.DATA_END:
             return self._end_mark(position, length), None
         elif opcode == op.MESSAGE:
-            return after, self._single(position, length)
+            return after, self._unchunked_message(position, length)
         elif opcode in DATA_RECORDS:
             if length > MAX_RECORD:
                 raise BadRecordError(f"a record of {length} bytes")
-            return after, self._small(opcode, self.read_at(position + 9, length))
+            return after, self._small_record(opcode, self.read_at(position + 9, length))
         elif 0 < opcode <= op.DATA_END:
             raise BadRecordError(f"record type {opcode} within the data")
         elif opcode == 0:
@@ -631,7 +631,7 @@ class LogReader:
         self._unknown_at = None
         return self._chunk(position, length)[1]
 
-    def _single(self, position: int, length: int) -> Event | None:
+    def _unchunked_message(self, position: int, length: int) -> Event | None:
         """Read a message outside chunks."""
         if length < op.MESSAGE_FIXED:
             raise BadRecordError("a message is shorter than its fields")
@@ -641,7 +641,7 @@ class LogReader:
             return None
         return Block(position, self.read_at(position, 9 + length), False)
 
-    def _small(self, opcode: int, body: bytes) -> Event | None:
+    def _small_record(self, opcode: int, body: bytes) -> Event | None:
         if opcode == op.METADATA:
             return parse_metadata(body)
         if opcode == op.HEADER:
@@ -663,7 +663,7 @@ class LogReader:
         if schema.number == 0 or known == schema:
             return
         if known is not None:
-            self._differs(op.SCHEMA, schema.number, from_data)
+            self._report_redefinition(op.SCHEMA, schema.number, from_data)
             return
         self._definition_bytes += len(schema.data)
         if self._definition_bytes > MAX_DEFINITIONS:
@@ -681,9 +681,9 @@ class LogReader:
                 raise BadRecordError(f"definitions of over {MAX_DEFINITIONS} bytes in all")
             self.channels[channel.number] = channel
         elif known != channel:
-            self._differs(op.CHANNEL, channel.number, from_data)
+            self._report_redefinition(op.CHANNEL, channel.number, from_data)
 
-    def _differs(self, opcode: int, number: int, from_data: int) -> None:
+    def _report_redefinition(self, opcode: int, number: int, from_data: int) -> None:
         """Report once that definitions differ; a checked summary takes precedence."""
         if from_data and self.summary is not None and self.summary.checked:
             return
@@ -705,7 +705,7 @@ class LogReader:
         if after > self._bytes.end:
             return self._bytes.end, self._cut_chunk(position, packed)
         if head.size > MAX_CHUNK or length > MAX_CHUNK:
-            self._lose_chunk(position, after, head, f"a chunk of {head.size} bytes")
+            self._note_lost_chunk(position, after, head, f"a chunk of {head.size} bytes")
             return after, None
         if self.window is not None and self.summary is not None and self.summary.knows_all_channels:
             first, last = self.window
@@ -723,7 +723,7 @@ class LogReader:
                 verify(self.read_at, packed)
             return after, Block(position, b"", head.crc != 0, packed)
         except BadRecordError as error:
-            self._lose_chunk(position, after, head, str(error))
+            self._note_lost_chunk(position, after, head, str(error))
             if self.keep_suspect and head.compression in COMPRESSIONS and head.size <= MAX_SUSPECT:
                 return after, Block(position, b"", False, packed, suspect=True)
             return after, None
@@ -742,7 +742,7 @@ class LogReader:
         rest = Packed(head, packed.place, max(0, min(end - packed.place, packed.length)))
         return Block(position, b"", False, rest, partial=True)
 
-    def _streamed(self, block: Block, without: Container[int]) -> Iterator[Message]:
+    def _streamed_messages(self, block: Block, without: Container[int]) -> Iterator[Message]:
         """Yield messages while decompressing a chunk, with only the largest one in memory."""
         packed = block.packed
         if packed is None:
@@ -783,9 +783,9 @@ class LogReader:
                 elif opcode in (op.SCHEMA, op.CHANNEL) and length <= MAX_RECORD:
                     if len(held) - at < size:
                         break
-                    self._take_inner(block, opcode, bytes(held[at + 9 : at + size]))
+                    self._handle_inner(block, opcode, bytes(held[at + 9 : at + size]))
                 else:
-                    if not self._take_inner(block, opcode, b""):
+                    if not self._handle_inner(block, opcode, b""):
                         reason = "-"
                         break
                     skip = max(0, at + size - len(held))
@@ -818,7 +818,7 @@ class LogReader:
             reason = reason or "a chunk whose records do not fit into it"
             self.note_damage(Damage(block.offset, 0, reason))
 
-    def _suspected(self, block: Block) -> Iterator[Message]:
+    def _suspect_messages(self, block: Block) -> Iterator[Message]:
         """Yield everything that looks like a message from a damaged chunk."""
         packed = block.packed
         if packed is None:
@@ -827,9 +827,9 @@ class LogReader:
         while at + 9 <= len(data):
             opcode, length = op.RECORD.unpack_from(data, at)
             after = at + 9 + length
-            if opcode == op.MESSAGE and self._likely(data, at, packed.head):
-                if after < len(data) and not self._likely(data, after, packed.head):
-                    following = self._resume(data, at + 31, packed.head)
+            if opcode == op.MESSAGE and self._likely_message(data, at, packed.head):
+                if after < len(data) and not self._likely_message(data, after, packed.head):
+                    following = self._find_message(data, at + 31, packed.head)
                     if following < after:  # its length is wrong: it would include others
                         at = following
                         continue
@@ -842,11 +842,11 @@ class LogReader:
                 with contextlib.suppress(BadRecordError):
                     self._define(opcode, data[at + 9 : after])
             elif not self.channels or not opcode > op.DATA_END or after > len(data):
-                at = self._resume(data, at + 1, packed.head)
+                at = self._find_message(data, at + 1, packed.head)
                 continue
             at = after
 
-    def _likely(self, data: bytes, at: int, head: ChunkHead) -> bool:
+    def _likely_message(self, data: bytes, at: int, head: ChunkHead) -> bool:
         """Whether a message can begin here: of a known channel, at a time within its chunk."""
         if at + 31 > len(data):
             return False
@@ -858,15 +858,15 @@ class LogReader:
             and head.start_ns <= log_ns <= head.end_ns
         )
 
-    def _resume(self, data: bytes, at: int, head: ChunkHead) -> int:
+    def _find_message(self, data: bytes, at: int, head: ChunkHead) -> int:
         """Position of the next likely message; the end if there is none."""
         while (at := data.find(op.MESSAGE, at)) >= 0:
-            if self._likely(data, at, head):
+            if self._likely_message(data, at, head):
                 return at
             at += 1
         return len(data)
 
-    def _take_inner(self, block: Block, opcode: int, body: bytes) -> bool:
+    def _handle_inner(self, block: Block, opcode: int, body: bytes) -> bool:
         """Handle a record within a chunk that is not a message; False if the rest is lost."""
         if opcode in (op.SCHEMA, op.CHANNEL):
             try:
@@ -882,11 +882,11 @@ class LogReader:
             return False
         return True
 
-    def _lose_chunk(self, position: int, after: int, head: ChunkHead, reason: str) -> None:
+    def _note_lost_chunk(self, position: int, after: int, head: ChunkHead, reason: str) -> None:
         """Note a lost chunk; the indexes after it tell how many messages it had."""
         self._lost_chunk = Damage(position, after - position, reason, 0, head.start_ns, head.end_ns)
 
-    def _settle_lost_chunk(self) -> None:
+    def _report_lost_chunk(self) -> None:
         lost, self._lost_chunk = self._lost_chunk, None
         kept, self._suspect_kept = self._suspect_kept, 0
         if lost is not None:
@@ -941,7 +941,7 @@ class LogReader:
     def _skip(self, position: int, reason: str) -> int:
         """Skip an unreadable part: one record if its length leads to another, otherwise everything
         up to the next chunk or the end of the data."""
-        self._settle_lost_chunk()
+        self._report_lost_chunk()
         head = self.read_at(position, 9)
         after = position + 9 + op.RECORD.unpack(head)[1] if len(head) == 9 else self._bytes.end
         messages = None

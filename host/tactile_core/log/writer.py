@@ -316,7 +316,7 @@ class LogWriter:
                 self._pending = self._chunk.seal(self._compressor)
                 self._chunk = ChunkBuffer()
             if self._ready(last):
-                self._write_waiting()
+                self._write_pending()
         except OSError as error:
             self._fail(error)
         except Exception as error:  # noqa: BLE001 - any error: the log continues without this
@@ -336,7 +336,9 @@ class LogWriter:
         if self._file is not None:
             self._file.forget()
         log.error("log: the writer failed", exc_info=error)
-        self._leave(WRITER_FAILED, f"{type(error).__name__}: {error}", "going on in another file")
+        self._leave_file(
+            WRITER_FAILED, f"{type(error).__name__}: {error}", "going on in another file"
+        )
 
     def finish(self) -> None:
         """Finish the file after the last flush; ``state`` becomes closed unless something went
@@ -413,7 +415,7 @@ class LogWriter:
         self._opened = time.monotonic()
         self.files += 1
 
-    def _write_waiting(self) -> None:
+    def _write_pending(self) -> None:
         """Write everything pending at once: fewer calls keep other threads waiting less."""
         file, pending = self._file, self._pending
         if file is None:
@@ -489,7 +491,7 @@ class LogWriter:
         """Leave a file that cannot be continued, and try another one later."""
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         remedy = "make room" if full else "check the disk; trying another file"
-        self._leave(
+        self._leave_file(
             "disk_full" if full else "io_error", f"{self.path}: {error.strerror or error}", remedy
         )
 
@@ -498,9 +500,9 @@ class LogWriter:
         free = self._storage.free(self._set.directory) / 1e9
         kept = self._settings.min_free_bytes / 1e9
         text = f"{free:.2f} GB free in {self._set.directory}, logs stop at {kept:.2f}"
-        self._leave("low_space", text, "make room")
+        self._leave_file("low_space", text, "make room")
 
-    def _leave(self, reason: str, text: str, remedy: str) -> None:
+    def _leave_file(self, reason: str, text: str, remedy: str) -> None:
         if self.state != reason:
             log.error("log: %s; %s", text, remedy)
         self.state, self.last_error = reason, text

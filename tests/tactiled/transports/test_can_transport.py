@@ -51,7 +51,7 @@ def test_bus_specs_of_the_readme_are_accepted(text: str, spec: CanSpec) -> None:
 @pytest.mark.parametrize("text", ["", "can0", "socketcan:", ":can0", "slcan:/dev/x@fast",
                                   "slcan:/dev/x@0", "virtual:0+FD", "slcan:/dev/x@-5"])  # fmt: skip
 def test_invalid_bus_is_refused_with_expected_form(text: str) -> None:
-    with pytest.raises(ValueError, match="expected INTERFACE:CHANNEL|allowed: a positive number"):
+    with pytest.raises(ValueError, match=r"expected INTERFACE:CHANNEL|allowed: a positive number"):
         CanTransport(text)
 
 
