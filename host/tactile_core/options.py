@@ -46,7 +46,7 @@ class BusTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     tls: TlsConfig | None = None
     insecure: Annotated[
         bool,
-        Meta(description="ask nobody for a proof; whoever reaches an endpoint may command"),
+        Meta(description="no authentication: whoever reaches an endpoint may command"),
     ] = False
 
 

@@ -27,17 +27,17 @@ class Roles(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """Certificate names of each role; a name in no list has no rights."""
 
     tactiled: Annotated[
-        tuple[str, ...], Meta(description="certificate names of those that publish boards")
+        tuple[str, ...], Meta(description="certificate names of processes that publish boards")
     ] = ()
     reachd: Annotated[
-        tuple[str, ...], Meta(description="certificate names of those that command arms")
+        tuple[str, ...], Meta(description="certificate names of processes that command arms")
     ] = ()
     arm: Annotated[tuple[str, ...], Meta(description="certificate names of arm drivers")] = ()
     operator: Annotated[
-        tuple[str, ...], Meta(description="certificate names of those who may ask for all")
+        tuple[str, ...], Meta(description="certificate names with all requests allowed")
     ] = ()
     viewer: Annotated[
-        tuple[str, ...], Meta(description="certificate names of those who may only look")
+        tuple[str, ...], Meta(description="certificate names with read access only")
     ] = ()
 
     def table(self) -> dict[CertificateRole, tuple[str, ...]]:

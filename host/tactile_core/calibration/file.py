@@ -89,7 +89,7 @@ Numbers = tuple[float, ...]
 class ForceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``[array.force]``: force of a taxel = own block · its field + coupling · others' fields."""
 
-    kind: Annotated[Literal["linear"], Meta(description="law of force and field")]
+    kind: Annotated[Literal["linear"], Meta(description="relation of force and field")]
     own_n_per_ut: Annotated[
         list[Nine], unit("N/µT"), Meta(description="3 × 3 block of each taxel, row-major")
     ]
@@ -104,13 +104,11 @@ class ArrayTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """``[[array]]``: one array of rows × columns taxels. Vectors in taxel axes, z outward."""
 
     name: Annotated[Text, Meta(description="name of the array, in printable characters")]
-    side: Annotated[
-        Literal["left", "right", "tip"], Meta(description="side of the finger it is on")
-    ]
+    side: Annotated[Literal["left", "right", "tip"], Meta(description="side of the finger")]
     rows: Annotated[int, Meta(ge=1, le=MAX_TAXELS, description="rows of taxels")]
-    columns: Annotated[int, Meta(ge=1, le=MAX_TAXELS, description="taxels of a row")]
+    columns: Annotated[int, Meta(ge=1, le=MAX_TAXELS, description="taxels per row")]
     posed: Annotated[
-        bool, Meta(description="whether the places below are known; false: they are a guess")
+        bool, Meta(description="whether the places below are known or (false) a guess")
     ] = True
     position_m: Annotated[
         list[Three], unit("m"), Meta(description="x, y, z of each taxel in `frame`")
@@ -122,7 +120,7 @@ class ArrayTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         list[Two], unit("m"), Meta(description="u, v of each taxel on the unrolled skin")
     ]
     chip_yaw_deg: Annotated[
-        tuple[Degrees, ...], unit("°"), Meta(description="how each chip is turned about its z")
+        tuple[Degrees, ...], unit("°"), Meta(description="rotation of each chip about its z")
     ]
     reference_c: Annotated[Celsius, Meta(description="temperature of `rest_ut`")]
     rest_ut: Annotated[
@@ -137,34 +135,32 @@ class ArrayTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 class RestTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``rest`` of a model: when the skin counts as untouched, and how its rest field follows."""
 
-    near_ut: Annotated[float, unit("µT"), Meta(description="greatest distance from the rest field")]
+    near_ut: Annotated[float, unit("µT"), Meta(description="largest distance from the rest field")]
     still_ut: Annotated[
-        float, unit("µT"), Meta(description="greatest distance from the mean of the last second")
+        float, unit("µT"), Meta(description="largest distance from the mean of the last second")
     ]
-    tau_s: Annotated[Seconds, Meta(description="time constant with which the rest field follows")]
+    tau_s: Annotated[Seconds, Meta(description="time constant of the tracked rest field")]
 
 
 class LayerTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``[[net.layer]]``: one layer of the readout; the last one is linear to the targets."""
 
-    kind: Annotated[Literal["linear", "tanh", "rbf"], Meta(description="what it computes")]
-    columns: Annotated[
-        int, Meta(ge=1, le=MAX_FEATURES, description="numbers of each row of `weights`")
-    ]
+    kind: Annotated[Literal["linear", "tanh", "rbf"], Meta(description="function of the layer")]
+    columns: Annotated[int, Meta(ge=1, le=MAX_FEATURES, description="numbers per row of `weights`")]
     weights: Annotated[
         list[list[float]],
         Meta(max_length=MAX_FEATURES, description="input × output, or the centres of rbf"),
     ]
     bias: Annotated[
-        Numbers, Meta(max_length=MAX_UNITS, description="of each output; of rbf: gamma")
+        Numbers, Meta(max_length=MAX_UNITS, description="bias of each output; for rbf: gamma")
     ]
 
 
 class FigureTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``[[net.figure]]``: one error figure of a model."""
 
-    name: Annotated[Text, Meta(description="what it is")]
-    value: Annotated[float, Meta(description="the figure")]
+    name: Annotated[Text, Meta(description="name of the figure")]
+    value: Annotated[float, Meta(description="value of the figure")]
     unit: Annotated[Text, Meta(description="its unit")]
     how: Annotated[Text, Meta(description="how it was obtained")]
 
@@ -172,23 +168,23 @@ class FigureTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 class NetTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``[[net]]``: a fitted model of the contact as a whole (since version 2)."""
 
-    recipe: Annotated[Text, Meta(description="what the fit was called")]
+    recipe: Annotated[Text, Meta(description="name of the fit")]
     targets: Annotated[
         tuple[str, ...],
-        Meta(min_length=1, description=f"what it predicts: {', '.join(TARGET_UNITS)}"),
+        Meta(min_length=1, description=f"predicted values: {', '.join(TARGET_UNITS)}"),
     ]
     units: Annotated[
-        tuple[str, ...], Meta(min_length=1, description="unit of each target: N, of places mm")
+        tuple[str, ...], Meta(min_length=1, description="unit of each target: N, or mm for places")
     ]
     floor: Annotated[
         tuple[MinusInfinity, ...], Meta(description="least value of each target, -inf for none")
     ]
     delay_s: Annotated[
-        Seconds, Meta(description="delay of the labels behind the field, taken out in the fit")
+        Seconds, Meta(description="delay of the labels behind the field, removed in the fit")
     ]
     rest: RestTable | None = None
     components: Annotated[
-        int, Meta(ge=1, le=MAX_CHANNELS, description="numbers of each row of `projection`")
+        int, Meta(ge=1, le=MAX_CHANNELS, description="numbers per row of `projection`")
     ]
     projection: Annotated[
         list[list[float]],
@@ -196,7 +192,7 @@ class NetTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         Meta(max_length=MAX_CHANNELS, description="channels (x, y, z of each taxel) × components"),
     ]
     degree: Annotated[
-        int, Meta(ge=1, le=MAX_DEGREE, description="most factors of a product of components")
+        int, Meta(ge=1, le=MAX_DEGREE, description="most factors in a product of components")
     ]
     curved: Annotated[int, Meta(ge=0, description="components whose products are features")]
     taus_s: Annotated[
@@ -207,7 +203,7 @@ class NetTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     radii: Annotated[Numbers, Meta(max_length=MAX_TERMS, description="radii of the play operators")]
     lagged: Annotated[int, Meta(ge=0, description="components whose history is a feature")]
     lag_degree: Annotated[
-        int, Meta(ge=0, le=3, description="powers of the first component that history is times")
+        int, Meta(ge=0, le=3, description="highest power of the first component times history")
     ]
     direction: Annotated[
         bool, Meta(description="whether the direction of the components is a feature")
@@ -225,14 +221,14 @@ class NetTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 class CalibrationFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A calibration of one board."""
 
-    format: Annotated[Literal["tactile-calibration"], Meta(description="what the file is")]
+    format: Annotated[Literal["tactile-calibration"], Meta(description="type of the file")]
     format_version: Annotated[
         int, Meta(ge=1, le=FORMAT_VERSION, description="version of the format")
     ]
-    serial_number: Annotated[Text, Meta(description="of the board, in printable characters")]
-    model: Annotated[Text, Meta(description="of the board, in printable characters")]
+    serial_number: Annotated[Text, Meta(description="serial number, in printable characters")]
+    model: Annotated[Text, Meta(description="model, in printable characters")]
     frame: Annotated[Text, Meta(description="frame of the places, in printable characters")]
-    created: Annotated[Text, Meta(description="when, ISO 8601")]
+    created: Annotated[Text, Meta(description="date and time, ISO 8601")]
     provenance: Annotated[Text, Meta(description="how the figures were obtained")]
     nominal: Annotated[
         bool, Meta(description="whether they are typical figures, not measured on this board")

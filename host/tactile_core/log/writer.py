@@ -139,36 +139,38 @@ class RecorderSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     """``[log.recorder]``: how logs are cut, kept and bounded."""
 
     split_bytes: Annotated[
-        Bytes, Meta(gt=0, description="a new file begins when this one is larger")
+        Bytes, Meta(gt=0, description="a new file begins when the current one is larger")
     ] = 1 << 30
     split_seconds: Annotated[
-        Duration, Meta(description="a new file begins when this one is older")
+        Duration, Meta(description="a new file begins when the current one is older")
     ] = 3600.0
     min_free_bytes: Annotated[
-        Bytes, Meta(ge=0, description="logging stops, loudly, when less is free on the disk")
+        Bytes, Meta(ge=0, description="logging stops with an error when less is free on the disk")
     ] = 1 << 30
     max_files: Annotated[
         Count | None,
-        Meta(description="the oldest files of a name go when there are more; left out: all stay"),
+        Meta(description="most files of a name, the oldest are deleted; default: all are kept"),
     ] = None
     max_bytes: Annotated[
         Annotated[Bytes, Meta(gt=0)] | None,
-        Meta(description="the oldest files of a name go when all of them take more"),
+        Meta(description="most bytes of all files of a name, the oldest are deleted"),
     ] = None
     flush_period: Annotated[
         Seconds,
-        Meta(gt=0, le=0.5, description="what `kill -9` may cost, plus the time of one write"),
+        Meta(
+            gt=0, le=0.5, description="longest time lost to `kill -9`, plus the time of one write"
+        ),
     ] = 0.25
     chunk_bytes: Annotated[
-        Bytes, Meta(gt=0, description="a chunk is written when it is larger, before its time")
+        Bytes, Meta(gt=0, description="a larger chunk is written before the flush period ends")
     ] = 1 << 20
     queue_messages: Annotated[
         Count,
-        Meta(description="messages that may wait; the default is 27 s of one board at 100 Hz"),
+        Meta(description="messages that may be queued; default: 27 s of one board at 100 Hz"),
     ] = 16384
-    queue_bytes: Annotated[Bytes, Meta(gt=0, description="bytes that may wait")] = 64 << 20
+    queue_bytes: Annotated[Bytes, Meta(gt=0, description="bytes that may be queued")] = 64 << 20
     retry_seconds: Annotated[
-        Duration, Meta(description="first pause before a file that failed is opened again")
+        Duration, Meta(description="first pause before a failed file is opened again")
     ] = 1.0
 
 
