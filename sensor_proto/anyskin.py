@@ -86,8 +86,7 @@ class Search:
         return self._first_frame(count, 2)
 
     def new(self, counts: Iterable[int]) -> tuple[int, int] | None:
-        """Offset of the first of `LOCK_FRAMES` consecutive frames, and their number of
-        magnetometers."""
+        """Offset of the first of `LOCK_FRAMES` consecutive frames, and their magnetometers."""
         if not len(self._ends) or not self._plausible_at.any():
             return None
         for count in counts:
@@ -198,8 +197,10 @@ MAX_FIELD_UT = 1e6
 
 
 def encode_anyskin(samples: FloatSamples) -> bytes:
-    """Encode one frame. Raises ValueError unless it has 1 to 20 magnetometers, each with a
-    temperature."""
+    """Encode one frame.
+
+    Raises ValueError unless it has 1 to 20 magnetometers, each with a temperature.
+    """
     n = len(samples.temperature_c)
     if not 1 <= n <= MAX_MAGNETOMETERS or samples.field_ut.shape != (n, 3):
         raise ValueError(
@@ -268,8 +269,10 @@ class AnySkinDecoder:
         return bursts
 
     def _feed(self, piece: bytes, fed: int, later: int, bursts: list[FloatBurst]) -> None:
-        """Process one piece. ``fed``: bytes of the whole chunk; ``later``: those of them after the
-        piece."""
+        """Process one piece.
+
+        ``fed``: bytes of the whole chunk; ``later``: those of them after the piece.
+        """
         buffer = self._buffer + piece
         at = 0
         while True:
@@ -292,8 +295,7 @@ class AnySkinDecoder:
         self._buffer = buffer[at:]
 
     def _search(self, data: bytes) -> tuple[int, int] | None:
-        """Offset of a frame in ``data`` and its number of magnetometers; None to wait for more
-        data."""
+        """Offset of a frame in ``data`` and its magnetometers; None to wait for more data."""
         search = Search(data)
         if self._count is not None:
             start = search.known(self._count)
@@ -307,8 +309,10 @@ class AnySkinDecoder:
     def _append_frames(
         self, buffer: bytes, at: int, later: int, fed: int, bursts: list[FloatBurst]
     ) -> int:
-        """Append the frames from ``at`` on and return the bytes consumed. Unlock where they stop
-        fitting."""
+        """Append the frames from ``at`` on and return the bytes consumed.
+
+        Unlock where they stop fitting.
+        """
         n = self._count or 0
         size = frame_size(n)
         whole = (len(buffer) - at) // size
@@ -341,8 +345,10 @@ class AnySkinDecoder:
         return fitting * size
 
     def _trusted_frames(self, temperature_c: NDArray[np.float32]) -> int:
-        """Number of frames up to the one at which the temperatures, (k, n) °C, cast doubt on the
-        boundary."""
+        """Number of frames up to the one, if any, that casts doubt on the boundary.
+
+        ``temperature_c``: (k, n) °C.
+        """
         with np.errstate(invalid="ignore"):
             likely = plausible(temperature_c).mean(axis=1) >= 0.5
         for i, good in enumerate(likely.tolist()):

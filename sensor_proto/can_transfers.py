@@ -199,8 +199,10 @@ class CanEncoder:
         self._next: dict[MessageType, int] = {}
 
     def encode(self, message: Message) -> tuple[CanFrame, ...]:
-        """Frames of the transfer that carries ``message``. Raises ValueError if a value does not
-        fit."""
+        """Frames of the transfer that carries ``message``.
+
+        Raises ValueError if a value does not fit.
+        """
         kind = message_type(message)
         raw = pack(message, self._board)
         transfer = self._next.get(kind, 0)

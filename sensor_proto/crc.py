@@ -77,8 +77,10 @@ def crc32c(data: bytes | bytearray | memoryview) -> int:
 
 
 def crc32c_each(packets: Sequence[bytes]) -> NDArray[np.uint32]:
-    """CRC-32C of each packet, (k,). Raises ValueError for an empty packet or one longer than
-    `BLOCK`."""
+    """CRC-32C of each packet, (k,).
+
+    Raises ValueError for an empty packet or one longer than `BLOCK`.
+    """
     sizes = np.fromiter(map(len, packets), dtype=np.intp, count=len(packets))
     if not len(sizes):
         return np.empty(0, dtype=np.uint32)

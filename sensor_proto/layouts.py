@@ -472,8 +472,10 @@ class Tokens:
 
 
 def tokens(line: bytes) -> Tokens:
-    """Split a line into tokens. Adjoining numbers are separated by their equal number of
-    decimals."""
+    """Split a line into tokens.
+
+    Adjoining numbers are separated by their equal number of decimals.
+    """
     pattern = _TOKEN
     if _GLUED.search(line):
         places = len(line.rstrip(b" \t,;]").rpartition(b".")[2])
@@ -548,8 +550,7 @@ class TextDecoder:
 
     @property
     def counters(self) -> dict[str, int]:
-        """Lines (frames) accepted, times their form was lost, and bytes of lines that did not
-        fit."""
+        """Lines (frames) accepted, times their form was lost, and bytes of rejected lines."""
         return self._tally.snapshot()
 
     def reset(self) -> None:
@@ -724,8 +725,7 @@ class LayoutDecoder:
         self._suspect = self._astray = 0
 
     def feed(self, data: bytes, /) -> list[Received]:
-        """Return the frames completed by ``data``; the first after a lock also include those held
-        back."""
+        """Return the frames completed by ``data``, and after a lock those held back."""
         out: list[Received] = []
         if self._bare or self._weak:
             self._synchronise_on_read(data)
@@ -772,8 +772,10 @@ class LayoutDecoder:
             self._buffer, self._locked = b"", False
 
     def _take(self, buffer: bytes, at: int, later: int, fed: int, out: list[Received]) -> int:
-        """Append the frames from ``at`` on and return the bytes consumed. Unlock where they stop
-        fitting."""
+        """Append the frames from ``at`` on and return the bytes consumed.
+
+        Unlock where they stop fitting.
+        """
         size = self._size
         whole = (len(buffer) - at) // size
         if not whole:
@@ -920,8 +922,7 @@ class LayoutDecoder:
         return None if best is None else best[1]
 
     def _count_frames(self, buffer: bytes, start: int) -> int:
-        """Number of consecutive frames from ``start`` on that fit and are plausible, up to a
-        maximum."""
+        """Number of consecutive plausible frames from ``start`` on, up to a maximum."""
         most = 2 * LOCK_FRAMES if self._weak else LOCK_FRAMES
         whole = min((len(buffer) - start) // self._size, most)
         if not whole:

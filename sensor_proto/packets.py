@@ -655,7 +655,7 @@ def pack(message: Message, board: int = 0) -> bytes:
 
 
 def shape_error(packet: bytes) -> Reject | None:
-    """Reason to reject ``packet`` by its size alone, before its CRC is computed; None if there is
+    """Reason to reject ``packet`` by its size, before its CRC is computed; None if there is
     none."""
     size = len(packet)
     if size < OVERHEAD:
@@ -668,8 +668,7 @@ def shape_error(packet: bytes) -> Reject | None:
 
 
 def intact(packets: Sequence[bytes]) -> list[bool]:
-    """Whether the CRC of each packet (8 to `MAX_PACKET` bytes) is right; cheapest for many at
-    once."""
+    """Whether the CRC of each packet (8 to `MAX_PACKET` bytes) is right; cheapest in bulk."""
     if len(packets) == 1:
         return [crc32c(packets[0]) == RESIDUE]
     good: list[bool] = (crc32c_each(packets) == RESIDUE).tolist()

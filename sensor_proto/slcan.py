@@ -97,8 +97,10 @@ def encode_frame(frame: CanFrame) -> bytes:
 
 
 def decode_frame(line: bytes) -> CanFrame | Rejected:
-    """Decode a line without its CR: the frame, or why it was rejected. Ignores a time stamp at the
-    end."""
+    """Decode a line without its CR: the frame, or why it was rejected.
+
+    Ignores a time stamp at the end.
+    """
     letter = line[:1]
     if letter not in _EXTENDED or not letter:
         return Rejected.STANDARD_ID if letter and letter in b"tdb" else _not_data(letter)
@@ -126,8 +128,10 @@ def _not_data(letter: bytes) -> Rejected:
 
 
 class SlcanDecoder:
-    """Decodes an adapter's output, in any chunks, to frames, error frames and answers. Never
-    raises."""
+    """Decodes an adapter's output, in any chunks, to frames, error frames and answers.
+
+    Never raises.
+    """
 
     def __init__(self) -> None:
         self._buffer = bytearray()

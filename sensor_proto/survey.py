@@ -105,8 +105,7 @@ def _records(taken: list[Tokens]) -> tuple[list[Tokens], int]:
 
 
 def _lead(values: np.ndarray) -> tuple[int, int]:
-    """Count of numbers before those of the chips (a growing clock or counter), and of the
-    others."""
+    """Count of leading numbers (a growing clock or counter), and of those of the chips."""
     count = values.shape[1]
     first = values[:, 0]
     grows = bool((np.diff(first) > 0).all() and (first == np.round(first)).all())
@@ -505,8 +504,10 @@ def _describe_floats(frame: _Frame, kind: Kind, big: bool, values: NDArray[np.ge
 
 
 def _find_counts(frames: list[_Frame]) -> Finding | None:
-    """Assess frames of integers: 32 bits if they are small, else 16 bits in the byte order that
-    varies least."""
+    """Assess frames of integers.
+
+    They have 32 bits if they are small, otherwise 16 bits in the byte order that varies least.
+    """
     wide = _find_wide_counts(frames)
     if wide is not None:
         return wide

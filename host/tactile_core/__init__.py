@@ -1,2 +1,1 @@
-"""Shared by daemons, simulator and tools: time, topics, messages, sessions, calibrations and
-logs."""
+"""Shared by daemons, simulator and tools: time, topics, messages, sessions, calibration, logs."""

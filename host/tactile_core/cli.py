@@ -119,8 +119,10 @@ class Formatter(argparse.HelpFormatter):
         super().__init__(prog, **({"max_help_position": 26} | options))
 
     def add_argument(self, action: argparse.Action) -> None:
-        """Add a line. Commands are indented two columns more, which argparse does not account
-        for."""
+        """Add a line.
+
+        Commands are indented two columns more, which argparse does not account for.
+        """
         super().add_argument(action)
         if isinstance(action, argparse._SubParsersAction):
             self._action_max_length += 2
@@ -604,8 +606,8 @@ def _add_bus(group: Adding, role: str) -> None:
     add(
         "--insecure",
         action="store_true",
-        help="ask nobody who joins for a proof, and allow endpoints that leave this machine: "
-        "whoever reaches them may read and command; all of a rig say it, or none",
+        help="no authentication, and endpoints beyond this machine are allowed: "
+        "whoever reaches them may read and command; give it to all of a rig or to none",
     )
 
 
@@ -620,8 +622,10 @@ Report = Callable[[int, int], None]
 
 @contextmanager
 def progress(what: str, unit: str = "bytes") -> Iterator[Report | None]:
-    """Progress bar on a terminal, removed at the end; yields None elsewhere. ``unit``: "bytes" or
-    "items"."""
+    """Progress bar on a terminal, removed at the end; yields None elsewhere.
+
+    ``unit``: "bytes" or "items".
+    """
     if not sys.stderr.isatty():
         yield None
         return

@@ -601,8 +601,10 @@ class Key:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """Description of one table of a file: header (empty for the top-level keys), meaning and
-    keys."""
+    """Description of one table of a file.
+
+    ``header``: empty for the top-level keys.
+    """
 
     header: str
     meaning: str
@@ -768,8 +770,7 @@ class _Scanner:
         return self.text.startswith(token, self.at)
 
     def string(self) -> str:
-        """Skip a quoted string and return its raw text, which is the key itself unless it has
-        escapes."""
+        """Skip a quoted string; returns its raw text, the key itself unless it has escapes."""
         quote = self.text[self.at]
         if self.text[self.at : self.at + 3] in MULTILINE_QUOTES:
             quote = self.text[self.at : self.at + 3]

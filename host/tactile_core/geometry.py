@@ -71,8 +71,10 @@ class ArrayGeometry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkinGeometry:
-    """All arrays of one board, in the order of their numbers. ``frame``: name of the frame
-    ``ee``."""
+    """All arrays of one board, in the order of their numbers.
+
+    ``frame``: name of the frame ``ee``.
+    """
 
     model: str
     frame: str

@@ -19,8 +19,10 @@ class Throttle:
         self._at: Instant | None = None
 
     def allow(self, now: Instant) -> bool:
-        """Whether a message may be sent now; counts it if not. An earlier ``now`` changes
-        nothing."""
+        """Whether a message may be sent now; counts it if not.
+
+        An earlier ``now`` changes nothing.
+        """
         if not self.ready(now):
             self.held += 1
             return False

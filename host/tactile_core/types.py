@@ -67,8 +67,10 @@ class WallClock:
 
     @classmethod
     def take(cls) -> WallClock:
-        """Read both clocks now. Monotonic reads before and after the wall-clock read bound the
-        error."""
+        """Read both clocks now.
+
+        Monotonic reads before and after the wall-clock read bound the error.
+        """
         before = time.monotonic_ns()
         wall = time.time_ns()
         return cls.reading(wall, (before + time.monotonic_ns()) // 2)

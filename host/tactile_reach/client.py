@@ -134,7 +134,7 @@ class Stream(Generic[T]):
         return message
 
     def get(self, timeout_s: float | None = 0.0) -> T | None:
-        """Return the next message, or None if none arrives within ``timeout_s`` (None: wait
+        """Return the next message; None if there is none within ``timeout_s`` (None: wait
         forever)."""
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
@@ -240,7 +240,7 @@ class Board:
         return Path(self._ask("record", request, RECORD_S)["path"])
 
     def stop_recording(self) -> dict[str, Any]:
-        """Stop the recording; returns ``path``, ``messages``, ``bytes``, ``seconds`` and
+        """Stop recording; returns ``path``, ``messages``, ``bytes``, ``seconds`` and
         ``dropped``."""
         return dict(self._ask("record", {"action": "stop"}, RECORD_S))
 
@@ -275,7 +275,7 @@ class Reach:
     def goal(
         self, x: float, y: float, *, radius: float | None = None, time_limit: float | None = None
     ) -> None:
-        """Reach for a target: m in ``cupboard``, s; radius and time limit default to its
+        """Reach for a target in ``cupboard`` (m, s); radius and time limit default to its
         settings."""
         self._ask("goal", {"x": x, "y": y, "radius": radius, "time_limit": time_limit})
 
@@ -407,8 +407,10 @@ class Bus:
 
 
 def type_of(sample: zenoh.Sample) -> str:
-    """Message type of a sample. Raises `DecodeError` if neither sender nor table of topics gives
-    one."""
+    """Message type of a sample.
+
+    Raises `DecodeError` if neither sender nor table of topics gives one.
+    """
     _, _, schema = str(sample.encoding).partition(";")
     if schema:
         return schema

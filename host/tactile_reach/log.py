@@ -109,8 +109,7 @@ class Log(Mapping[str, Table]):
         return len(self.tables)
 
     def board(self, name: str) -> dict[str, Table]:
-        """Tables of one board by the last word of their topic: features, forces, field and so
-        on."""
+        """Tables of one board by the last word of their topic, such as features or forces."""
         head = f"/tactile/{name}/"
         found = {t.removeprefix(head): table for t, table in self.tables.items() if head in t}
         if not found:
@@ -258,8 +257,7 @@ def _time(get: Callable[[Any], Any]) -> Callable[[Any], int]:
 
 
 def _column(values: list[Any]) -> NDArray[Any]:
-    """Build a column: numbers and text directly, lists of equal length stacked, others as
-    objects."""
+    """Build a column: plain values, stacked lists of equal length, or an array of objects."""
     if values and isinstance(values[0], np.ndarray):
         if len({len(each) for each in values}) == 1:
             return np.stack(values)

@@ -1,2 +1,4 @@
-"""Helpers shared by several test folders. Import as ``from tests.support.waiting import
-wait_until``."""
+"""Helpers shared by several test folders.
+
+Import as ``from tests.support.waiting import wait_until``.
+"""

@@ -89,8 +89,10 @@ def claim(session: zenoh.Session, name: str = "test", clock: str | None = None) 
 
 
 class Cupboard:
-    """A running ``simdevice cupboard`` and a session on its bus. ``states``: all received
-    states."""
+    """A running ``simdevice cupboard`` and a session on its bus.
+
+    ``states``: all received states.
+    """
 
     def __init__(self, folder: Path, scene: str, *arguments: str) -> None:
         self.folder = folder
@@ -136,8 +138,7 @@ class Cupboard:
         )
 
     def reset(self) -> None:
-        """Bring the arm to rest, make it free for another commander, and put everything back in
-        place."""
+        """Bring the arm to rest, free its command, and put everything back in place."""
         self.rest()
         wait_until(lambda: not self.owned())
         self.call("reset", kind="world")

@@ -19,8 +19,7 @@ SECONDS = 3.0
 
 
 def crowded(objects: int = 12) -> Scene:
-    """A scene that is crowded at the front edge, reduced for speed, with its target near the
-    front."""
+    """A scene crowded at the front edge, reduced for speed, with its target near the front."""
     scene = generate("authors_sim", 29)
     near = sorted(scene.objects, key=lambda o: abs(o.y) + o.x)[:objects]
     return replace(scene, objects=tuple(near), goal=(0.16, 0.0))

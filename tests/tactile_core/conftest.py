@@ -135,8 +135,7 @@ def disk() -> FragileDisk:
 
 @pytest.fixture
 def record(disk: FragileDisk) -> Iterator[Callable[..., Recorder]]:
-    """``record(path, **settings)``: a recorder on ``disk`` with quick flushes, closed after the
-    test."""
+    """``record(path, **settings)``: a recorder on ``disk`` with quick flushes."""
     recorders = []
 
     def start(path: Path, **settings: Any) -> Recorder:

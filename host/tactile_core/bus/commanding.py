@@ -115,13 +115,14 @@ was. ``late``: older than its expiry on arrival. ``future``: decided after now."
 
 
 class NotGrantedError(Exception):
-    """The arm's command, or a request reserved for its commander, was not granted; the text says
-    why."""
+    """Claim or request refused; the text says why."""
 
 
 class ClaimRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Request for the command. ``name``: name of the reach; ``clock``: commander's
-    `clock_domain`."""
+    """Request for the command.
+
+    ``name``: name of the reach; ``clock``: commander's `clock_domain`.
+    """
 
     name: str
     clock: str
@@ -289,8 +290,10 @@ class CommandDesk:
             return Grant(self._commander, key.hex(), "same" if own else "remote")
 
     def release(self, request: Signed) -> None:
-        """Give the grant back. Raises `NotGrantedError` if the request is not from the
-        commander."""
+        """Give the grant back.
+
+        Raises `NotGrantedError` if the request is not from the commander.
+        """
         with self._lock:
             if not self._commander:
                 return

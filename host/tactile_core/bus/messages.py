@@ -183,8 +183,10 @@ class Codec:
             raise DecodeError(f"{msgtype} of {len(data)} bytes: {error}") from error
 
     def schema(self, kind: Topic | str) -> Schema:
-        """Name, encoding, definition text and hash of a type. Raises ValueError if it is
-        unknown."""
+        """Name, encoding, definition text and hash of a type.
+
+        Raises ValueError if it is unknown.
+        """
         msgtype = kind if isinstance(kind, str) else kind.msgtype
         schema = self._schemas.get(msgtype)
         if schema is None:

@@ -78,8 +78,7 @@ def find_runtime() -> Runtime:
 
 
 def home() -> Runtime:
-    """Folder of this service; of the installed services for members of their group; or the user's
-    own."""
+    """Folder of this service, of the installed services (for their group), or of the user."""
     from_systemd = os.environ.get(SYSTEMD_VARIABLE, "").partition(":")[0]
     if from_systemd:
         return Runtime(Path(from_systemd).absolute(), shared=True)
@@ -221,8 +220,10 @@ class SocketLock:
         self._file: int | None = None
 
     def acquire(self) -> bool:
-        """Acquire the lock; False if another process holds it. Raises OSError if the folder forbids
-        it."""
+        """Acquire the lock; False if another process holds it.
+
+        Raises OSError if the folder forbids it.
+        """
         file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -233,8 +234,10 @@ class SocketLock:
         return True
 
     def release(self) -> None:
-        """Release the lock. The file stays: deleting it would let two processes hold locks of one
-        name."""
+        """Release the lock.
+
+        The file stays: deleting it would let two processes hold locks of one name.
+        """
         if self._file is not None:
             os.close(self._file)
             self._file = None

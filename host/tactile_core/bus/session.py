@@ -150,8 +150,7 @@ SECURE = ("tls/", "quic/")
 
 
 def _check_endpoints(config: BusConfig) -> None:
-    """Reject endpoints that open the bus to the network without TLS, or that need keys not
-    given."""
+    """Reject endpoints open to the network without TLS, or that need keys not given."""
     for endpoint in (*config.listen_endpoints(), *config.connect_endpoints()):
         secure = endpoint.startswith(SECURE)
         if secure and config.tls is None:
@@ -338,8 +337,10 @@ def _example(where: str) -> str:
 
 
 def close_session(session: zenoh.Session, timeout: float = CLOSE_TIMEOUT) -> bool:
-    """Close within ``timeout`` s; False if zenoh still waits for a peer (closing then
-    continues)."""
+    """Close the session.
+
+    Returns False if zenoh still waits for a peer after ``timeout`` s; closing then continues.
+    """
     if session.is_closed():
         return True
     opened = _open_sessions.pop(str(session.zid()), None)

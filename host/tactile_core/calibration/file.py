@@ -238,8 +238,7 @@ class CalibrationFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
 
 def save(calibration: BoardCalibration, path: Path | str) -> None:
-    """Write ``calibration`` to ``path`` atomically: the old file stays until the new one is
-    complete."""
+    """Write ``calibration`` atomically: the old file stays until the new one is complete."""
     path = Path(path)
     temporary = path.with_name(path.name + ".part")
     try:

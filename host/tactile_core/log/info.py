@@ -495,8 +495,10 @@ class _Collector:
 
 
 class _Unneeded:
-    """Channels whose data is not needed, decided before their first message is read, which in a
-    large chunk may fill the memory."""
+    """Channels whose data is not needed.
+
+    Decided before their first message is read, as in a large chunk it may fill the memory.
+    """
 
     def __init__(self, collector: _Collector, reader: LogReader, known: set[int]) -> None:
         self._collector = collector

@@ -314,8 +314,10 @@ class McapFile:
             self._dirty = False
 
     def finish(self) -> None:
-        """Commit, write the summary and close. After an OSError the file is closed without a
-        summary."""
+        """Commit, write the summary and close.
+
+        After an OSError the file is closed without a summary.
+        """
         try:
             self.commit()
             self._put(self._summary())

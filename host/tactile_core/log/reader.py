@@ -166,8 +166,10 @@ def read_summary(read_at: ReadAt, start: int, end: int, crc: int | None) -> Summ
 
 
 def _records(read_at: ReadAt, start: int, end: int) -> Iterator[tuple[int, int, int]]:
-    """Position, type and length of each record; an incomplete header counts as a record beyond
-    ``end``."""
+    """Position, type and length of each record.
+
+    An incomplete header counts as a record beyond ``end``.
+    """
     position = start
     window, begin = b"", start
     while position < end:
@@ -320,8 +322,11 @@ class LogReader:
 
     @property
     def indexed(self) -> bool:
-        """After the pass: whether the summary lists all channels and types, and indexes every chunk
-        and its messages, so that programs that need an index find every message."""
+        """After the pass: whether the summary indexes everything.
+
+        That is, it lists all channels and types and indexes every chunk and its messages, so that
+        programs that need an index find every message.
+        """
         summary = self.summary
         if summary is None or self.unchunked or not summary.knows_all_channels:
             return False
@@ -338,8 +343,10 @@ class LogReader:
         return bool(self.messages_lost or self.lost_unknown)
 
     def read_at(self, position: int, size: int) -> bytes:
-        """Read bytes at ``position``; fewer at the end of the file. Raises `LogError` on a disk
-        error."""
+        """Read bytes at ``position``; fewer at the end of the file.
+
+        Raises `LogError` on a disk error.
+        """
         return self._bytes.read_at(position, size)
 
     def pieces_at(self, position: int, size: int) -> Iterator[bytes]:
@@ -432,8 +439,7 @@ class LogReader:
     # Start and end of a file
 
     def _start(self) -> int:
-        """Return the position of the first record; determines whether and how the file was
-        finished."""
+        """Return the position of the first record; determines how the file ends."""
         if self.size == 0:
             raise LogError(f"{self.path} is empty: its writer ended before the first byte")
         self._bytes.end = self.size
@@ -939,8 +945,11 @@ class LogReader:
         return AttachmentRecord(name, media_type, log_ns, create_ns, start, size)
 
     def _skip(self, position: int, reason: str) -> int:
-        """Skip an unreadable part: one record if its length leads to another, otherwise everything
-        up to the next chunk or the end of the data."""
+        """Skip an unreadable part; returns where reading continues.
+
+        That is the next record if the length leads to one, otherwise the next chunk or the end of
+        the data.
+        """
         self._report_lost_chunk()
         head = self.read_at(position, 9)
         after = position + 9 + op.RECORD.unpack(head)[1] if len(head) == 9 else self._bytes.end

@@ -386,8 +386,10 @@ class Recorder:
             time.sleep(0)
 
     def _drain(self) -> None:
-        """Write everything queued. A failing file gets one successor; after that the rest is
-        lost."""
+        """Write everything queued.
+
+        A failing file gets one successor; after that the rest is lost.
+        """
         failures = 0
         while failures < 2:
             self._take()

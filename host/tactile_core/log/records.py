@@ -251,8 +251,10 @@ class LogBytes:
             self._file.close()
 
     def read_at(self, position: int, size: int) -> bytes:
-        """Read bytes at ``position``; fewer at the end of the file. Raises `LogError` on a disk
-        error."""
+        """Read bytes at ``position``; fewer at the end of the file.
+
+        Raises `LogError` on a disk error.
+        """
         if self._file is None:
             raise ValueError("the log is not open")
         try:

@@ -137,8 +137,10 @@ at the 7 MB a minute of one board, seven hours."""
 
 
 class DiskWatch:
-    """Checks the free space of a folder. ``free_bytes``: at the last check, None before the
-    first."""
+    """Checks the free space of a folder.
+
+    ``free_bytes``: at the last check, None before the first.
+    """
 
     def __init__(
         self,

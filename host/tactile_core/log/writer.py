@@ -343,8 +343,7 @@ class LogWriter:
         )
 
     def finish(self) -> None:
-        """Finish the file after the last flush; ``state`` becomes closed unless something went
-        wrong."""
+        """Finish the file after the last flush; ``state`` becomes closed unless this fails."""
         try:
             self._end_file()
         except OSError as error:
@@ -473,8 +472,8 @@ class LogWriter:
             file.add_channel(number, identity, channel.path, "cdr", metadata)
 
     def _repeat_latched(self) -> None:
-        """Repeat the latched messages in a new file, with their old numbers so that no gap
-        appears."""
+        """Repeat the latched messages in a new file, with their old numbers so as to show no
+        gap."""
         if self._file is None or self._pending is None or not self._latched:
             return
         chunk = ChunkBuffer()

@@ -146,8 +146,7 @@ def notes() -> Iterator[Notes]:
 
 @pytest.fixture(scope="session")
 def build(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
-    """``build(out, source, *flags, compiler="gcc")``: build a program or library from
-    ``source``."""
+    """``build(out, source, *flags, compiler="gcc")``: build a program or library."""
     folder = tmp_path_factory.mktemp("firmware")
 
     def run(out: str, source: str | Path, *flags: str, compiler: str = "gcc") -> Path:

@@ -26,8 +26,7 @@ FORCES_N = (2.0, 4.0, 3.0)
 
 
 def press(ms: float) -> float:
-    """Force in N on the left side: 6 s at rest, then three presses of 2 s with ramps of 0.5 s,
-    rest."""
+    """Force in N on the left side: 6 s at rest, three presses of 2 s with 0.5 s ramps, rest."""
     for number, force in enumerate(FORCES_N):
         t = ms / 1000 - 6.0 - 3.0 * number
         if 0 <= t <= 2.0:

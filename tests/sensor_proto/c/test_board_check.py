@@ -1,5 +1,4 @@
-"""``tactile board-check`` passes boards that follow PROTOCOL.md and names the mistakes of
-others."""
+"""``tactile board-check`` passes boards that follow PROTOCOL.md and names others' mistakes."""
 
 from __future__ import annotations
 

@@ -60,8 +60,7 @@ def test_each_header_compiles_alone(
 
 
 def test_smoke_inputs_pass_under_sanitizers(build: Callable[..., Path], need: Any) -> None:
-    """The fuzzer's entry points with inputs of a fixed seed; `make firmware-test` runs libFuzzer
-    itself."""
+    """The fuzzer's entry points on inputs of a fixed seed, for machines without libFuzzer."""
     flags = ["-std=c99", "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     program = build("smoke", "test/smoke.c", *flags)
     subprocess.run([program], check=True, timeout=120)

@@ -209,8 +209,7 @@ def test_oversized_packet_is_refused_by_both(codec: Any) -> None:
 
 
 def test_receiver_checks_bytes_it_cannot_hold(codec: Any) -> None:
-    """A longer command of a newer host is obeyed with sixteen bytes of memory, a corrupted one is
-    not."""
+    """With 16 bytes of memory, a newer host's longer command is obeyed unless corrupted."""
     payload = pack(SetGain(9, 255, 7, 0, 0, 3))[4:-4] + bytes(range(1, 201))
     raw = right_crc(b"\x85\0" + len(payload).to_bytes(2, "little") + payload)
     receiver = codec.receiver(hold=16)

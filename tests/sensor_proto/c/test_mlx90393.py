@@ -37,8 +37,7 @@ class Rig:
         self._c.rig_field(self._r, (ctypes.c_int32 * len(nt))(*nt), cc)
 
     def cycle(self, wait_us: int = SLOWEST_US) -> tuple[Any, list[int], float]:
-        """Run a cycle; returns counts (chips, 3), status of each chip and mean temperature in
-        °C."""
+        """Run a cycle; returns counts (chips, 3), status of each chip, mean temperature in °C."""
         v = (ctypes.c_int64 * 40)()
         self._c.rig_cycle(self._r, wait_us, v)
         rows = np.array(v[: 4 * self.chips]).reshape(self.chips, 4)

@@ -56,8 +56,7 @@ def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
 
 
 def stream(start: Any, folder: Path, port: str, seconds: float, *words: str) -> list[Any]:
-    """Features logged by the real tactiled from the board at ``port`` in ``seconds`` of
-    streaming."""
+    """Features that the real tactiled logs from the board at ``port`` in ``seconds``."""
     module = [sys.executable, "-c", "import sys; from tactiled.cli import main; sys.exit(main())"]
     daemon = start(*module, "--port", port, "--log", "run.mcap", *words, out="tactiled.txt")
     text = folder / "tactiled.txt"

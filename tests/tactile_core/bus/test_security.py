@@ -339,8 +339,7 @@ def test_secret_is_created_once_and_private(
 def test_secret_folder_of_another_user_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another user may have created it first in a shared folder; the error names the variable to
-    use."""
+    """Another user may have created it first; the error names the variable to use."""
     monkeypatch.delenv(runtime.SYSTEMD_VARIABLE, raising=False)
     monkeypatch.setenv(runtime.RUNTIME_VARIABLE, str(tmp_path / "rig"))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))

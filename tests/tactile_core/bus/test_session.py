@@ -179,8 +179,7 @@ def test_slow_process_acts_on_newest_sample(bus: Any, subscriber: Any) -> None:
 
 
 def test_stopped_subscriber_blocks_nobody(bus: Any, subscriber: Any) -> None:
-    """Row 20: with one reader under SIGSTOP, publishing continues and the others get everything
-    new."""
+    """Row 20: with one reader under SIGSTOP, publishing continues and others get everything."""
     port = free_port()
     session = bus(listen=port)
     publisher = declare_publisher(session, topics.FEATURES, "b0")

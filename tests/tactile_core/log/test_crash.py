@@ -1,5 +1,4 @@
-"""Row 29: real processes killed while logging; every file they leave is readable and
-recoverable."""
+"""Row 29: every file of a process killed while logging is readable and recoverable."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Logs that were cut off or damaged, and files that are not logs: a clear result, and all readable
-data."""
+"""Logs cut off or damaged, and files that are not logs: a clear result, all readable data."""
 
 from __future__ import annotations
 
