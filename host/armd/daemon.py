@@ -225,7 +225,7 @@ class Daemon(Service):
             self._do_jobs()
             now = monotonic_now()
             with self._lock:
-                order = self.port.desk.newest(now)
+                order = self.port.arbiter.newest(now)
                 if order is not None:
                     self._guard.obey(order, now)
                 velocity, echo = self._guard.velocity(now)
@@ -281,7 +281,7 @@ class Daemon(Service):
 
     def _set_limits(self, limits: ArmLimits) -> ArmLimits:
         with self._lock:
-            kept = self._guard.request_limits(limits, self.port.desk.commander)
+            kept = self._guard.request_limits(limits, self.port.arbiter.commander)
         job = Job(lambda: self.driver.limit(kept))
         self._ask(job)
         if not job.wait(ASKED):

@@ -14,14 +14,14 @@ import zenoh
 from tactile_core.bus.commanding import (
     LONGEST_EXPIRY,
     ClaimRequest,
-    CommandDesk,
+    CommandArbiter,
     LimitsRequest,
     NotGrantedError,
     Signed,
     Signer,
     clock_domain,
     limits_fields,
-    serve_desk,
+    serve_claims,
 )
 from tactile_core.bus.markers import frame_transform
 from tactile_core.bus.messages import MSG, codec, header
@@ -109,7 +109,7 @@ class ArmPort:
         heard: Callable[[], None] | None = None,
     ) -> None:
         self.name = name
-        self.desk = CommandDesk()
+        self.arbiter = CommandArbiter()
         self.sent = 0
         self._bus = bus
         self._set_limits = set_limits
@@ -142,7 +142,7 @@ class ArmPort:
     def refused(self) -> dict[str, int]:
         """Commands not obeyed so far, by reason."""
         oversized = 0 if self._commands is None else self._commands.refused
-        return {**self.desk.refused, "oversized": oversized}
+        return {**self.arbiter.refused, "oversized": oversized}
 
     def open(self) -> None:
         """Join the bus; BusError when that cannot be, or an arm of this name is there."""
@@ -167,7 +167,7 @@ class ArmPort:
             ),
             declare_service(session, service_key(name, "clear", "arm"), self._cleared, Signed),
             declare_service(session, service_key(name, "status", "arm"), self._said, Nothing),
-            *serve_desk(session, name, self.desk),
+            *serve_claims(session, name, self.arbiter),
         ]
         self._token = session.liveliness().declare_token(alive_key(name, "arm"))
 
@@ -184,7 +184,7 @@ class ArmPort:
             raise RuntimeError("the arm has not begun")
         self.sent += 1
         wall_ns = self._wall.wall_ns(state.captured)
-        message = state_message(state, self.sent % SEQUENCES, wall_ns, self.desk.commander)
+        message = state_message(state, self.sent % SEQUENCES, wall_ns, self.arbiter.commander)
         self._states.put(self._codec.encode(ARM_STATE, message), wall_ns)
         if state.captured >= self._next_frame:
             self._next_frame = after(state.captured, FRAME_PERIOD)
@@ -199,12 +199,12 @@ class ArmPort:
         self._codec.encode(TF, frame_transform(0, FRAME, FINGER_FRAME, pose))
         none = ArmState(Instant(0), Instant(0), *pose[:3], ZERO, *pose[:3], "ready", *pose)
         self._codec.encode(ARM_STATE, state_message(none, 0, 0))
-        owner = CommandDesk()
+        owner = CommandArbiter()
         signer = Signer(owner.claim(ClaimRequest("warm", clock_domain()), Instant(0)))
-        owner.hear(signer.command(ZERO, Instant(0), LONGEST_EXPIRY, 0), Instant(0))
+        owner.receive(signer.command(ZERO, Instant(0), LONGEST_EXPIRY, 0), Instant(0))
 
     def _hear(self, sample: BusSample) -> None:
-        self.desk.hear(sample.data, monotonic_now())
+        self.arbiter.receive(sample.data, monotonic_now())
         if self._heard is not None:
             self._heard()
 
@@ -220,7 +220,7 @@ class ArmPort:
 
     def _authorise(self, service: str, request: Signed, **fields: object) -> None:
         try:
-            self.desk.authorise(service, request, monotonic_now(), **fields)
+            self.arbiter.authorise(service, request, monotonic_now(), **fields)
         except NotGrantedError as error:
             raise ServiceError(str(error)) from error
 
@@ -235,7 +235,7 @@ class ArmPort:
     def _said(self, _: Nothing) -> dict[str, object]:
         return {
             "states": self.sent,
-            "commander": self.desk.commander or None,
+            "commander": self.arbiter.commander or None,
             **self._status(),
         }
 

@@ -212,7 +212,7 @@ class ArmServer:
             world = self._on_bus = self._begin(now)
         with self._lock:
             states = self.cupboard.advance(now)
-            order = self.port.desk.newest(now)
+            order = self.port.arbiter.newest(now)
             if order is not None:
                 # It arrived at an unknown moment since the last poll: assume the earliest.
                 waited = seconds_between(self._polled, now)

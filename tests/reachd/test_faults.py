@@ -165,7 +165,7 @@ def test_second_reachd_seeing_only_the_arm_is_refused(lab: Any) -> None:
     arm, _ = lab.arm, lab.board()
     lab.reachd("--serve", "--strategy", "straight", "--no-log")
     wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
-    wait_until(lambda: arm.desk.commander)
+    wait_until(lambda: arm.arbiter.commander)
     locks = lab.folder / "elsewhere"
     locks.mkdir()
     for how in (("--serve",), NEAR):
@@ -175,7 +175,7 @@ def test_second_reachd_seeing_only_the_arm_is_refused(lab: Any) -> None:
         )  # fmt: skip
         assert second.wait() == 3, second.said
         assert "commanded by another reachd (reach 'reach')" in second.said
-    assert arm.desk.commander.startswith("reach-")
+    assert arm.arbiter.commander.startswith("reach-")
     wait_until(lab.arms)
     assert lab.ask("status")["armed"] is True
 
@@ -188,15 +188,15 @@ def test_restarted_arm_driver_is_claimed_again(lab: Any) -> None:
     wait_until(lab.arms)
     lab.ask("goal", {"x": 0.36, "y": 0.0})
     wait_until(lambda: arm.moving)
-    first = arm.desk.commander
-    arm.desk.forget()
+    first = arm.arbiter.commander
+    arm.arbiter.forget()
     wait_until(lambda: lab.ask("status")["held"] == "commander")
     assert "obeys nobody's commands" in lab.ask("status")["outcome"]["text"]
-    wait_until(lambda: arm.desk.commander not in ("", first))
+    wait_until(lambda: arm.arbiter.commander not in ("", first))
     wait_until(lab.arms)
     program.signal(signal.SIGTERM)
     assert program.wait() == 0
-    assert arm.desk.commander == "", "given back"
+    assert arm.arbiter.commander == "", "given back"
 
 
 @pytest.mark.parametrize("delay", [0.25, 0.07])

@@ -11,12 +11,12 @@ from typing import Any
 import zenoh
 
 from tactile_core.bus.commanding import (
-    CommandDesk,
+    CommandArbiter,
     LimitsRequest,
     NotGrantedError,
     Order,
     limits_fields,
-    serve_desk,
+    serve_claims,
 )
 from tactile_core.bus.messages import MSG, codec, header
 from tactile_core.bus.services import ServiceError, declare_service
@@ -60,10 +60,10 @@ class FakeArm:
         self._wall = WallClock.take()
         self._stopping = threading.Event()
         self._key = COMMAND.key(name)
-        self.desk = CommandDesk()
+        self.arbiter = CommandArbiter()
         self._subscriber = self.session.declare_subscriber(self._key, self._hear)
         key = service_key(name, "limits", "arm")
-        self._services = serve_desk(self.session, name, self.desk)
+        self._services = serve_claims(self.session, name, self.arbiter)
         self._services.append(declare_service(self.session, key, self._limit, LimitsRequest))
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -87,9 +87,9 @@ class FakeArm:
 
     def _hear(self, sample: zenoh.Sample) -> None:
         now = monotonic_now()
-        if self.desk.hear(sample.payload.to_bytes(), now) is not None:
+        if self.arbiter.receive(sample.payload.to_bytes(), now) is not None:
             return
-        order = self.desk.newest(now)
+        order = self.arbiter.newest(now)
         if order is None:  # it expired while this thread was not scheduled
             return
         twist = order.twist
@@ -99,7 +99,9 @@ class FakeArm:
 
     def _limit(self, request: LimitsRequest) -> ArmLimits:
         try:
-            self.desk.authorise("limits", request, monotonic_now(), **limits_fields(request.limits))
+            self.arbiter.authorise(
+                "limits", request, monotonic_now(), **limits_fields(request.limits)
+            )
         except NotGrantedError as error:
             raise ServiceError(str(error)) from error
         if not self.deaf_to_limits:
@@ -153,7 +155,7 @@ class FakeArm:
         )
 
     def _echo(self) -> dict[str, Any]:
-        last, commander = (self.heard[-1].order if self.heard else None), self.desk.commander
+        last, commander = (self.heard[-1].order if self.heard else None), self.arbiter.commander
         mine = last is not None and last.commander == commander
         return {
             "commander": commander,

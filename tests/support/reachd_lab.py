@@ -92,7 +92,7 @@ class ReachdLab:
         def stands() -> bool:
             arm = self.arm
             told = bool(arm.heard) and all(h.still for h in arm.heard[-3:])
-            return told or (arm.desk.refused["late"] > 0 and not arm.moving)
+            return told or (arm.arbiter.refused["late"] > 0 and not arm.moving)
 
         wait_until(stands)
 

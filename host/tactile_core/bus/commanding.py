@@ -1,9 +1,10 @@
 """Command of an arm: granted by the arm, proved with every command, valid for a short time.
 
-`CommandDesk` is the arm's side, for the simulated arm and every driver; `Signer` is the commander's
-side. The arm grants its command through a service, to one commander at a time, together with a
-secret. Every command carries a keyed hash made with that secret. Whoever reads the bus and repeats,
-forges or renumbers commands is therefore not obeyed, and takes nothing from the owner. Pure.
+`CommandArbiter` is the arm's side, for the simulated arm and every driver; `Signer` is the side of
+the commander. The arm grants its command through a service, to one commander at a time, together
+with a secret. Every command carries a keyed hash made with that secret. Whoever reads the bus and
+repeats, forges or renumbers commands is therefore not obeyed, and takes nothing from the owner.
+Pure.
 
 A command ends at its expiry, counted from the instant of its **decision** on the commander's
 monotonic clock. If both run on one machine (see `clock_domain`), that clock is also the arm's.
@@ -45,12 +46,12 @@ from tactile_core.types import (
 # Services through which every arm, simulated or real, grants its command.
 
 
-def serve_desk(session: zenoh.Session, arm: str, desk: CommandDesk) -> list[Service]:
+def serve_claims(session: zenoh.Session, arm: str, arbiter: CommandArbiter) -> list[Service]:
     """Serve ``claim`` and ``release`` of the arm called ``arm``."""
 
     def claim(request: ClaimRequest) -> Grant:
         try:
-            return desk.claim(request, monotonic_now())
+            return arbiter.claim(request, monotonic_now())
         except NotGrantedError as error:
             raise ServiceError(
                 f"arm {arm!r} is not to be had: {error}; stop that one, or name another --arm"
@@ -58,10 +59,10 @@ def serve_desk(session: zenoh.Session, arm: str, desk: CommandDesk) -> list[Serv
 
     def release(request: Signed) -> dict[str, str]:
         try:
-            desk.release(request)
+            arbiter.release(request)
         except NotGrantedError as error:
             raise ServiceError(str(error)) from error
-        return {"commander": desk.commander}
+        return {"commander": arbiter.commander}
 
     return [
         declare_service(session, service_key(arm, "claim", "arm"), claim, ClaimRequest),
@@ -240,7 +241,7 @@ class Signer:
         return fields | signed | {"proof": _proof(self._key, about).hex()}
 
 
-class CommandDesk:
+class CommandArbiter:
     """The arm's side: grants the command to one at a time and checks every command.
 
     Every command is checked on arrival, in any thread, so that a flood from others cannot hide the
@@ -319,7 +320,7 @@ class CommandDesk:
             if self._commander and (request.commander or now < self._reserved_until):
                 self._verify(service, request, fields)
 
-    def hear(self, data: bytes, now: Instant) -> Refusal | None:
+    def receive(self, data: bytes, now: Instant) -> Refusal | None:
         """Check a command received at ``now``; returns and counts the reason if it is refused."""
         with self._lock:
             found = self._check(data, now)
