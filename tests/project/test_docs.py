@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -10,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from armd.cli import teach_parser
+from tactile_core.daemon import Shutdown
+from tactile_tools.completion import parsers
 from tactile_tools.dev import architecture, topics_page
 from tests.support.paths import ROOT
 
@@ -43,6 +47,45 @@ def test_document_links_exist(path: Path) -> None:
         assert whole.exists(), f"{link} does not exist"
         if anchor and whole.suffix == ".md":
             assert anchor in anchors(whole), f"{link}: no such heading"
+
+
+SHELL = re.compile(r"^```(?:sh|bash)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+COMMAND = re.compile(r"(?:sudo )?(?:\.venv/bin/)?((?:tactile|tactiled|reachd|simdevice|armd) .*)")
+
+
+def commands(path: Path) -> list[list[str]]:
+    """Our commands in the shell blocks of a Markdown file, as words."""
+    found = []
+    for block in SHELL.findall(path.read_text(encoding="utf-8")):
+        for line in block.replace("\\\n", " ").splitlines():
+            match = COMMAND.match(line.strip())
+            if match is not None:
+                words = shlex.split(match[1].replace("…", ""), comments=True)
+                found.append([word for word in words if word != "&"])
+    return found
+
+
+def test_every_command_of_the_documents_has_options_that_exist(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    known = {parser.prog: parser for parser in parsers()}
+    count = 0
+    for path in DOCUMENTS:
+        for words in commands(path):
+            parser, rest = known[words[0]], words[1:]
+            if words[:2] == ["armd", "teach"]:
+                parser, rest = teach_parser(Shutdown()), words[2:]
+            try:
+                parser.parse_args(rest)
+            except SystemExit as ended:
+                refused = f"{path}: {shlex.join(words)}\n" if ended.code else ""
+            else:
+                refused = ""
+            said = capsys.readouterr().err
+            assert not refused, refused + said
+            assert "is now called" not in said, said
+            count += 1
+    assert count > 50
 
 
 def test_structure_pictures_are_up_to_date() -> None:
