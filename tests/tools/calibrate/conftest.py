@@ -33,7 +33,10 @@ def displacement(time: Float, period: float = 20.0) -> Float:
 
 
 def skin_field(depth: Float, rng: np.random.Generator, noise_ut: float = 3.0) -> Float:
-    """(m, 15) µT of five taxels over a rest of 10 mT: each bends the depth in its own way."""
+    """Field of five taxels, (m, 15) µT, over a rest of 10 mT.
+
+    Each responds to the depth differently.
+    """
     gain = np.array(
         [900, -300, 2000, 500, 700, -400, -600, 800, 1500, 300, -200, 900, 1000, 0, 400.0]
     )
@@ -79,7 +82,10 @@ def make_recording() -> Callable[..., Recording]:
 
 @pytest.fixture
 def write_pair(tmp_path: Path) -> Callable[..., Path]:
-    """Folder with the CSV pair of a plain skin; ``edit(sensor, states)`` may spoil the lines."""
+    """Write a folder with a CSV pair of a plain skin.
+
+    ``edit(sensor, states)`` may damage its lines.
+    """
 
     def write(
         name: str = "normal_1",
@@ -112,7 +118,7 @@ def write_pair(tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture(scope="session")
 def real() -> Callable[[str], Recording]:
-    """Recording of the eFlesh rig by name, read once: `Recording` does not change."""
+    """Recording of the eFlesh rig by name, read once; `Recording` is immutable."""
 
     @cache
     def read(name: str) -> Recording:

@@ -1,4 +1,4 @@
-"""What a user may get wrong: every message names file and remedy, exit codes 2 and 3."""
+"""Mistakes of users: every message names file and remedy; exit status 2 and 3."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tactile_tools.cli import main
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Only the linear recipe is tried: what is said of files does not depend on it."""
+    """Try only the linear recipe: messages about files do not depend on the model."""
     monkeypatch.setattr(fitting, "FORCE_RECIPES", FORCE_RECIPES[:1])
 
 
@@ -163,7 +163,7 @@ def test_fitted_file_names_its_recordings(capsys, quick, write_pair, tmp_path):
     assert described["serial_number"] == "S7"
     assert described["models"][0]["targets"] == {"normal": "N"}
 
-    # what is wrong with the file is named, by key
+    # the message names what is wrong by its key
     text = out.read_text()
     for old, new, words in (
         ("format_version = 3", "format_version = 9", ["newer than 3"]),

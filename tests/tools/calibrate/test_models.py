@@ -55,7 +55,7 @@ def test_model_with_history_fits_hysteresis(make_recording, force, recipe):
     recipe = replace(recipe, penalties=(1.0,))
     simple = tail20([recording], [CUBIC])[0].rmse[0]
     with_history = tail20([recording], [recipe])[0].rmse[0]
-    assert simple > 0.25  # what the rubber adds on the way in and takes on the way out
+    assert simple > 0.25  # what the rubber adds when loaded and takes when unloaded
     assert with_history < simple / 3
 
 
@@ -71,7 +71,7 @@ def test_too_short_recording_is_refused_with_a_remedy(make_recording):
 
 
 def test_label_delay_is_estimated(make_recording):
-    """A slow memory alone: one of 0.3 s would take part of the delay on itself."""
+    """A slow memory alone: one of 0.3 s would explain part of the delay."""
     recording = make_recording(lambda time, depth: 10 * depth, delay=0.25, seconds=120, period=10)
     slow = replace(CREEP, components=2, degree=1, taus_s=(10.0,), lagged=1, lag_degree=0)
     choice = choose([recording], [replace(slow, penalties=(0.01,))])
@@ -89,7 +89,7 @@ def test_load_cell_beat_is_estimated(make_recording):
     assert clock.reading_s == pytest.approx(0.2, rel=1e-3)
     assert clock.beat_s == pytest.approx(0.2 * 0.205 / 0.005, rel=0.01)
     wrong = np.abs(clock.lag_s - (time - true))
-    moving = np.abs(np.gradient(label, time)) > 0.5  # where nothing moves a tooth cannot be seen
+    moving = np.abs(np.gradient(label, time)) > 0.5  # a tooth cannot be seen where nothing moves
     assert np.median(wrong[moving]) < 0.02
     assert np.median(clock.lag_s) > 0.05
 
@@ -133,7 +133,7 @@ def test_test_rows_are_never_near_training_rows(make_recording):
                 times = np.concatenate([[-np.inf], np.sort(rows.time_s[mine]), [np.inf]])
                 assert min((rows.time_s[test] - times[near]).min(), 9e9) >= 3.0
         seen += 1
-    assert seen == 12  # five blocks of each, and each whole
+    assert seen == 12  # five blocks of each, and each as a whole
 
 
 def test_model_features_are_causal(make_recording):
@@ -188,7 +188,7 @@ def test_frame_by_frame_equals_batch(make_recording):
 
 
 def test_daemon_pipeline_matches_batch(make_recording):
-    """Chips turned, rest from the file's own, tared at the start: features sum to the model."""
+    """Chips turned, the file's own rest field, tared at the start: features add up to the model."""
     recording = make_recording(creeping, seconds=60)
     model = fit([recording], Choice(CREEP, 1.0, 0.0, (), ()))
     calibration = board(nominal("anyskin", "s", 5), [recording], [model], "s")

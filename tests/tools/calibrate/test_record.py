@@ -1,4 +1,4 @@
-"""A board calibrated as its owner does it: real processes, and a person who does what is asked."""
+"""A board calibrated as its owner would: real processes, and a person who does what is asked."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.support.waiting import PATIENCE_S
 
 FORCE_N = 4.0
 FIRST_S, EVERY_S = 3.0, 7.0
-FREE_S = (3.7, 4.6)  # since a press began: it is over, and nothing comes for 2.4 s
+FREE_S = (3.7, 4.6)  # since the start of a press: it is over, and none comes for 2.4 s
 PRESSES = f"""
 [[press]]
 array = "skin"
@@ -44,10 +44,10 @@ CALIBRATE = (sys.executable, "-m", "tactile_tools.cli", "calibrate")
 
 
 class Person:
-    """Acts when a press has just begun or ended, as the features tell, and tares when it is over.
+    """Acts when a press has just begun or ended, as the features show, and tares when it is over.
 
-    What the features say before the first tare is worth nothing, so then the clock tells: the board
-    had power from ``began`` (s, monotonic) on, and the script runs from there.
+    Before the first tare the features are meaningless, so the clock decides then: the board had
+    power from ``began`` (s, monotonic) on, and the script runs from there.
     """
 
     def __init__(self, features: Latest, began: float) -> None:
@@ -55,7 +55,7 @@ class Person:
         self._began = began
 
     def wait_untouched(self) -> None:
-        """Until nothing is on the skin, and nothing will be for some time."""
+        """Wait until nothing is on the skin, and nothing will be for some time."""
         low, high = FREE_S
         while not low <= (time.monotonic() - self._began - FIRST_S) % EVERY_S <= high:
             time.sleep(0.05)
@@ -66,7 +66,7 @@ class Person:
         return float(codec().decode(FEATURES, sample.data).normal_force)
 
     def wait_for(self, *, pressed: bool) -> None:
-        """Until the skin, after it was otherwise, is pressed or free, and steadily so."""
+        """Wait until the skin has changed to pressed or free, and stays so."""
         deadline = time.monotonic() + PATIENCE_S
         for wanted in (not pressed, pressed):
             while (self.force() > 0.5) is not wanted:
@@ -76,7 +76,7 @@ class Person:
 
 @contextmanager
 def served(folder: Path, *words: str) -> Iterator[tuple[str, Person]]:
-    """The board and a tactiled on it, its endpoint, and a person who sees what it says."""
+    """The board with a tactiled on it, its endpoint, and a person who sees its features."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     port, press = folder / "skin", folder / "press.toml"
     press.write_text(PRESSES)
@@ -98,7 +98,7 @@ def served(folder: Path, *words: str) -> Iterator[tuple[str, Person]]:
 
 
 def prompt(process: subprocess.Popen[str]) -> str:
-    """What is asked next; "" when nothing more is."""
+    """The next question; "" when there is none."""
     assert process.stdout is not None
     text = ""
     while not text.endswith(("tare: ", "end: ", "1kg): ", "Enter: ", "[y/N] ")):
@@ -110,7 +110,7 @@ def prompt(process: subprocess.Popen[str]) -> str:
 
 
 def test_repeated_stamps_do_not_spoil_a_recording(tmp_path: Path) -> None:
-    """As while the estimate of a board's clock is set back, which a busy machine brings about."""
+    """Stamps repeat while the estimate of a board's clock is set back, as on a busy machine."""
     path, begin = tmp_path / "rec.mcap", 1_700_000_000 * 10**9
     recorder = Recorder(path, RecorderSettings(min_free_bytes=0))
     recorder.attach(f"skin{SUFFIX}", "application/toml", saves(nominal("anyskin", "s", 5)).encode())

@@ -1,6 +1,6 @@
 """Figures on recordings of the eFlesh rig; docs/calibration.md has those of the whole recordings.
 
-Bounds are a little above what was measured, so that a change for the worse is seen.
+Bounds are a little above what was measured, so that a regression is noticed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ LINEAR, CUBIC, CREEP, PLAY = FORCE_RECIPES
 
 
 def last_fifth(recording, recipe, penalty, label_clock=True):
-    """Errors on the last fifth of the model that cross-validation chose on the rest."""
+    """Errors on the last fifth, of the model that cross-validation chose on the rest."""
     head = recording.until(0.8)
     model = fit([head], Choice(recipe, penalty, 0.0, (), ()))
     tested = recording.label_time_s > head.time_s[-1]

@@ -142,7 +142,7 @@ def test_wizard_recording_calibrates_the_simulated_board(tmp_path):
     assert recording.labels.max() == pytest.approx(8.0)
     choice = choose([recording], FORCE_RECIPES[:2])
     model = fit([recording], choice)
-    other = record(tmp_path, "other.mcap", some_presses(5, 8))  # what was on it then is the truth
+    other = record(tmp_path, "other.mcap", some_presses(5, 8))  # its labels are the truth
     error = predict(model, other) - other.labels
     loaded = other.labels[:, 0] > 0
     assert np.sqrt((error[~loaded] ** 2).mean()) < 0.3
@@ -157,7 +157,7 @@ def test_recording_with_equal_stamps_is_read(tmp_path):
     sample = bench._sample
 
     def stalled():
-        """Six frames in a hundred come in a burst, as older versions stamped it."""
+        """Six frames in a hundred come in a burst, as older versions stamped them."""
         at, field = sample()
         late = at % (2 * NS_PER_S)
         return at - late if late < 0.12 * NS_PER_S else at, field
@@ -171,7 +171,7 @@ def test_recording_with_equal_stamps_is_read(tmp_path):
 
 
 class Silent:
-    """A source that gives no frames."""
+    """A source without frames."""
 
     def tare(self, force=False):
         return "tared"
@@ -181,7 +181,7 @@ class Silent:
 
 
 class Steady(Silent):
-    """A source that gives twenty frames a second; each tare but a forced one may be refused."""
+    """A source of twenty frames a second; each tare except a forced one may be refused."""
 
     def __init__(self, refusals=0):
         self.refusals = refusals
@@ -199,7 +199,7 @@ class Steady(Silent):
 
 
 class Dialogue:
-    """Answers in their order; everything that was shown, and what was labelled."""
+    """Gives answers in order; keeps everything that was shown and labelled."""
 
     def __init__(self, *answers):
         self.answers, self.shown, self.labels = list(answers), [], []

@@ -1,4 +1,4 @@
-"""The rig live in Foxglove, seen by a client that knows nothing but the protocol."""
+"""The rig live in Foxglove, seen by a client that knows only the protocol."""
 
 from __future__ import annotations
 
@@ -35,7 +35,10 @@ def free_port() -> int:
 
 
 class Viewer:
-    """A client of Foxglove's WebSocket protocol: `data` by topic, the last of each JSON message."""
+    """Client of Foxglove's WebSocket protocol.
+
+    `data`: messages by topic; the last of each JSON kind.
+    """
 
     def __init__(self, port: int) -> None:
         self.socket = client.connect(
@@ -96,7 +99,7 @@ class Viewer:
 
 
 class Rig:
-    """A daemon's side of the bus: one board and one reach, and what was asked of them."""
+    """A daemon's side of the bus: one board and one reach, and the requests they received."""
 
     def __init__(self) -> None:
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -121,7 +124,7 @@ class Rig:
         return data
 
     def speak(self) -> None:
-        """One message of each stream."""
+        """Publish one message of each stream."""
         self.put(LOG, "left", MSG.Log(header(0, "").stamp, 20, "left", "hello", "", "", 0))
         self.put(FEATURES, "left", _default(FEATURES.msgtype))
         self.put(REACH_STATE, "reach", _default(REACH_STATE.msgtype))

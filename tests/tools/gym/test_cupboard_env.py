@@ -1,4 +1,4 @@
-"""The cupboard as a Gymnasium environment, by Gymnasium's own checker and by what users rely on."""
+"""The cupboard as a Gymnasium environment: Gymnasium's own checker, and what users rely on."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def make(**options: Any) -> Any:
 
 
 def episode(env: Any, seed: int, steps: int = 40) -> list[Any]:
-    """Everything that random actions, drawn from a seed of their own, bring."""
+    """Everything that random actions, drawn from ``seed``, bring."""
     observation, info = env.reset(seed=seed)
     found: list[Any] = [observation, info]
     rng = np.random.default_rng(seed)
@@ -54,7 +54,7 @@ def test_gymnasiums_checker_finds_nothing() -> None:
 def test_same_seed_gives_the_same_bits(depth: str, steps: int) -> None:
     first, second = make(depth=depth), make(depth=depth)
     assert same(episode(first, 5, steps), episode(second, 5, steps))
-    # Nothing is carried over from one episode to the next.
+    # An episode does not depend on earlier ones.
     assert not same(episode(first, 6, steps), episode(second, 5, steps))
     assert same(episode(first, 5, steps), episode(second, 5, steps))
 
@@ -75,7 +75,7 @@ def test_scene_can_be_chosen() -> None:
 
 
 def test_straight_ahead_touches_and_the_gate_limits_it() -> None:
-    """Full speed ahead into the clutter: patches are seen, the gate acts, its limits hold."""
+    """Full speed into the clutter: patches are seen, the gate acts, its limits hold."""
     env = make(scene="authors_sim", depth="contacts")
     observation, info = env.reset(seed=0, options={"scene_seed": 35})
     touched, rewards = [], 0.0
@@ -116,7 +116,7 @@ def test_empty_cupboard_is_reached(tmp_path: Any) -> None:
         if terminated:
             break
     assert info["reached"]
-    assert 1.9 < rewards < 2.1  # all of the way, and the goal
+    assert 1.9 < rewards < 2.1  # the whole distance, and the goal
     assert observation["patches"].sum() == 0.0
 
 
@@ -130,7 +130,7 @@ def test_time_limit_truncates() -> None:
 
 
 def test_several_in_processes_of_their_own() -> None:
-    """Vectorised over processes it gives what one by one gives."""
+    """Vectorised over processes, it gives the same as one by one."""
     vector = gymnasium.make_vec(
         ID,
         num_envs=2,

@@ -49,7 +49,7 @@ def log_tool(capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
 
 @pytest.fixture
 def tiny_log() -> Callable[..., bytes]:
-    """``tiny_log(path)``: a whole log of some 1.4 kB, with all kinds of records."""
+    """``tiny_log(path)``: write a complete log of some 1.4 kB with all kinds of records."""
 
     def write(path: Path, library: str = "t", profile: str = "ros2", count: int = 6) -> bytes:
         file = McapFile(path, DiskStorage(), library, profile)

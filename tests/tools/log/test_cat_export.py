@@ -1,4 +1,4 @@
-"""What a log holds, as text for people and machines, and as tables."""
+"""Contents of a log as text for people and programs, and as tables."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_exports_contain_every_value_of_the_log(
     rows = rows_of(log_tool("cat", path, "--json", "--topic", "*features").out)
     for kind in ("csv", "parquet", "npz"):
         outcome = log_tool("export", path, "--to", kind)
-        assert outcome.code == int(cut), outcome.err  # messages were lost where it was cut
+        assert outcome.code == int(cut), outcome.err  # messages were lost where it was cut off
         assert ("not closed" in outcome.err) == cut
     peak = np.array([row["message"]["peak_force"] for row in rows], np.float32)
     stamps = [row["message"]["header"]["stamp"] for row in rows]

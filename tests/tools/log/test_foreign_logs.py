@@ -1,4 +1,4 @@
-"""Logs of other programs and versions, and what the doctor says of odd ones."""
+"""Logs of other programs and versions, and what the doctor says about unusual ones."""
 
 from __future__ import annotations
 

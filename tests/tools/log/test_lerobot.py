@@ -1,4 +1,4 @@
-"""Logs as a LeRobot data set: what its frames hold, and LeRobot's own loader where there is one."""
+"""Logs as a LeRobot data set: contents of its frames, and LeRobot's own loader if there is one."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_streams_come_to_one_clock_as_they_were_known(
     times = np.array(rows["timestamp"].to_pylist())
     assert tactile.shape[1] == 6
     assert times == pytest.approx(np.arange(len(times)) / 20, abs=1e-6)
-    # Force is time: it never runs ahead of the clock, nor lies more than two periods behind.
+    # The force equals the time: it is never ahead of the clock, nor more than two periods behind.
     late = times - (tactile[:, 0] - tactile[0, 0])
     assert (np.abs(late) <= 0.0101).all()
     assert (np.diff(tactile[:, 0]) > 0).all()

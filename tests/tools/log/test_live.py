@@ -1,4 +1,4 @@
-"""Logs of real daemons: reprocessed to the bit, replayed on the bus, read by others' readers."""
+"""Logs of real daemons: reprocessed bit for bit, replayed on the bus, read by other readers."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _disturb(folder: Path, endpoint: str, daemon: subprocess.Popen[bytes]) -> None:
-    """Tare one board, stop the daemon for a while, and take a copy of the log as it stands."""
+    """Tare one board, stop the daemon for a while, and copy the log as it stands."""
     session = open_session(BusConfig(listen=(), connect=(endpoint,)))
     heard = {"finger": 0, "skin": 0}
 
@@ -128,7 +128,7 @@ def test_log_of_a_killed_daemon_is_reproduced_bit_for_bit(lab: Path, log_tool: A
     )
     assert len(rows) == 10
     for topic, _, old, same in rows:
-        # The raw bytes of the last few cycles were to be logged next.
+        # The raw bytes of the last few cycles had not been logged yet.
         assert int(old) - 40 <= int(same), (topic, outcome.out)
         assert int(same) > 5
 
@@ -164,13 +164,13 @@ def test_replay_uses_its_own_keys_and_original_spacing(lab: Path, tmp_path: Path
     assert {key for _, key in heard} == {
         "replay/tactile/finger/features", "replay/tactile/skin/features"
     }  # fmt: skip
-    # Two boards of 100 Hz at four times their pace; a busy machine may be slower, never faster.
+    # Two boards of 100 Hz at four times their speed; a busy machine may be slower, never faster.
     assert len(heard) / (heard[-1][0] - heard[0][0]) < 1200
 
 
 @pytest.fixture(scope="module")
 def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Log of a full reach with taxels, in lockstep."""
+    """Log of a complete reach with taxels, in lockstep."""
     path = tmp_path_factory.mktemp("trial") / "trial.mcap"
     words = ["reach", "--headless", "--strategy", "straight", "--seed", "4", "--log", str(path)]
     done = subprocess.run([command("tactile"), *words], capture_output=True, text=True, check=False)

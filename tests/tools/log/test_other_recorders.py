@@ -1,4 +1,4 @@
-"""Logs of other recorders through every tool: nothing lost unsaid, nothing printed that acts."""
+"""Logs of other recorders through every tool: losses are reported, output is harmless."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Row = tuple[int, int, int, float]  # channel, sequence, log time, value
 def write(
     path: Path, rows: Sequence[Row], names: Sequence[str] = ("/a",), *, qos: str = "", **how: Any
 ) -> Path:
-    """A log of numbers; ``qos``: of all channels; ``how``: options of the format's writer."""
+    """Write a log of numbers. ``qos``: of all channels; ``how``: options of the format's writer."""
     with path.open("wb") as file:
         writer = Writer(file, **how)
         writer.start(profile="ros2", library="another recorder")
@@ -47,7 +47,7 @@ def write(
 
 
 def steady(count: int, start: int = BASE_NS, sequence: int | None = None) -> list[Row]:
-    """``count`` messages at 10 Hz; numbered, or all with ``sequence``."""
+    """``count`` messages at 10 Hz, numbered, or all with ``sequence``."""
     return [
         (0, k if sequence is None else sequence, start + k * 10**8, float(k)) for k in range(count)
     ]
@@ -110,7 +110,7 @@ def test_duplicates_are_kept_once_and_reported_by_topic(
     rows = [*steady(30), (1, 0, BASE_NS + 1, 2.0), (1, 1, BASE_NS + 1, 2.0)]
     paths = [write(tmp_path / f"{n}.mcap", rows, ("/a", "/b")) for n in "xyz"]
     outcome = log_tool("merge", *paths, "--out", tmp_path / "m.mcap")
-    assert counts(tmp_path / "m.mcap") == {"/a": 30, "/b": 2}  # what each has twice stays twice
+    assert counts(tmp_path / "m.mcap") == {"/a": 30, "/b": 2}  # doubles in one log stay
     assert "/a: 60 messages were in several logs" in outcome.out
     assert "/b: 4 messages were in several logs" in outcome.out
 
@@ -119,7 +119,7 @@ def test_duplicates_are_kept_once_and_reported_by_topic(
 def test_merged_log_is_ordered_despite_backward_times(
     log_tool: Any, tmp_path: Path, held: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With little memory the messages that wait go to files, which are made one now and then."""
+    """With little memory the waiting messages go to files, which are merged now and then."""
     monkeypatch.setattr("tactile_tools.log.ordering.HELD_BYTES", held)
     monkeypatch.setattr("tactile_tools.log.ordering.MAX_RUNS", 3)
     monkeypatch.setattr("tactile_tools.log.ordering.STRETCH_MESSAGES", 50)
@@ -322,7 +322,7 @@ def test_raw_bytes_are_exported_only_on_request(
     assert (
         "/tactile/finger/raw"
         in log_tool("export", both, "--to", "csv", "--force", "--topic", "*/raw").err
-    )  # asked for, and told that these are no messages
+    )  # asked for by name, and reported as undecodable
 
 
 def test_service_events_and_wide_strings_are_read(
@@ -443,7 +443,7 @@ def test_recorded_qos_and_latching_are_preserved(log_tool: Any, tmp_path: Path) 
         folder = tmp_path / f"bag{len(list(tmp_path.iterdir()))}"
         assert log_tool("rosbag", path, "--out", folder).code == 0
         bag = YAML(typ="safe").load((folder / "metadata.yaml").read_text())
-        with Reader(folder) as reader:  # which compares file and YAML
+        with Reader(folder) as reader:  # compares the files with the YAML
             assert sum(1 for _ in reader.messages()) == 3
         (told,) = bag["rosbag2_bagfile_information"]["topics_with_message_count"]
         offered = told["topic_metadata"]["offered_qos_profiles"]

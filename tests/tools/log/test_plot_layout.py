@@ -1,4 +1,4 @@
-"""What a picture says is inside it and off its data; what a log does not hold is not drawn."""
+"""Texts of a picture are inside it and off its data; what a log lacks is not drawn."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> BoardSeries:
 
 
 def with_events(board: BoardSeries, count: int) -> BoardSeries:
-    """The same with ``count`` events, of texts of all lengths, and stretches that are not valid."""
+    """The same with ``count`` events, texts of all lengths and invalid stretches."""
     rng = np.random.default_rng(count)
     when = np.sort(rng.uniform(board.first, board.last, count)).tolist()
     events = [(t, f"event_{i} of $x$\n" + "and so on " * (i % 9)) for i, t in enumerate(when)]
@@ -66,10 +66,10 @@ def with_hole(board: BoardSeries, begin: float, end: float) -> BoardSeries:
 
 
 def laid_out(sheet: Sheet) -> Any:
-    """The figure; fails where it says something outside itself, on its data or on other words."""
+    """Return the figure; fail where a text is outside it, on its data or on other text."""
     figure = sheet.finish()
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # as when a layout does not fit
+        warnings.simplefilter("error")  # a layout that does not fit warns
         figure.canvas.draw()
     whole, inches = figure.bbox, figure.get_tightbbox()
     assert inches.x0 * figure.dpi >= -1
@@ -116,7 +116,7 @@ def test_event_labels_never_cover_the_data(board: BoardSeries, size: str, count:
 def test_labels_stay_inside_every_picture_and_off_the_data(
     board: BoardSeries, what: str, size: str
 ) -> None:
-    """Also with long and odd names, a hole and features that are not valid."""
+    """Also with long and odd names, a hole and invalid features."""
     names = ["_left $x$", "the right side of the finger, seen from the wrist", "tip"]
     geometry = SimpleNamespace(
         **{name: getattr(board.geometry, name) for name in (
@@ -177,7 +177,7 @@ def test_missing_data_is_distinguished_from_delay_and_rate_change() -> None:
 
 
 def test_strongest_moments_are_different_presses() -> None:
-    """A jam that chatters is one; a press held while another comes and goes is one of its own."""
+    """A jam that chatters is one press; a press held while another comes and goes is another."""
     rng = np.random.default_rng(1)
     time = np.arange(0.0, 20.0, 0.01)
     left = np.where((time > 2) & (time < 8), rng.uniform(0, 14, len(time)), 0.0)
@@ -185,7 +185,7 @@ def test_strongest_moments_are_different_presses() -> None:
     right = np.where((time > 5) & (time < 6), 6.0, 0.0)
     right += np.where((time > 15) & (time < 16.5), 2.0 + 0.1 * rng.normal(size=len(time)), 0.0)
     found = [float(time[i]) for i in presses(time, np.stack([left, right], 1), 0.3, 6)]
-    assert len(found) in (3, 4)  # the short one on the right may be told with the jam
+    assert len(found) in (3, 4)  # the short one on the right may count as part of the jam
     assert 2 < found[0] < 8
     assert 12 <= found[-2] <= 13
     assert 15 <= found[-1] <= 16.5

@@ -1,4 +1,4 @@
-"""Pictures: of every kind of log, also where something is missing; and bounded memory."""
+"""Pictures of every kind of log, also where something is missing, in bounded memory."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def skin_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def picture(path: Path) -> Any:
-    """Pixels; a picture with nothing drawn is white all over."""
+    """Pixels; a picture with nothing drawn is all white."""
     pixels = matplotlib.image.imread(path)
     assert pixels.shape[0] > 500
     assert (pixels[..., :3].min(axis=2) < 0.9).mean() > 0.005

@@ -1,4 +1,4 @@
-"""What the log tools say of what they cannot do."""
+"""What the log tools say when they cannot do something."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pipeline again over a log: the same to the bit whatever happened, or as newly asked."""
+"""The pipeline again over a log: bit for bit the same after any event, or with new settings."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_the_same_settings_give_the_same_bytes(log_tool: Any, pressed: Path) -> 
         c.topic: c.messages for c in info(pressed).channels
     }
     assert found.attachments.keys() == info(pressed).attachments.keys()
-    # What came out is a log like any other: it can be run again.
+    # The result is a log like any other, so it can be reprocessed again.
     all_same(log_tool("reprocess", out, "--out", out.with_name("third.mcap")), 150)
 
 
@@ -90,7 +90,7 @@ def test_reprocessing_is_exact_after_any_event(log_tool: Any, tmp_path: Path) ->
     daemon.set_rate(60.0)
     daemon.run(0.6)
     daemon.stalled = True
-    daemon.run(0.8)  # more than the inbox holds
+    daemon.run(0.8)  # more than the queue holds
     daemon.stalled = False
     daemon.run(0.4)
     assert daemon.inbox.dropped > 0
@@ -140,11 +140,11 @@ def test_new_settings_and_calibrations_give_new_features(
     assert outcome.code == 0, outcome.err
     new, old, same = counts(outcome.out)["/tactile/finger/features"]
     assert new == old
-    assert same < new  # without contact both say 0 N, to the bit
+    assert same < new  # without contact both give 0 N, bit for bit
     before, after = features(pressed)[-1], features(out)[-1]
     assert after.peak_force == pytest.approx(2 * before.peak_force, rel=0.1)
     assert info(out).attachments["finger.cal.toml"][1] != info(pressed).attachments
-    # and the new log holds the new calibration: alone it gives the same again
+    # The new log holds the new calibration: reprocessed alone it gives the same.
     all_same(log_tool("reprocess", out, "--out", tmp_path / "again.mcap"), 150)
     slow = log_tool(
         "reprocess", pressed, "--feature-rate", "15", "--compensation", "off", "--out",
@@ -168,7 +168,7 @@ def test_truncated_log_reprocesses_its_bytes(log_tool: Any, pressed: Path, tmp_p
     outcome = log_tool("reprocess", cut)
     assert outcome.code == 0, outcome.err
     new, old, same = counts(outcome.out)["/tactile/finger/features"]
-    # Raw bytes may be in the log before the features made of them, never the other way round here.
+    # Raw bytes may be logged before the features made of them, and never after.
     assert new >= old == same > 20
     assert "not closed" in outcome.out
 
@@ -180,7 +180,7 @@ def test_log_without_its_beginning_is_reprocessed_passively(log_tool: Any, tmp_p
     daemon.run(0.6)
     daemon.unplug()
     daemon.run(0.1)
-    daemon.open()  # whereupon the board is asked who it is
+    daemon.open()  # the board is then asked for its identity
     daemon.run(0.8)
     daemon.close()
     assert log_tool("split", path, "--at", "0.5").code == 0
@@ -191,7 +191,7 @@ def test_log_without_its_beginning_is_reprocessed_passively(log_tool: Any, tmp_p
 
 
 def without_state(part: Path, out: Path) -> None:
-    """The part as versions before wrote it, which says less of its boards."""
+    """The part as earlier versions wrote it, with less about its boards."""
     from tactile_core.log.records import MetadataRecord
     from tactile_tools.log.sources import find_series
     from tactile_tools.log.stream import Reading, Record, read_series

@@ -1,4 +1,4 @@
-"""Logs in several files: read as one, split, merged, and made a bag."""
+"""Logs in several files: read as one, split, merged, and turned into a bag."""
 
 from __future__ import annotations
 
@@ -87,13 +87,13 @@ def test_latched_values_start_every_part(
         assert counts(each)["/tactile/finger/geometry"] == 1
     merged = tmp_path / "merged.mcap"
     assert log_tool("merge", tmp_path / "parts", "--out", merged).code == 0
-    assert counts(merged) == counts(path)  # the repeated ones are told apart
+    assert counts(merged) == counts(path)  # repeated messages are recognised
 
 
 def test_logs_of_two_daemons_merge_into_one(
     log_tool: Any, recorded: Any, tmp_path: Path, counts: Any
 ) -> None:
-    """The second heard what the first said and logged it too; it began a little later."""
+    """The second daemon heard and logged what the first one published; it began a little later."""
     first = recorded(tmp_path / "tactiled.mcap", 1.0)
     second = recorded(tmp_path / "reachd.mcap", 1.0, start=0.5)
     merged = tmp_path / "trial.mcap"

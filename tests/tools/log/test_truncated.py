@@ -1,4 +1,4 @@
-"""Logs cut off at every byte, or with any byte spoilt: a clear outcome, never a traceback."""
+"""Logs cut off at every byte, or with any byte changed: a clear outcome, never a traceback."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def options(tool: Any, *words: str) -> argparse.Namespace:
 
 
 def outcome(run: Callable[[argparse.Namespace], int], given: argparse.Namespace) -> int:
-    """Exit code, as `tactile log` makes it of the two errors that tools may raise."""
+    """Exit status, as `tactile log` makes it of the two errors that tools may raise."""
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         try:
             return run(given)
@@ -41,7 +41,7 @@ def outcome(run: Callable[[argparse.Namespace], int], given: argparse.Namespace)
 @pytest.fixture
 def tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Callable[[Path], int]]:
     out = tmp_path / "out"
-    monkeypatch.setattr(DiskStorage, "sync", lambda *_: None)  # thousands of times is the disk's
+    monkeypatch.setattr(DiskStorage, "sync", lambda *_: None)  # not thousands of flushes
 
     def fixed(module: Any, *words: str) -> Callable[[Path], int]:
         given = options(module, "x", *words)
@@ -76,7 +76,7 @@ def test_log_cut_at_any_byte_is_read_up_to_the_cut(
     for name, found in codes.items():
         assert found[-1] == 0, name
         assert set(found) <= {0, 1, 2}, name
-        # Without its first eight bytes it is no log; with them it is one, though not whole.
+        # Without its first eight bytes it is not a log; with them it is one, though incomplete.
         assert set(found[:8]) == {2}, name
     assert set(codes["doctor"][8:-1]) == {1}
     assert set(codes["info"][8:]) == {0}

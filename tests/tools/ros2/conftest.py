@@ -1,4 +1,4 @@
-"""A ROS 2 router as rmw_zenohd is configured, a bus with a publisher, messages of any type."""
+"""A ROS 2 router configured like rmw_zenohd, a bus with a publisher, messages of any type."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PATIENCE_S = 30.0
 
 
 def until(done: Callable[[], Any], seconds: float = PATIENCE_S) -> Any:
-    """What ``done`` returns as soon as that is true."""
+    """Return what ``done`` returns, as soon as that is true."""
     end = time.monotonic() + seconds
     while not (found := done()):
         assert time.monotonic() < end, "waited too long"
@@ -39,7 +39,7 @@ def free_endpoint() -> str:
 
 
 def plain_session(**values: object) -> zenoh.Session:
-    """A zenoh session of somebody else's; ``a__b`` stands for the setting ``a/b``."""
+    """A zenoh session of another program; ``a__b`` stands for the setting ``a/b``."""
     config = zenoh.Config()
     for key, value in (
         {"scouting__multicast__enabled": False, "scouting__delay": 0} | values
@@ -49,7 +49,7 @@ def plain_session(**values: object) -> zenoh.Session:
 
 
 class Router:
-    """As rmw_zenohd: a router that does not forward between peers."""
+    """Like rmw_zenohd: a router that does not forward between peers."""
 
     def __init__(self) -> None:
         self.endpoint = free_endpoint()
@@ -70,7 +70,7 @@ class Router:
 
 
 class RosPeer:
-    """A ROS node of somebody else's: a peer at the router, as rmw_zenoh's sessions are."""
+    """A ROS node of another program: a peer at the router, like rmw_zenoh's sessions."""
 
     def __init__(self, router: Router) -> None:
         self.session = plain_session(mode="peer", connect__endpoints=[router.endpoint])
@@ -91,7 +91,7 @@ class RosPeer:
 
 
 class Bus:
-    """A daemon's session with its publishers, and the endpoint where it is met."""
+    """A daemon's session with its publishers, and the endpoint where others join it."""
 
     def __init__(self) -> None:
         self.endpoint = free_endpoint()
@@ -118,7 +118,7 @@ class Bus:
 
 
 def fill(msgtype: str, rng: np.random.Generator) -> Any:
-    """A message of a type with every field set to something."""
+    """A message of a type with a value in every field."""
 
     def value(description: Any) -> Any:
         kind, detail = description
@@ -163,7 +163,7 @@ def bus() -> Iterator[Bus]:
 
 
 class Running:
-    """A bridge with its two sessions, ticked by the test."""
+    """A bridge with its two sessions, driven by the test."""
 
     def __init__(self, bus: Bus, router: Router, **options: Any) -> None:
         node_options = {key: options.pop(key) for key in ("namespace", "domain") if key in options}
@@ -189,7 +189,7 @@ class Running:
 
 @pytest.fixture
 def start_bridge(bus: Bus, router: Router) -> Iterator[Callable[..., Running]]:
-    """``start_bridge(**options)``: a bridge between ``bus`` and ``router``."""
+    """``start_bridge(**options)``: start a bridge between ``bus`` and ``router``."""
     made: list[Running] = []
 
     def start(**options: Any) -> Running:
@@ -203,12 +203,12 @@ def start_bridge(bus: Bus, router: Router) -> Iterator[Callable[..., Running]]:
 
 @pytest.fixture
 def filled() -> Callable[[str], Any]:
-    """``filled(msgtype)``: a message with every field set to something."""
+    """``filled(msgtype)``: a message with a value in every field."""
     rng = np.random.default_rng(1)
     return lambda msgtype: fill(msgtype, rng)
 
 
 @pytest.fixture
 def wait() -> Callable[..., Any]:
-    """``wait(done)``: what ``done`` returns as soon as that is true."""
+    """``wait(done)``: return what ``done`` returns, as soon as that is true."""
     return until

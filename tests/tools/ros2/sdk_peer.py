@@ -1,8 +1,8 @@
 """A ROS 2 node made with zenoh-ros2-sdk; run by an interpreter that has it.
 
 ``sdk_peer.py ROUTER_PORT DEFINITIONS JOB``: definitions as PACKAGE/msg/NAME.msg. JOB is JSON:
-topics to hear (topic, type), messages to publish, for how long. Prints what was heard, one JSON a
-line.
+topics to hear (topic, type), messages to publish, and for how long. Prints what was heard, one JSON
+object per line.
 """
 
 import json
@@ -20,7 +20,7 @@ from zenoh_ros2_sdk.session import ZenohSession
 
 
 def plain(value: object) -> object:
-    """A message as JSON has it."""
+    """A message as plain values for JSON."""
     if isinstance(value, np.ndarray):
         return [plain(each) for each in value.tolist()]
     if isinstance(value, list):

@@ -122,7 +122,7 @@ def test_late_subscriber_gets_the_geometry(
     data: list[bytes] = []
     running.until(passed_on)
     got: list[bytes] = []
-    # As rmw_zenoh subscribes to what is transient local.
+    # rmw_zenoh subscribes to transient local topics like this.
     late = zenoh.ext.declare_advanced_subscriber(
         peer.session,
         ros_key(GEOMETRY),
@@ -233,7 +233,7 @@ def test_too_many_streams_are_refused_and_counted(
     assert len(running.bridge.routes) <= 256
 
 
-# From ROS.
+# From ROS
 
 
 def test_nothing_is_accepted_unasked(
@@ -366,7 +366,7 @@ def test_router_may_go_and_come_back(
     again.close()
 
 
-# As a process.
+# As a process
 
 
 def bridge_process(bus: Any, router: str, *words: str) -> subprocess.Popen[str]:

@@ -106,9 +106,8 @@ def test_a_ros_controller_reaches_the_goal(
             state["seen"].add(message.state)
             state["activity"].add(message.activity)
             speed = np.hypot(message.commanded.linear.x, message.commanded.linear.y)
-            assert (
-                speed <= parameters("authors_sim").safety.speed + 1e-9
-            )  # four times was asked for
+            # Four times the limit was asked for.
+            assert speed <= parameters("authors_sim").safety.speed + 1e-9
         status = ask("status") if asked % 50 == 0 else None
         return status and (status.get("outcome") or {}).get("success") is not None and status
 

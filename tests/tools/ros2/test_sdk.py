@@ -1,7 +1,7 @@
-"""Both ways against zenoh-ros2-sdk, which speaks rmw_zenoh's protocol independently of us.
+"""Both directions against zenoh-ros2-sdk, an independent implementation of rmw_zenoh's protocol.
 
-It works out hashes of types from definitions by itself: those of our package as it is in the
-repository, and of the standard ones.
+It computes hashes of types from definitions by itself: those of our package in the repository, and
+those of standard types.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SHARED = set(ROS_TOPIC.values())
 
 @pytest.fixture
 def sdk(router: Any, tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
-    """``sdk(hear=..., publish=...)``: the other node, as a process."""
+    """``sdk(hear=..., publish=...)``: start the other node as a process."""
     python = os.environ.get(PYTHON)
     if python is None:
         pytest.skip(f"{PYTHON} does not name an interpreter with zenoh-ros2-sdk")
@@ -55,7 +55,7 @@ def sdk(router: Any, tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            # Behind a router that does not forward between peers, as in the shipped configuration.
+            # For a router that does not forward between peers, as in the shipped configuration.
             env=os.environ | {"ZENOH_CONFIG_OVERRIDE": "scouting/multicast/enabled=false"},
         )
 
@@ -63,7 +63,7 @@ def sdk(router: Any, tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
 
 
 def _standard() -> set[str]:
-    """Standard types that ours hold, directly or within one another."""
+    """Standard types that ours contain, directly or nested."""
     found: set[str] = set()
     todo = [t.msgtype for t in TOPICS] + [WANTED.msgtype, "geometry_msgs/msg/PoseStamped"]
     while todo:

@@ -1,5 +1,4 @@
-"""A board that is a script, a tactiled and a page, as real processes; and a browser where there is
-one."""
+"""Real processes: a scripted board, a tactiled and a page; and a browser, if there is one."""
 
 from __future__ import annotations
 
@@ -86,7 +85,7 @@ class Rig:
         )  # fmt: skip
 
     def page(self, *words: str) -> str:
-        """The address of a new page."""
+        """Start a page; returns its address."""
         view = self.start(
             command("tactile"), "view", "--port", "0", "--connect", self.endpoint, *words
         )
@@ -118,7 +117,7 @@ def make_rig(tmp_path: Path) -> Iterator[Callable[[], Rig]]:
 
 
 class Viewer:
-    """What a browser does, without one: takes frames and says which it has drawn."""
+    """Does what a browser does: takes frames and reports which it has drawn."""
 
     def __init__(self, address: str, **options: Any) -> None:
         host = address.removeprefix("http://").partition("/")[0]

@@ -1,4 +1,4 @@
-"""Who may open the page: pure decisions, and the kernel's word on who owns a connection."""
+"""Who may open the page: pure decisions, and the kernel's answer on who owns a connection."""
 
 from __future__ import annotations
 

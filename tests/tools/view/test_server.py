@@ -1,4 +1,4 @@
-"""The page's server as a process: values, refusals, slow and many viewers, actions, logs."""
+"""The page's server as a process: values, refusals, slow and many viewers, requests, logs."""
 
 from __future__ import annotations
 
