@@ -51,8 +51,10 @@ hold_s = 30.0
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Logs of tactiled on a finger and an AnySkin board: ``run.mcap``, and ``cut.mcap``, what
-    there was of it at some moment, as after a `kill -9`."""
+    """Logs of tactiled on a finger and an AnySkin board.
+
+    ``run.mcap``, and ``cut.mcap``: a copy made meanwhile, like what a `kill -9` leaves.
+    """
     folder = tmp_path_factory.mktemp("lab")
     (folder / "press.toml").write_text(PRESS)
     simdevice, tactiled = command("simdevice"), command("tactiled")

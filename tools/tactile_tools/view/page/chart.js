@@ -1,4 +1,4 @@
-// Forces of the last seconds as curves.
+// Draws the forces of the last seconds as curves.
 
 export function colours() {
   const style = getComputedStyle(document.documentElement);
@@ -6,7 +6,7 @@ export function colours() {
 }
 
 export function fit(canvas, height) {
-  // Sharp on every screen; drawing is then in CSS pixels.
+  // Use the screen's resolution; drawing is in CSS pixels.
   const width = canvas.clientWidth, ratio = Math.min(window.devicePixelRatio || 1, 3);
   const w = Math.round(width * ratio), h = Math.round(height * ratio);
   if (canvas.width !== w || canvas.height !== h) {
@@ -36,7 +36,7 @@ export class Chart {
 
   add(t, total, sides) {
     const last = this.points.at(-1);
-    if (last && t < last[0]) this.points.length = 0; // another place of a log
+    if (last && t < last[0]) this.points.length = 0; // a jump to another place of a log
     if (last && t === last[0]) return;
     this.points.push([t, total, ...SIDES.map((side) => sides[side] || 0)]);
     let old = 0;
@@ -51,7 +51,7 @@ export class Chart {
     let most = 0.5;
     for (const p of points) if (p[0] >= now - this.span && p[1] > most) most = p[1];
     const goal = most * 1.12;
-    // Up at once, down slowly: a scale that jumps cannot be read.
+    // The scale grows at once and shrinks slowly: one that jumps cannot be read.
     this.top = goal > this.top ? goal : Math.max(goal, this.top * 0.985);
     const step = STEPS.find((s) => this.top / s <= 3.6) || 2000;
     const x = (t) => left + (1 - (now - t) / this.span) * (width - left - right);
@@ -108,7 +108,7 @@ export class Chart {
     pen.strokeStyle = colour.accent;
     curve(1);
     pen.restore();
-    // What is what, upper right.
+    // Legend, upper right.
     const words = [["normal force", "accent"]];
     if (shown.length > 1) for (const side of shown) if (SIDES.includes(side)) words.push([side, side]);
     pen.textAlign = "right";

@@ -1,4 +1,4 @@
-// The cupboard from above: x into it is up, y is left. Objects, finger, contacts, target, path.
+// Draws the cupboard from above (x into it is up, y is left): objects, finger, contacts, path.
 
 import { fit } from "/chart.js";
 import { arrow } from "/skin.js";
@@ -29,7 +29,7 @@ export class Cupboard {
     }
     if (pose) for (const [x, y] of shape.finger) { const p = place(pose, x, y); xs.push(p[0]); ys.push(p[1]); }
     const want = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
-    // The picture stays put unless something would leave it.
+    // The view is fixed unless something would leave it.
     this.box = this.box ? this.box.map((v, i) => (i < 2 ? Math.min(v, want[i]) : Math.max(v, want[i]))) : want;
     const [x0, y0, x1, y1] = this.box;
     const scale = Math.min((width - 16) / (y1 - y0), (height - 16) / (x1 - x0));

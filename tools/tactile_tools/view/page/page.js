@@ -1,4 +1,4 @@
-// The live page: takes frames from the server, draws the newest, and says which it has drawn.
+// The live page: receives frames, draws the newest, and reports which it has drawn.
 
 import { Chart, colours } from "/chart.js";
 import { Cupboard } from "/cupboard.js";
@@ -233,7 +233,7 @@ class BoardCard extends Card {
     set(this.get("calibration"), board.nominal === null ? "–" : board.nominal ? "nominal" : "calibrated");
     set(this.get("log"), board.log || "none", board.log && board.log !== "recording" ? "warn" : "");
     this.drawRecording(board.recording);
-    // Logs of trials on contacts alone have no taxels.
+    // Logs of trials with exact contacts have no taxels.
     $(".skin", this.root).hidden = Boolean(frame.log) && !board.taxels;
     this.skin.draw(board.taxels, force?.sides ?? {}, colour);
     this.chart.draw(frame.t, this.sides, colour);

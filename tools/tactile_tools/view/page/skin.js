@@ -1,4 +1,4 @@
-// The unrolled skin: circles for normal force, arrows for shear, as in the paper's Figure 1.
+// Draws the unrolled skin: circles for normal force, arrows for shear, as in the paper's Figure 1.
 
 import { fit } from "/chart.js";
 
@@ -7,7 +7,7 @@ const LEAST_N = 0.04; // below, a taxel is a dot
 const LEAST_SHEAR_N = 0.08;
 const MARGIN_MM = 7, GAP = 18, HEAD = 24, FOOT = 26, MAX_HEIGHT = 400, MAX_SCALE = 7.5;
 const FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif';
-// Walking round the finger from its right rear corner, as seen from outside.
+// Order around the finger from its right rear corner, as seen from outside.
 const ORDER = { right: 0, tip: 1, left: 2, none: 3 };
 
 export class Skin {
@@ -39,7 +39,7 @@ export class Skin {
     this.canvas.setAttribute("aria-label", `Skin of ${layout.taxels} taxels in ${this.arrays.length} arrays`);
   }
 
-  // Rows of arrays that give the largest picture.
+  // Choose the number of rows that gives the largest picture.
   #arrange(width) {
     let best = null;
     const n = this.arrays.length;
@@ -49,7 +49,7 @@ export class Skin {
       const wide = Math.min(...rows.map((r) => (width - GAP * (r.length - 1)) / sum(r.map((a) => a.w))));
       const tall = (MAX_HEIGHT - FOOT - rows.length * (HEAD + 8)) / sum(rows.map((r) => Math.max(...r.map((a) => a.h))));
       const scale = Math.min(wide, tall, MAX_SCALE);
-      // One row is worth something: neighbours on the skin are neighbours in the picture.
+      // Prefer one row: neighbours on the skin are then neighbours in the picture.
       const worth = scale * (rows.length === 1 ? 1.25 : 1);
       if (scale > 0 && (!best || worth > best.worth)) best = { rows, scale, worth };
     }
@@ -157,7 +157,7 @@ export class Skin {
     const radius = radiusOf(force, place.unit);
     const bound = taxels.b[place.index] / 1000;
     if (bound > 0 && bound <= force) {
-      // Between the circles of the least and the greatest force that it may be.
+      // The ring between the circles of the least and the greatest possible force.
       const outer = radiusOf(force + bound, place.unit), inner = radiusOf(Math.max(force - bound, 0), place.unit);
       pen.globalAlpha = 0.16;
       pen.fillStyle = colour.accent;
@@ -166,7 +166,7 @@ export class Skin {
       pen.arc(place.x, place.y, inner, 0, 7, true);
       pen.fill("evenodd");
     }
-    // What may as well be nothing is faint.
+    // A force that may be zero is drawn faintly.
     const sure = !(bound > force);
     pen.globalAlpha = sure ? 0.5 : 0.22;
     pen.fillStyle = colour.accent;
@@ -291,7 +291,7 @@ export function arrow(pen, x0, y0, x1, y1, colour, width = 2) {
 }
 
 function radiusOf(force, unit) {
-  // The area stands for the force.
+  // The area is proportional to the force.
   return Math.min(Math.sqrt(force / FULL_N) * unit * 0.75, unit * 1.25);
 }
 
