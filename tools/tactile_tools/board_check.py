@@ -116,7 +116,6 @@ class Host:
         self.node = node
         self.reopened = 0
         self.heard: list[Heard] = []
-        self.refused: dict[str, int] = {}
         self.fd = fd
         self._serial = SerialDecoder()
         self._can = CanDecoder()
@@ -124,7 +123,7 @@ class Host:
         self._request = 0
         self._transfer: dict[int, int] = {}
 
-    def take_node(self, node: int) -> None:
+    def set_node(self, node: int) -> None:
         """Talk to board ``node`` alone from now on."""
         self.node = node
         self._encoder = CanEncoder(node, self.fd)
@@ -177,13 +176,13 @@ class Host:
             if isinstance(chunk.payload, bytes):
                 received = self._serial.feed(chunk.payload)
             else:
-                received = self._can.feed(self._mine(chunk.payload))
+                received = self._can.feed(self._own_frames(chunk.payload))
             for item in received:
                 if not isinstance(item.message, FloatSamples):
                     self.heard.append(Heard(item.message, chunk.received))
         return True
 
-    def _mine(self, frames: tuple[CanFrame, ...]) -> list[CanFrame]:
+    def _own_frames(self, frames: tuple[CanFrame, ...]) -> list[CanFrame]:
         """Frames of our board; those of other boards on the bus are not judged."""
         return [
             f
@@ -205,13 +204,13 @@ class Host:
                         found[item.board] = item.message
         return found
 
-    def of(self, kind: type[Message], first: int = 0) -> list[Heard]:
+    def messages(self, kind: type[Message], first: int = 0) -> list[Heard]:
         """Messages of type ``kind``, from index ``first`` of all messages on."""
         return [h for h in self.heard[first:] if isinstance(h.message, kind)]
 
-    def hears(self, kind: type[Message], first: int, seconds: float) -> bool:
+    def wait_for(self, kind: type[Message], first: int, seconds: float) -> bool:
         """Wait up to ``seconds`` for a message of type ``kind``, from index ``first`` on."""
-        return self.listen(seconds, lambda: bool(self.of(kind, first)))
+        return self.listen(seconds, lambda: bool(self.messages(kind, first)))
 
     def refusals(self) -> dict[str, int]:
         """Count what the board sent and our decoder refused, by reason."""
@@ -246,8 +245,8 @@ class Host:
         for _ in range(round(ANSWER_S / REPEAT_S)):
             mark = len(self.heard)
             self.send(Identify(self.next_request(), major))
-            if self.hears(Descriptor, mark, REPEAT_S):
-                message = self.of(Descriptor, mark)[-1].message
+            if self.wait_for(Descriptor, mark, REPEAT_S):
+                message = self.messages(Descriptor, mark)[-1].message
                 assert isinstance(message, Descriptor)
                 return message
         raise Failed("Identify was not answered")
@@ -269,7 +268,7 @@ class Host:
 
     def ack(self, request: int, first: int) -> Ack | None:
         """The ack of ``request`` from index ``first`` on, if it has come."""
-        for h in self.of(Ack, first):
+        for h in self.messages(Ack, first):
             if isinstance(h.message, Ack) and h.message.request == request:
                 return h.message
         return None
@@ -277,9 +276,9 @@ class Host:
     def status(self) -> Status:
         """Wait for the next status; `Failed` when none comes in time."""
         mark = len(self.heard)
-        if not self.listen(ANSWER_S, lambda: bool(self.of(Status, mark))):
+        if not self.listen(ANSWER_S, lambda: bool(self.messages(Status, mark))):
             raise Failed(f"no status in {ANSWER_S:g} s")
-        message = self.of(Status, mark)[0].message
+        message = self.messages(Status, mark)[0].message
         assert isinstance(message, Status)
         return message
 
@@ -339,13 +338,13 @@ def _gain(
     )
 
 
-def ok(said: AckResult, of: str) -> None:
+def require_ok(said: AckResult, of: str) -> None:
     """`Failed` unless the command was obeyed."""
     if said is not AckResult.OK:
         raise Failed(f"{of} was answered with {said.name}")
 
 
-def refused(said: AckResult, of: str, wanted: AckResult = AckResult.BAD_ARGUMENT) -> None:
+def require_refusal(said: AckResult, of: str, wanted: AckResult = AckResult.BAD_ARGUMENT) -> None:
     """`Failed` unless the command was refused with ``wanted``."""
     if said is not wanted:
         raise Failed(f"{of} was answered with {said.name} instead of {wanted.name}")
@@ -376,12 +375,12 @@ def _answers_other_majors(board: Board) -> str:
 def _comes_back_after_reboot(board: Board) -> str:
     """Leaves the board stopped."""
     host = board.host
-    ok(host.command(Reboot), "Reboot")
+    require_ok(host.command(Reboot), "Reboot")
     mark, reopened = len(host.heard), host.reopened
     end = after(host.now(), RETURN_S)
 
     def told() -> list[Heard]:
-        return [h for h in host.of(Status, mark) if _uptime(h) < 1000 * (FIRST_STATUS_S + 1)]
+        return [h for h in host.messages(Status, mark) if _uptime(h) < 1000 * (FIRST_STATUS_S + 1)]
 
     while not told():
         try:
@@ -394,7 +393,7 @@ def _comes_back_after_reboot(board: Board) -> str:
     assert isinstance(first, Status)
     # Between ack and reset a board may go on streaming; half a second before this status it was
     # surely reset.
-    if any(seconds_between(h.when, told()[0].when) < 0.5 for h in host.of(Samples, mark)):
+    if any(seconds_between(h.when, told()[0].when) < 0.5 for h in host.messages(Samples, mark)):
         raise Failed("it streams before Start")
     if first.reset_cause != 1:
         raise Failed(f"reset_cause is {first.reset_cause} instead of 1, command")
@@ -430,7 +429,7 @@ def _is_silent_until_start(board: Board) -> str:
 def _begins_at_sequence_0(board: Board) -> str:
     host = board.host
     mark = len(host.heard)
-    ok(host.command(Start), "Start")
+    require_ok(host.command(Start), "Start")
     host.samples(3, board.patience + RETURN_S)
     first = host.all_samples(mark)[0].sequence
     status = host.status()
@@ -494,7 +493,7 @@ def _reads_its_chips(board: Board) -> str:
 
 def _obeys_start_while_streaming(board: Board) -> str:
     before = board.host.samples(2, board.patience)[-1].sequence
-    ok(board.host.command(Start), "a second Start")
+    require_ok(board.host.command(Start), "a second Start")
     if board.host.samples(2, board.patience)[-1].sequence <= before:
         raise Failed("its sequence began anew")
     return ""
@@ -516,9 +515,9 @@ def _answers_clock_polls(board: Board) -> str:
         mark = len(host.heard)
         asked = host.now()
         host.send(ClockPoll(token))
-        if not host.hears(ClockReply, mark, ANSWER_S):
+        if not host.wait_for(ClockReply, mark, ANSWER_S):
             raise Failed("a clock poll was not answered")
-        heard = host.of(ClockReply, mark)[0]
+        heard = host.messages(ClockReply, mark)[0]
         reply = heard.message
         assert isinstance(reply, ClockReply)
         if reply.token != token:
@@ -544,7 +543,7 @@ def _refuses_rates(board: Board) -> str:
     most = board.descriptor.max_rate_mhz
     for rate in (0, most + 1, 0xFFFF_FFFF):
         if rate <= 0xFFFF_FFFF:
-            refused(host.command(_rate(rate)), f"Set rate {rate} mHz")
+            require_refusal(host.command(_rate(rate)), f"Set rate {rate} mHz")
     rate = host.status().rate_mhz
     if rate != board.default_mhz:
         raise Failed(f"a refused rate left it at {rate} mHz instead of {board.default_mhz}")
@@ -558,7 +557,7 @@ def _keeps_rates(board: Board) -> str:
     for rate in sorted({most, most * 2 // 3, most // 7, min(most, 33_333)}):
         if rate < 1000 and rate != most:
             continue
-        ok(host.command(_rate(rate)), f"Set rate {rate} mHz")
+        require_ok(host.command(_rate(rate)), f"Set rate {rate} mHz")
         first_array = d.arrays[0].array
         cycles = max(8, min(40, rate // 1000))
         samples = host.samples(cycles, ANSWER_S + 3000 * cycles / rate)
@@ -567,7 +566,7 @@ def _keeps_rates(board: Board) -> str:
         if said != rate:
             raise Failed(f"after Set rate {rate} its status says {said}")
         told.append(f"{rate / 1000:g}")
-    ok(host.command(_rate(board.default_mhz)), "Set rate to the default")
+    require_ok(host.command(_rate(board.default_mhz)), "Set rate to the default")
     return f"{', '.join(told)} Hz"
 
 
@@ -618,7 +617,7 @@ def _refuses_gains(board: Board) -> str:
         ("with filter 255", _gain(255, 5, 0, 0, 255)),
     ):
         said = host.command(make)
-        refused(said, f"Set gain {what}")
+        require_refusal(said, f"Set gain {what}")
     if host.identify() != board.descriptor:
         raise Failed("a refused gain changed the descriptor")
     return ""
@@ -628,10 +627,10 @@ def _refuses_gains_too_slow_for_the_rate(board: Board) -> str:
     if not _mlx(board):
         raise Skipped("its chips are not known here")
     host = board.host
-    ok(host.command(_rate(board.default_mhz)), "Set rate")
+    require_ok(host.command(_rate(board.default_mhz)), "Set rate")
     if board.default_mhz < 15_000:
         raise Skipped("its default rate is slow enough for every filter")
-    refused(host.command(_gain(255, 5, 0, 3, 7)), "a filter of 0.2 s")
+    require_refusal(host.command(_gain(255, 5, 0, 3, 7)), "a filter of 0.2 s")
     return ""
 
 
@@ -642,12 +641,12 @@ def _sets_gain(board: Board) -> str:
     said = host.command(_gain(255, 7, 0, 0, 2))
     if said is AckResult.BAD_ARGUMENT:
         raise Skipped("its gain cannot be set")
-    ok(said, "Set gain 7")
+    require_ok(said, "Set gain 7")
     d = host.identify()
     for a in d.arrays:
         if (a.lsb_xy_nt, a.lsb_z_nt) != LSB_NT[7]:
             raise Failed(f"array {a.array} has {a.lsb_xy_nt}/{a.lsb_z_nt} nT after gain 7: 150/242")
-    ok(host.command(_gain(d.arrays[0].array, 5, 0, 0, 2)), "Set gain of one array")
+    require_ok(host.command(_gain(d.arrays[0].array, 5, 0, 0, 2)), "Set gain of one array")
     changed = host.identify()
     got = [(a.lsb_xy_nt, a.lsb_z_nt) for a in changed.arrays]
     if got != [LSB_NT[5], *[LSB_NT[7]] * (len(got) - 1)]:
@@ -664,8 +663,8 @@ def _mlx(board: Board) -> bool:
 def _stops_and_goes_on(board: Board) -> str:
     host = board.host
     before = host.samples(2, board.patience)[-1].sequence
-    ok(host.command(Stop), "Stop")
-    ok(host.command(Stop), "a second Stop")
+    require_ok(host.command(Stop), "Stop")
+    require_ok(host.command(Stop), "a second Stop")
     host.listen(0.2)  # what was still on its way
     mark = len(host.heard)
     host.listen(max(0.3, min(3.0, 3000 / board.default_mhz)))
@@ -675,7 +674,7 @@ def _stops_and_goes_on(board: Board) -> str:
         raise Failed("its status gives a rate while it is stopped")
     last = host.all_samples()[-1].sequence
     mark = len(host.heard)
-    ok(host.command(Start), "Start")
+    require_ok(host.command(Start), "Start")
     host.samples(2, board.patience)
     resumed = host.all_samples(mark)[0].sequence
     status = host.status()
@@ -696,11 +695,11 @@ def _refuses_unknown_commands(board: Board) -> str:
     assert ack is not None
     if ack.command != UNKNOWN_COMMAND:
         raise Failed(f"the ack names command {ack.command:02X}h")
-    refused(ack.result, "a command of a newer version", AckResult.UNKNOWN_COMMAND)
+    require_refusal(ack.result, "a command of a newer version", AckResult.UNKNOWN_COMMAND)
     mark = len(host.heard)
     host.send_raw(OTHER_BOARDS_TYPE, b"\x01\x02")
     host.listen(0.3)
-    if host.of(Ack, mark):
+    if host.messages(Ack, mark):
         raise Failed("it answers a message that only boards send")
     status = host.status()
     if status.rx_errors < before + 2:
@@ -717,7 +716,7 @@ def _reads_longer_commands(board: Board) -> str:
         raise Failed("Start with the fields of a newer version was not answered")
     ack = host.ack(request, mark)
     assert ack is not None
-    ok(ack.result, "Start with the fields of a newer version")
+    require_ok(ack.result, "Start with the fields of a newer version")
     return ""
 
 
@@ -794,7 +793,9 @@ def _survives_a_flood(board: Board) -> str:
     host.status()
     refusals = host.status().rx_errors - before
     tokens = [
-        h.message.token for h in host.of(ClockReply, mark) if isinstance(h.message, ClockReply)
+        h.message.token
+        for h in host.messages(ClockReply, mark)
+        if isinstance(h.message, ClockReply)
     ]
     if len(set(tokens)) != len(tokens) or tokens != sorted(tokens):
         raise Failed("replies come twice or in another order")
@@ -808,7 +809,7 @@ def _survives_a_flood(board: Board) -> str:
 
 def _counts_what_it_drops(board: Board) -> str:
     host = board.host
-    ok(host.command(Stop), "Stop")
+    require_ok(host.command(Stop), "Stop")
     host.listen(0.3)
     host.status()
     status = host.status()
@@ -818,16 +819,16 @@ def _counts_what_it_drops(board: Board) -> str:
         raise Failed(f"{missing} cycles never came; its overruns say {status.overruns}")
     if not got[-1] < status.cycles <= got[-1] + 1 + status.overruns:
         raise Failed(f"{got[-1] + 1} cycles by sequence; its status says {status.cycles}")
-    ok(host.command(Start), "Start")
+    require_ok(host.command(Start), "Start")
     return f"{len(got)} cycles, {missing} missing, {status.overruns} told"
 
 
 def _forgets_with_a_reset(board: Board) -> str:
     changed = board.descriptor
-    ok(board.host.command(_rate(max(1, changed.max_rate_mhz // 2))), "Set rate")
+    require_ok(board.host.command(_rate(max(1, changed.max_rate_mhz // 2))), "Set rate")
     _comes_back_after_reboot(board)
     mark = len(board.host.heard)
-    ok(board.host.command(Start), "Start")
+    require_ok(board.host.command(Start), "Start")
     board.host.samples(1, board.patience)
     first = board.host.all_samples(mark)[0].sequence
     status = board.host.status()
@@ -835,7 +836,7 @@ def _forgets_with_a_reset(board: Board) -> str:
         raise Failed(f"its sequence begins with {first}")
     if status.rate_mhz != board.default_mhz:
         raise Failed(f"its rate is {status.rate_mhz} mHz instead of {board.default_mhz}")
-    ok(board.host.command(Stop), "Stop")
+    require_ok(board.host.command(Stop), "Stop")
     return ""
 
 
@@ -843,7 +844,7 @@ def _writes_well_formed_messages(board: Board) -> str:
     wrong = board.host.refusals()
     if wrong:
         raise Failed(", ".join(f"{n} {reason}" for reason, n in wrong.items()))
-    logs = [h.message for h in board.host.of(Log) if isinstance(h.message, Log)]
+    logs = [h.message for h in board.host.messages(Log) if isinstance(h.message, Log)]
     return f"{len(board.host.heard)} messages, {len(logs)} of them log lines"
 
 
@@ -953,5 +954,5 @@ def connect(options: argparse.Namespace) -> Host:
                 if found
                 else f"no board answers on {options.can}: see that it is powered, and the bit rate"
             )
-        host.take_node(next(iter(found)))
+        host.set_node(next(iter(found)))
     return host

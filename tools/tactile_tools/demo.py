@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
     return code
 
 
-def _start_of(path: Path) -> bytes:
+def _first_bytes(path: Path) -> bytes:
     with path.open("rb") as file:
         return file.read(len(MAGIC))
 
@@ -89,9 +89,11 @@ def demo_files(stem: str, options: argparse.Namespace) -> tuple[Path, Path]:
     if log is None:
         numbers = itertools.count(2)
         log = Path(f"{stem}.mcap")
-        while not options.force and (log.exists() or (png is None and _beside(log).exists())):
+        while not options.force and (
+            log.exists() or (png is None and _picture_beside(log).exists())
+        ):
             log = Path(f"{stem}-{next(numbers)}.mcap")
-    png = _beside(log) if png is None else png
+    png = _picture_beside(log) if png is None else png
     for flag, path in (("--log", log), ("--png", png)):
         if not path.resolve().parent.is_dir():
             raise CommandError(
@@ -99,12 +101,12 @@ def demo_files(stem: str, options: argparse.Namespace) -> tuple[Path, Path]:
             )
         if path.exists() and not options.force:
             raise CommandError(f"{flag} {path} exists: name another, or overwrite it with --force")
-    if log.is_dir() or (log.exists() and _start_of(log) != MAGIC):
+    if log.is_dir() or (log.exists() and _first_bytes(log) != MAGIC):
         raise CommandError(f"--log {log} exists and is not a log: name another")
     return log, png
 
 
-def _beside(log: Path) -> Path:
+def _picture_beside(log: Path) -> Path:
     return log.with_suffix(".png")
 
 
@@ -139,7 +141,7 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
             else:
                 print(f"The live page could not be opened: {said.read_text()[-300:]}", flush=True)
         stack.enter_context(rig)
-        code = _ended(rig.reachd(options.strategy, TIME_LIMIT_S, "--log", str(options.log)))
+        code = _wait_for_exit(rig.reachd(options.strategy, TIME_LIMIT_S, "--log", str(options.log)))
         if code == 1:
             print(*rig.arm_errors(), sep="\n", end="")
         if code == 3:
@@ -170,7 +172,7 @@ def _is_served(port: int, process: subprocess.Popen[bytes]) -> bool:
     return False
 
 
-def _ended(process: subprocess.Popen[bytes]) -> int:
+def _wait_for_exit(process: subprocess.Popen[bytes]) -> int:
     """Wait for a process and return its exit code.
 
     After Ctrl-C, which the process receives as well, it gets time to end in order.

@@ -35,10 +35,10 @@ def echo(options: argparse.Namespace) -> int:
             if sample is None:
                 quiet = time.monotonic() - since
                 if options.timeout is not None and quiet > options.timeout:
-                    watching.say_quiet("echo", options.key)
+                    watching.report_silence("echo", options.key)
                     return watching.REFUSED
                 if not told and not printed and quiet > watching.QUIET_S:
-                    watching.say_quiet("echo", options.key)
+                    watching.report_silence("echo", options.key)
                     told = True
                 continue
             since = time.monotonic()
@@ -67,9 +67,3 @@ def echo(options: argparse.Namespace) -> int:
 def _as_stream(sample: zenoh.Sample, msgtype: str) -> LogStream:
     schema = codec().schema(msgtype)
     return LogStream(str(sample.key_expr), msgtype, schema.encoding, schema.data, "cdr")
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) == 0:
-        raise argparse.ArgumentTypeError(f"{text} given; allowed: a whole number above 0")
-    return int(text)

@@ -69,7 +69,7 @@ DONE, USAGE, REFUSED = 0, 2, 3
 def run(options: argparse.Namespace) -> int:
     """Serve viewers until stopped; returns the exit status."""
     try:
-        import foxglove  # noqa: F401
+        import foxglove  # noqa: F401 - is it installed?
     except ImportError:
         print("tactile foxglove: needs `pip install 'tactile-reach[foxglove]'`", file=sys.stderr)
         return REFUSED
@@ -131,7 +131,7 @@ class Live:
         self._latched: dict[str, tuple[bytes, int]] = {}  # last message by topic, and its time
         self._boards: set[str] = set()
         self._reaches: set[str] = set()
-        self._met: dict[tuple[str, str], None] = {}  # new boards and reaches, as (kind, name)
+        self._unserved: dict[tuple[str, str], None] = {}  # new boards and reaches, as (kind, name)
         self._lock = threading.Lock()
         logging.getLogger("foxglove").setLevel(logging.WARNING)
         try:
@@ -164,8 +164,8 @@ class Live:
 
     def tick(self) -> None:
         """Offer the services of boards and reaches heard for the first time."""
-        for kind, name in list(self._met):
-            del self._met[kind, name]
+        for kind, name in list(self._unserved):
+            del self._unserved[kind, name]
             if kind == "tactile":
                 self._boards.add(name)
                 key = service_key(name, "geometry")
@@ -230,6 +230,7 @@ class Live:
                 )
                 continue
             try:
+                # Anything but a number ends in TypeError or ValueError below.
                 rate = float(parameter.get_value())  # type: ignore[arg-type]
                 key = service_key(board, "set_rate")
                 call(self._bus, key, {"rate_hz": rate}, STATUS_TIMEOUT_S)
@@ -250,9 +251,9 @@ class Live:
                 self.counts["too_many_streams"] += 1
                 return
             if topic is FEATURES and name not in self._boards:
-                self._met["tactile", name] = None
+                self._unserved["tactile", name] = None
             elif topic is REACH_STATE and name not in self._reaches:
-                self._met["reach", name] = None
+                self._unserved["reach", name] = None
         wall_ns = time.time_ns() if sample.wall_ns is None else max(0, sample.wall_ns)
         if topic.latched:
             self._latched[path] = (sample.data, wall_ns)

@@ -76,11 +76,11 @@ def hz(options: argparse.Namespace) -> int:
             for name, key in sorted(keys.items()):
                 print(f"{name:{width}} {key.line(now - last)}", flush=True)
             if not heard and not told and now - start > watching.QUIET_S:
-                watching.say_quiet("hz", options.key)
+                watching.report_silence("hz", options.key)
                 told = True
             last = now
     if not heard:
         if not told:
-            watching.say_quiet("hz", options.key)
+            watching.report_silence("hz", options.key)
         return watching.REFUSED
     return watching.DONE

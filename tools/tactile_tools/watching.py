@@ -47,7 +47,7 @@ def run(name: str, work: Callable[[argparse.Namespace], int | None]) -> Callable
     return command
 
 
-def say_quiet(name: str, key: str) -> None:
+def report_silence(name: str, key: str) -> None:
     """Tell a waiting user that nothing has come yet."""
     print(
         f"tactile {name}: nothing on {key} yet; `tactile list` shows what is published",

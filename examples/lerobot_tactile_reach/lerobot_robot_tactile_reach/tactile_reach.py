@@ -136,7 +136,7 @@ class TactileReach(Robot):
                 self._wait(name, board)
             if self.robot is not None:
                 self.robot.connect(calibrate)
-        except BaseException:
+        except BaseException:  # also on Ctrl-C, the bus must be left
             self._leave()
             raise
 

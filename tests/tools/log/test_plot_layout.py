@@ -14,7 +14,7 @@ import pytest
 
 from tactile_tools.plot import curves, skin
 from tactile_tools.plot.curves import broken, holes, presses
-from tactile_tools.plot.look import LOOKS, Sheet, drawn
+from tactile_tools.plot.look import LOOKS, Sheet, styled
 from tactile_tools.plot.series import BoardSeries, Track, read_boards
 from tests.support import virtual_daemon
 
@@ -61,7 +61,7 @@ def with_hole(board: BoardSeries, begin: float, end: float) -> BoardSeries:
                 kept.add(time, item)
         return kept
 
-    tracks = ("forces", "delays", "felt", "removed", "warmth", "told")
+    tracks = [name for name in vars(board) if isinstance(getattr(board, name), Track)]
     return dataclasses.replace(board, **{name: cut(getattr(board, name)) for name in tracks})
 
 
@@ -99,7 +99,7 @@ def laid_out(sheet: Sheet) -> Any:
 )
 def test_event_labels_never_cover_the_data(board: BoardSeries, size: str, count: int) -> None:
     look = LOOKS[size]
-    with drawn(look):
+    with styled(look):
         figure = laid_out(curves.forces_sheet(with_events(board, count), look))
         texts = [t.get_text() for axes in figure.axes for t in axes.texts]
     listed = [text for text in texts if " s: event_" in text]
@@ -129,7 +129,7 @@ def test_labels_stay_inside_every_picture_and_off_the_data(
         features.valid, features.reasons = False, [REASON, "taring", "another_reason"]
     look = LOOKS[size]
     try:
-        with drawn(look):
+        with styled(look):
             figure = laid_out(SHEETS[what](odd, look=look))
     finally:
         for features, valid, reasons in held:
@@ -145,7 +145,7 @@ def test_labels_stay_inside_every_picture_and_off_the_data(
 
 def test_no_line_is_drawn_across_missing_data(board: BoardSeries) -> None:
     look = LOOKS["screen"]
-    with drawn(look):
+    with styled(look):
         for build in (curves.forces_sheet, curves.field_sheet, curves.timing_sheet):
             figure = build(with_hole(board, 0.8, 1.2), look).figure
             drawn_lines = 0
@@ -197,14 +197,16 @@ def test_strongest_moments_are_different_presses() -> None:
 
 
 def test_early_clock_estimates_do_not_set_the_scale(board: BoardSeries) -> None:
-    told = Track()
+    track = Track()
     rng = np.random.default_rng(2)
     for second in range(60):
         error = 4000e-6 if second < 3 else 40e-6 + 5e-6 * rng.normal()
-        told.add(board.first + second / 30, {"clock_rate_error": f"{error}"})
+        track.add(board.first + second / 30, {"clock_rate_error": f"{error}"})
     look = LOOKS["screen"]
-    with drawn(look):
-        figure = laid_out(curves.timing_sheet(dataclasses.replace(board, told=told), look))
+    with styled(look):
+        figure = laid_out(
+            curves.timing_sheet(dataclasses.replace(board, diagnostics_track=track), look)
+        )
     (axes,) = [a for a in figure.axes if "ppm" in a.get_ylabel()]
     low, high = axes.get_ylim()
     assert 0 < low < high < 100
@@ -224,9 +226,9 @@ def test_board_of_very_many_arrays_is_drawn_partially_with_a_note(board: BoardSe
     for time in board.time:
         forces.add(time, -np.abs(rng.normal(size=(4 * times, 3))).astype(np.float32))
     many = dataclasses.replace(
-        board, geometry=geometry, forces=forces, felt=Track(), removed=Track()
+        board, geometry=geometry, force_track=forces, feature_track=Track(), ambient_track=Track()
     )
-    with drawn(LOOKS["column"]):
+    with styled(LOOKS["column"]):
         figure = laid_out(skin.overview_sheet(many, look=LOOKS["column"]))
     keys = [t.get_text() for legend in figure.legends for t in legend.texts]
     assert "28 arrays that bear less are not drawn" in keys

@@ -163,7 +163,7 @@ def test_board_without_compensation_or_clock_is_drawn(skin_log: Path, tmp_path: 
     board = read_boards(skin_log)["finger"]
     bare = BoardSeries(
         "bare", geometry=board.geometry, cycles=board.cycles, first=board.first, last=board.last,
-        forces=board.forces, delays=board.delays,
+        force_track=board.force_track, delay_track=board.delay_track,
     )  # fmt: skip
     for drawer in (draw, draw_field, draw_timing):
         drawer(bare, tmp_path / "bare.png")

@@ -148,7 +148,7 @@ def _typed_reader(msgtype: str, schema_encoding: str, definition: bytes) -> Read
         if not name:
             raise DecodeError(f"does not hold {msgtype}")
         wide = _prepare(fields)
-        missing = _undefined(name, fields)
+        missing = _missing_types(name, fields)
         if EVENT_INFO in missing:
             fields[EVENT_INFO] = get_typestore(Stores.ROS2_JAZZY).fielddefs[EVENT_INFO]
             missing.remove(EVENT_INFO)
@@ -271,10 +271,10 @@ def _prepare(types: dict[str, Any]) -> bool:
     """
     wide = False
 
-    def mend(kind: Any, arguments: Any) -> tuple[Any, Any]:
+    def fixed(kind: Any, arguments: Any) -> tuple[Any, Any]:
         nonlocal wide
         if kind in (ARRAY, SEQUENCE):
-            return kind, (mend(*arguments[0]), arguments[1])
+            return kind, (fixed(*arguments[0]), arguments[1])
         if kind == NAME and arguments.rpartition("/")[2] == "wstring":
             kind, arguments = BASE, ("wstring", 0)
         elif kind == NAME:
@@ -283,8 +283,8 @@ def _prepare(types: dict[str, Any]) -> bool:
         return kind, arguments
 
     for name, (constants, fields) in list(types.items()):
-        mended = [(field, mend(*description)) for field, description in fields]
-        types[name] = (constants, mended or [(DUMMY, (BASE, ("uint8", 0)))])
+        fixed_fields = [(field, fixed(*description)) for field, description in fields]
+        types[name] = (constants, fixed_fields or [(DUMMY, (BASE, ("uint8", 0)))])
     return wide
 
 
@@ -300,7 +300,7 @@ def _names(msgtype: str) -> tuple[str, ...]:
     return name, f"{package}/msg/{last}"
 
 
-def _undefined(msgtype: str, fields: dict[str, Any]) -> list[str]:
+def _missing_types(msgtype: str, fields: dict[str, Any]) -> list[str]:
     """Types that are used and not defined."""
     missing: list[str] = []
     todo, seen = [msgtype], set()

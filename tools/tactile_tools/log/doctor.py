@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
     rows, sick = [], False
     for number, series in enumerate(find_series(options.files)):
         with progress("examining") as report:
-            watch = _Watch()
+            watch = _DecodeCheck()
             found = info_of(series.paths, report, watch.take)
         findings = examine(found, series, watch)
         sick |= any(finding.fault for finding in findings)
@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
     return FAULTY if sick else 0
 
 
-class _Watch:
+class _DecodeCheck:
     """Tries to decode the first message of every channel."""
 
     def __init__(self) -> None:
@@ -90,7 +90,7 @@ class _Watch:
             self.troubles[channel.topic] = str(error)
 
 
-def examine(found: LogInfo, series: Series, watch: _Watch) -> list[Finding]:
+def examine(found: LogInfo, series: Series, watch: _DecodeCheck) -> list[Finding]:
     """Return all findings, faults first."""
     findings = [*_file_findings(found, series), *_content_findings(found, watch)]
     return sorted(findings, key=lambda finding: not finding.fault)
@@ -142,7 +142,7 @@ def _file_findings(found: LogInfo, series: Series) -> list[Finding]:
     return out
 
 
-def _content_findings(found: LogInfo, watch: _Watch) -> list[Finding]:
+def _content_findings(found: LogInfo, watch: _DecodeCheck) -> list[Finding]:
     """Findings about what the files hold."""
     out = []
     gone = "what was not written cannot be had again"

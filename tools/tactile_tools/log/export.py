@@ -54,8 +54,8 @@ def run(options: argparse.Namespace) -> int:
     chosen = select(options)
     left_out: set[str] = set()
     if chosen.wanted is None:
-        chosen = replace(chosen, wanted=partial(_is_no_raw, left_out))
-    _allow_files()
+        chosen = replace(chosen, wanted=partial(_is_exported, left_out))
+    _raise_file_limit()
     source = chosen.logs[0].paths[0]
     out: Path = options.out or source.with_name(f"{source.stem}_{options.format}")
     _check_folder(out, options.force)
@@ -89,7 +89,7 @@ def _lerobot(options: argparse.Namespace) -> int:
     return lerobot.run(logs, out, fps=options.fps, task=options.task, force=options.force)
 
 
-def _is_no_raw(left_out: set[str], topic: str) -> bool:
+def _is_exported(left_out: set[str], topic: str) -> bool:
     """Return whether a topic is to be exported; topics of boards' raw bytes go to ``left_out``."""
     found = find_topic(topic)
     if found is None or found[0] != RAW:
@@ -98,7 +98,7 @@ def _is_no_raw(left_out: set[str], topic: str) -> bool:
     return False
 
 
-def _allow_files() -> None:
+def _raise_file_limit() -> None:
     """Raise our limit of open files as far as the system allows: there is one file per topic."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_FILES)

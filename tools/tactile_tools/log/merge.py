@@ -17,7 +17,7 @@ from tactile_core.log.records import MetadataRecord
 from tactile_core.log.writer import GAP
 from tactile_core.types import NS_PER_S
 from tactile_tools.log.arguments import check_output
-from tactile_tools.log.ordering import InOrder, Stretches
+from tactile_tools.log.ordering import Stretches, TimeSorter
 from tactile_tools.log.sources import FILE, Series, find_series
 from tactile_tools.log.stream import (
     Attachment,
@@ -53,14 +53,14 @@ def run(options: argparse.Namespace) -> int:
     shifts = _shifts(logs, options.align)
     reading = Reading()
     with progress("looking through") as report:
-        surveys = [_survey(series, report) for series in logs]
+        surveys = [_first_pass(series, report) for series in logs]
     streams = Counter(stream for survey in surveys for stream in survey.streams)
     shared = {stream for stream, count in streams.items() if count > 1}
     counted = {stream for survey in surveys for stream in survey.counted}
-    seen = Copies(shared)
+    seen = CopyFilter(shared)
     with progress("merging") as report, LogOutput(options.out, common_profile(logs)) as output:
         output.metadata(FILE, {"set": uuid.uuid4().hex, "file": "0"})
-        tables = Tables(logs, output)
+        tables = ExtrasMerger(logs, output)
         for number, item in _merged(logs, surveys, shifts, reading, report, options.out.parent):
             if not isinstance(item, Record):
                 tables.take(number, item)
@@ -91,7 +91,7 @@ class Survey:
     stretches: Stretches = field(default_factory=Stretches)
 
 
-def _survey(series: Series, report: Any) -> Survey:
+def _first_pass(series: Series, report: Any) -> Survey:
     survey, reading = Survey(), Reading()
     for item in read_series(series, reading, report):
         if isinstance(item, Record):
@@ -123,7 +123,7 @@ def _merged(
         shift = shifts[number]
         time = max(0, surveys[number].stretches.first_ns + shift)
         items = read_series(logs[number], reading, report if progress is not None else None)
-        ordered = InOrder(surveys[number].stretches, folder).sort(items)
+        ordered = TimeSorter(surveys[number].stretches, folder).sort(items)
         for count, item in enumerate(ordered):
             if isinstance(item, Record):
                 if shift:
@@ -165,7 +165,7 @@ def _shifts(logs: list[Series], align: bool) -> list[int]:
     return [0] * len(logs)
 
 
-class Copies:
+class CopyFilter:
     """Recognises messages that another log has already written, in streams that several logs share.
 
     A copy has the same bytes and the same stamp of its sender, and was logged at about the same
@@ -212,7 +212,7 @@ class Copies:
             del self._seen[order.popleft()[1]]
 
 
-class Tables:
+class ExtrasMerger:
     """Metadata and attachments of several logs: those that differ get the name of their log.
 
     What one log holds twice stays twice; what another log holds in the same form is not added.

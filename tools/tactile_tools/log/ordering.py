@@ -79,7 +79,7 @@ class _Waiting(NamedTuple):
     record: Record
 
 
-class InOrder:
+class TimeSorter:
     """Sorts one log. ``folder``: where files of waiting messages are made."""
 
     def __init__(self, stretches: Stretches, folder: Path) -> None:

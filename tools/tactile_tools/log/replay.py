@@ -59,11 +59,11 @@ def run(options: argparse.Namespace) -> int:
     finally:
         player.close()
         close_session(session)
-    _tell(player, rounds, stopped=stopping.is_set())
+    _report(player, rounds, stopped=stopping.is_set())
     return 0
 
 
-def _tell(player: Player, rounds: int, *, stopped: bool) -> None:
+def _report(player: Player, rounds: int, *, stopped: bool) -> None:
     console = plain_console()
     console.print(
         f"{'stopped: ' if stopped else ''}{player.sent} messages under {PREFIX}/"

@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
             raise ToolError(f"{folder} is there already: name a new folder with --out")
         fresh = not folder.exists()
         try:
-            paths = _bring(series, folder)
+            paths = _copy_files(series, folder)
         except (ToolError, LogError):
             if fresh:
                 shutil.rmtree(folder, ignore_errors=True)
@@ -79,7 +79,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _bring(series: Series, folder: Path) -> list[Path]:
+def _copy_files(series: Series, folder: Path) -> list[Path]:
     """Put the files of a log into a new folder, each of them complete."""
     paths = []
     try:

@@ -85,8 +85,8 @@ class Parts:
         self._identity = uuid.uuid4().hex
         self._tables: dict[str, MetadataRecord] = {}
         self._files: dict[str, Attachment] = {}
-        self._staying: dict[Stream, Record] = {}
-        self._kept: dict[Stream, bool] = {}
+        self._last_latched: dict[Stream, Record] = {}
+        self._latched: dict[Stream, bool] = {}
         self._output = self._open()
 
     def __enter__(self) -> Parts:
@@ -122,8 +122,8 @@ class Parts:
                 self._files[item.name] = Attachment.of(*item[:4], item.read())
         else:
             output.write(item)
-            if self._stays(item.stream):
-                self._staying[item.stream] = item
+            if self._is_latched(item.stream):
+                self._last_latched[item.stream] = item
 
     def cut(self, log_ns: int) -> None:
         """Continue in a new file, which begins at ``log_ns``, unless the present one is empty."""
@@ -138,7 +138,7 @@ class Parts:
             self._output.metadata(table.name, table.values)
         for each in self._files.values():
             self._output.attach(each)
-        for record in self._staying.values():
+        for record in self._last_latched.values():
             self._output.write(record._replace(log_ns=log_ns))
 
     def _open(self) -> LogOutput:
@@ -157,8 +157,8 @@ class Parts:
         if error is None:
             self.made.append((output.path, output.messages))
 
-    def _stays(self, stream: Stream) -> bool:
-        stays = self._kept.get(stream)
-        if stays is None:
-            stays = self._kept[stream] = is_latched(stream.topic, dict(stream.metadata))
-        return stays
+    def _is_latched(self, stream: Stream) -> bool:
+        latched = self._latched.get(stream)
+        if latched is None:
+            latched = self._latched[stream] = is_latched(stream.topic, dict(stream.metadata))
+        return latched

@@ -14,12 +14,12 @@ from tactile_tools.plot.look import (
     SCREEN,
     Look,
     Sheet,
-    drawn,
     named,
     plain,
     plain_ticks,
-    say,
     shortened,
+    show_text,
+    styled,
     width_pt,
 )
 from tactile_tools.plot.series import LATENCY_BINS, BoardSeries, Spread
@@ -151,7 +151,7 @@ def ambient(axes: Axes, board: BoardSeries, look: Look = SCREEN) -> None:
     axes.set_ylabel("ambient field\nremoved, µT")
     axes.grid(visible=True)
     if not board.ambient:
-        say(axes, "compensation was off")
+        show_text(axes, "compensation was off")
         return
     plane = np.stack([np.asarray(m.plane, float).reshape(-1, 3, 3) for m in board.ambient])
     valid = np.stack([np.asarray(m.valid, bool) for m in board.ambient])
@@ -169,8 +169,8 @@ def ambient(axes: Axes, board: BoardSeries, look: Look = SCREEN) -> None:
 
 def latency(axes: Axes, board: BoardSeries, look: Look = SCREEN) -> None:
     """Draw the time from capture to receipt."""
-    delays = np.asarray(board.delays.items, float).reshape(-1, 3)[:, 0] * 1e3
-    axes.plot(*broken(board.delays.time, delays), color=COLOURS[0], lw=0.8 * look.thin)
+    delays = np.asarray(board.delay_track.items, float).reshape(-1, 3)[:, 0] * 1e3
+    axes.plot(*broken(board.delay_track.time, delays), color=COLOURS[0], lw=0.8 * look.thin)
     axes.set_ylabel("captured →\nreceived, ms")
     _logarithmic(axes, delays)
     axes.grid(visible=True)
@@ -180,7 +180,7 @@ def draw_forces(
     board: BoardSeries, out: Path, look: Look = SCREEN, dpi: int | None = None, title: str = ""
 ) -> None:
     """Write contact forces, peak and tip, net wrench, taxels in contact, and events."""
-    with drawn(look):
+    with styled(look):
         forces_sheet(board, look, title).save(out, dpi)
 
 
@@ -210,7 +210,7 @@ def forces_sheet(board: BoardSeries, look: Look = SCREEN, title: str = "") -> Sh
         })  # fmt: skip
     else:
         for axes in rows:
-            say(axes, "the log holds no features")
+            show_text(axes, "the log holds no features")
     rows[1].set_ylabel("normal force, N")
     rows[2].set_ylabel("net force on\nthe skin, N")
     rows[3].set_ylabel("taxels")
@@ -227,7 +227,7 @@ def draw_field(
     board: BoardSeries, out: Path, look: Look = SCREEN, dpi: int | None = None, title: str = ""
 ) -> None:
     """Write the field removed, its support, the residual, and temperature."""
-    with drawn(look):
+    with styled(look):
         field_sheet(board, look, title).save(out, dpi)
 
 
@@ -251,8 +251,8 @@ def field_sheet(board: BoardSeries, look: Look = SCREEN, title: str = "") -> She
                     label=named(label),
                 )
     else:
-        say(rows[1], "compensation was off")
-        say(rows[2], "compensation was off")
+        show_text(rows[1], "compensation was off")
+        show_text(rows[2], "compensation was off")
     _warmth(rows[3], board, labels, look)
     rows[1].set_ylabel("taxels that\nsupport the fit, %")
     rows[1].set_ylim(0, 105)
@@ -268,10 +268,10 @@ def field_sheet(board: BoardSeries, look: Look = SCREEN, title: str = "") -> She
 
 
 def _warmth(axes: Axes, board: BoardSeries, labels: list[str], look: Look) -> None:
-    if not len(board.warmth):
-        say(axes, "no field is in this log")
+    if not len(board.temperature_track):
+        show_text(axes, "no field is in this log")
         return
-    warmth = [np.atleast_1d(item) for item in board.warmth.items]
+    warmth = [np.atleast_1d(item) for item in board.temperature_track.items]
     width = min(len(item) for item in warmth)
     curves = np.stack([item[:width] for item in warmth]).astype(float)
     if width > len(labels):
@@ -281,7 +281,7 @@ def _warmth(axes: Axes, board: BoardSeries, labels: list[str], look: Look) -> No
         curves, labels = mean[:, None], ["mean of all taxels"]
     for index, curve in enumerate(curves.T):
         axes.plot(
-            *broken(board.warmth.time, curve),
+            *broken(board.temperature_track.time, curve),
             color=COLOURS[index % 6],
             lw=0.8 * look.thin,
             label=named(labels[index] if index < len(labels) else str(index)),
@@ -292,7 +292,7 @@ def draw_timing(
     board: BoardSeries, out: Path, look: Look = SCREEN, dpi: int | None = None, title: str = ""
 ) -> None:
     """Write latency, uncertainty of stamps, clock error and drops, with their distributions."""
-    with drawn(look):
+    with styled(look):
         timing_sheet(board, look, title).save(out, dpi)
 
 
@@ -311,8 +311,8 @@ def timing_sheet(board: BoardSeries, look: Look = SCREEN, title: str = "") -> Sh
         places = [grid[i, j] for j in (0, 1) for i in range(3)]
     rows = [sheet.figure.add_subplot(places[0])]
     rows += [sheet.figure.add_subplot(place, sharex=rows[0]) for place in places[1:3]]
-    times = board.delays.time
-    delays = np.asarray(board.delays.items, float).reshape(-1, 3) * 1e3
+    times = board.delay_track.time
+    delays = np.asarray(board.delay_track.items, float).reshape(-1, 3) * 1e3
     thin = 0.8 * look.thin
     for column, index, label in ((0, 0, "captured → received"),
                                  (2, 1, "received → in the log's queue")):  # fmt: skip
@@ -346,11 +346,13 @@ def _clock(axes: Axes, board: BoardSeries, look: Look) -> None:
     """Draw the error of the board's clock; the time before it was known does not set the scale."""
     errors = [
         (when, float(values["clock_rate_error"]) * 1e6)
-        for when, values in zip(board.told.time, board.told.items, strict=True)
+        for when, values in zip(
+            board.diagnostics_track.time, board.diagnostics_track.items, strict=True
+        )
         if _is_number(values.get("clock_rate_error", ""))
     ]
     if not errors:
-        say(axes, "this board has no clock of its own")
+        show_text(axes, "this board has no clock of its own")
         return
     times, values = np.array(errors).T
     axes.plot(*broken(times, values), "o-", ms=3 * look.thin, color=COLOURS[3], lw=0.9 * look.thin)
@@ -389,7 +391,7 @@ def _histogram(sheet: Sheet, axes: Axes, spread: Spread, what: str, index: int) 
     axes.set_xlabel(f"{what}, ms")
     axes.set_ylabel("cycles")
     if not spread.number:
-        say(axes, "nothing to count")
+        show_text(axes, "nothing to count")
         return
     edges = LATENCY_BINS * 1e3
     axes.stairs(spread.counts[1:-1], edges, fill=True, color=COLOURS[index], alpha=0.6)
@@ -585,7 +587,7 @@ def _list(sheet: Sheet, axes: Axes, lines: Sequence[str]) -> None:
                 transform=axes.transAxes, fontsize=size, va="center", in_layout=False,
             )  # fmt: skip
 
-    sheet.later(write)
+    sheet.defer(write)
 
 
 def _is_number(text: str) -> bool:

@@ -133,7 +133,7 @@ class Sheet:
         engine.set(w_pad=pad, h_pad=pad)
         self.figure.suptitle(said, fontsize=size)
         self._legends: list[tuple[Axes, str]] = []
-        self._later: list[Callable[[], None]] = []
+        self._deferred: list[Callable[[], None]] = []
         self._keys: list[tuple[Any, str]] = []
 
     def legend(self, axes: Axes, title: str = "") -> None:
@@ -144,9 +144,9 @@ class Sheet:
         """Explain ``handle`` (a patch, a line) below everything else."""
         self._keys.append((handle, text))
 
-    def later(self, draw: Callable[[], None]) -> None:
+    def defer(self, draw: Callable[[], None]) -> None:
         """Call ``draw`` once all sizes are known."""
-        self._later.append(draw)
+        self._deferred.append(draw)
 
     def finish(self) -> Any:
         """Return the figure with everything in place."""
@@ -154,12 +154,12 @@ class Sheet:
         engine: Any = self.figure.get_layout_engine()
         with _quiet():
             engine.execute(self.figure)
-        for draw in self._later:
+        for draw in self._deferred:
             draw()
-        more = sum(self._name(axes, title) for axes, title in self._legends)
+        more = sum(self._place_legend(axes, title) for axes, title in self._legends)
         width, height = self.figure.get_size_inches()
         self.figure.set_size_inches(width, height + more * self.look.line_in)
-        self._later.clear()
+        self._deferred.clear()
         self._legends.clear()
         return self.figure
 
@@ -188,7 +188,7 @@ class Sheet:
         )  # fmt: skip
         self._keys.clear()
 
-    def _name(self, axes: Axes, title: str) -> int:
+    def _place_legend(self, axes: Axes, title: str) -> int:
         """Draw the legend; returns its lines beyond the first."""
         handles, labels = axes.get_legend_handles_labels()
         if not handles:
@@ -219,7 +219,7 @@ def named(name: str) -> str:
 
 
 @contextmanager
-def drawn(look: Look) -> Iterator[None]:
+def styled(look: Look) -> Iterator[None]:
     """Draw with the sizes of ``look`` inside the block, and show text literally."""
     import matplotlib as mpl  # takes 0.3 s: import it only when a picture is wanted
 
@@ -268,7 +268,7 @@ def plain_ticks(axis: Any, low: float, high: float) -> None:
     axis.set_ticks([], minor=True)
 
 
-def say(axes: Axes, text: str) -> None:
+def show_text(axes: Axes, text: str) -> None:
     """Write ``text`` in the middle of ``axes``, which are otherwise empty."""
     axes.set_yticks([])
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color="0.4")

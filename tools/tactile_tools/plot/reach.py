@@ -12,7 +12,7 @@ import numpy as np
 from tactile_core.bus.markers import ADD, CYLINDER
 from tactile_core.geometry import FINGER_OUTLINE, TIP_X
 from tactile_tools.plot.curves import MISSING, broken, explain_shades, holes
-from tactile_tools.plot.look import SCREEN, Look, Sheet, drawn, named, plain, shortened
+from tactile_tools.plot.look import SCREEN, Look, Sheet, named, plain, shortened, styled
 from tactile_tools.plot.reach_series import Contact, ReachSeries, read_reach, turned
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def draw_reach(
 
 def draw(reach: ReachSeries, out: Path, look: Look = SCREEN, dpi: int | None = None) -> None:
     """Write the picture of one reach."""
-    with drawn(look):
+    with styled(look):
         reach_sheet(reach, look).save(out, dpi)
 
 
@@ -296,7 +296,7 @@ def _contacts(sheet: Sheet, axes: Axes, reach: ReachSeries, moments: Sequence[in
         for contact in contacts:
             _shear(axes, contact, look)
         marks.append((number, _flip(max(contacts, key=lambda c: c.normal).place)))
-    sheet.later(lambda: _number(sheet, axes, marks))
+    sheet.defer(lambda: _number(sheet, axes, marks))
 
 
 def _number(sheet: Sheet, axes: Axes, marks: Sequence[tuple[int, Any]]) -> None:
@@ -409,7 +409,7 @@ def _legends(sheet: Sheet, axes: Axes, activities: Sequence[str], moved: bool) -
         key: Any = legend.legend_handles[index]
         key.set_markersize(M_AT_1_N * math.sqrt(5.0) * per_m)
 
-    sheet.later(size)
+    sheet.defer(size)
 
 
 def _distance(axes: Axes, reach: ReachSeries, look: Look) -> None:

@@ -38,7 +38,7 @@ class Contact:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class ReachSummary:
     """A reach in the log: its name, its strategy, and how it ended ("" if unknown)."""
 
     name: str
@@ -67,7 +67,7 @@ class ReachSeries:
     boards: dict[str, tuple[list[float], list[Any]]] = field(default_factory=dict)
     arm_name: str = ""
     board_name: str = ""
-    all_reaches: tuple[Told, ...] = ()
+    all_reaches: tuple[ReachSummary, ...] = ()
     left_out: int = 0
     newest: Any = None
 
@@ -200,31 +200,33 @@ def read_reach(
         reader.take(topic, name, message)
     first = path if isinstance(path, Path) else path[0]
     series = reader.chosen
-    told = tuple(reader.told)
-    if not told:
+    summaries = tuple(reader.summaries)
+    if not summaries:
         raise LogUnreadableError(
             f"{first} holds no reach: was it written by reachd or `tactile reach --log`?"
         )
     if series is None:
-        raise ToolError(f"no reach {number} in the log; it holds {len(told)}:\n{listed(told)}")
+        raise ToolError(
+            f"no reach {number} in the log; it holds {len(summaries)}:\n{listed(summaries)}"
+        )
     if not series.arms:
         raise LogUnreadableError(
             f"{first} holds no states of an arm during reach {series.number}, so that it is not "
             "known where the finger was: was the arm's topic logged?"
         )
-    series.all_reaches = told
+    series.all_reaches = summaries
     series.arm_name = _choose("arm", arm, series.arms)
     series.board_name = _choose("board", board, series.boards)
     return series
 
 
-def listed(told: Sequence[Told]) -> str:
+def listed(summaries: Sequence[ReachSummary]) -> str:
     """List the reaches, one per line."""
-    many = len({reach.name for reach in told}) > 1
+    many = len({reach.name for reach in summaries}) > 1
     return "\n".join(
         f"  {number}  {reach.name + ': ' if many else ''}{reach.strategy}, "
         f"{reach.outcome or 'no outcome in the log'}"
-        for number, reach in enumerate(told, 1)
+        for number, reach in enumerate(summaries, 1)
     )
 
 
@@ -239,7 +241,7 @@ class _Reader:
     """Reads a log and keeps one reach of it."""
 
     def __init__(self, wanted: int | None) -> None:
-        self.told: list[Told] = []
+        self.summaries: list[ReachSummary] = []
         self.chosen: ReachSeries | None = None
         self._wanted = wanted
         self._world: Any = None
@@ -266,9 +268,9 @@ class _Reader:
         series = self._current.get(name)
         under_way = message.state in UNDER_WAY
         if under_way and (series is None or series.ended or series.is_over(message)):
-            self.told.append(Told(name, message.strategy, ""))
+            self.summaries.append(ReachSummary(name, message.strategy, ""))
             series = ReachSeries(
-                message.stamped_ns, self._world, name, len(self.told), last_world=self._world
+                message.stamped_ns, self._world, name, len(self.summaries), last_world=self._world
             )
             self._current[name] = series
             if self._wanted in (None, series.number):
@@ -289,8 +291,10 @@ class _Reader:
         if now < 0 or (series.ended and message.kind != "outcome"):
             return
         if message.kind == "outcome" and series.outcome() is None:
-            known = self.told[series.number - 1]
-            self.told[series.number - 1] = Told(known.name, known.strategy, message.code)
+            known = self.summaries[series.number - 1]
+            self.summaries[series.number - 1] = ReachSummary(
+                known.name, known.strategy, message.code
+            )
         if len(series.events) < MAX_POINTS:
             series.events.append((now, message))
 

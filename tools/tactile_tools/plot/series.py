@@ -135,12 +135,14 @@ class BoardSeries:
     first: float = 0.0
     last: float = 0.0
     lost: int = 0  # cycles missing in the sequence
-    forces: Track = field(default_factory=Track)  # (N, 3) N, taxel axes
-    delays: Track = field(default_factory=Track)  # (captured to received, uncertainty, to log), s
-    felt: Track = field(default_factory=Track)  # features
-    removed: Track = field(default_factory=Track)  # ambient
-    warmth: Track = field(default_factory=Track)  # °C, one per array
-    told: Track = field(default_factory=Track)  # diagnostics as dictionaries
+    force_track: Track = field(default_factory=Track)  # (N, 3) N, taxel axes
+    delay_track: Track = field(
+        default_factory=Track
+    )  # (captured to received, uncertainty, to log), s
+    feature_track: Track = field(default_factory=Track)  # features
+    ambient_track: Track = field(default_factory=Track)  # ambient
+    temperature_track: Track = field(default_factory=Track)  # °C, one per array
+    diagnostics_track: Track = field(default_factory=Track)  # diagnostics as dictionaries
     latency_spread: Spread = field(default_factory=Spread)
     logging_spread: Spread = field(default_factory=Spread)
     period_spread: Spread = field(default_factory=Spread)
@@ -152,32 +154,32 @@ class BoardSeries:
     @property
     def time(self) -> list[float]:
         """Times of `force`, s."""
-        return self.forces.time
+        return self.force_track.time
 
     @property
     def force(self) -> list[FloatArray]:
         """Force on each taxel, (N, 3) N each."""
-        return self.forces.items
+        return self.force_track.items
 
     @property
     def feature_time(self) -> list[float]:
         """Times of `features`, s."""
-        return self.felt.time
+        return self.feature_track.time
 
     @property
     def features(self) -> list[Any]:
         """Messages of type ``ContactFeatures``."""
-        return self.felt.items
+        return self.feature_track.items
 
     @property
     def ambient_time(self) -> list[float]:
         """Times of `ambient`, s."""
-        return self.removed.time
+        return self.ambient_track.time
 
     @property
     def ambient(self) -> list[Any]:
         """Messages of type ``AmbientField``."""
-        return self.removed.items
+        return self.ambient_track.items
 
     def array_slices(self) -> list[tuple[str, slice]]:
         """Name and taxels of each array, in order."""
@@ -212,11 +214,13 @@ class BoardSeries:
             now = (message.captured_ns - start) * 1e-9
             if topic == FEATURES:
                 total = sum(patch.normal_force for patch in message.patches)
-                self.felt.add(now, message, max(total, message.peak_force))
+                self.feature_track.add(now, message, max(total, message.peak_force))
             elif topic == AMBIENT:
-                self.removed.add(now, message)
+                self.ambient_track.add(now, message)
             elif topic == FIELD:
-                self.warmth.add(now, np.asarray(message.temperature_c, np.float32).copy())
+                self.temperature_track.add(
+                    now, np.asarray(message.temperature_c, np.float32).copy()
+                )
 
     def remark(self, when: float, text: str) -> None:
         """Keep an event, or count it where there are too many."""
@@ -227,12 +231,14 @@ class BoardSeries:
 
     def _take_forces(self, message: Any, log_ns: int, now: float) -> None:
         force = np.asarray(message.force, np.float32).reshape(-1, 3).copy()
-        self.forces.add(now, force, float(np.nan_to_num(-force[:, 2]).max(initial=0.0)))
+        self.force_track.add(now, force, float(np.nan_to_num(-force[:, 2]).max(initial=0.0)))
         delay = (message.received_ns - message.captured_ns) * 1e-9
         # The header's stamp is the instant of capture on the wall clock of the log.
         offset = stamp_ns(message.header.stamp) - message.captured_ns
         logged = (log_ns - offset - message.received_ns) * 1e-9
-        self.delays.add(now, (delay, float(message.uncertainty), logged), delay + max(0.0, logged))
+        self.delay_track.add(
+            now, (delay, float(message.uncertainty), logged), delay + max(0.0, logged)
+        )
         self.latency_spread.add(delay)
         self.logging_spread.add(logged)
         if self.cycles:
@@ -250,7 +256,7 @@ class BoardSeries:
         for status in message.status:
             if status.name == f"tactiled/{self.name}":
                 values = {pair.key: pair.value for pair in status.values}
-                self.told.add(self.last, values)
+                self.diagnostics_track.add(self.last, values)
                 self.drops = {
                     key.removeprefix(DROPS_PREFIX): int(text)
                     for key, text in values.items()

@@ -10,7 +10,7 @@ import numpy as np
 
 from tactile_core.geometry import FINGER_OUTLINE, Side
 from tactile_tools.plot.curves import ambient, contact_forces, latency, presses, shade
-from tactile_tools.plot.look import COLOURS, SCREEN, Look, Sheet, drawn, named
+from tactile_tools.plot.look import COLOURS, SCREEN, Look, Sheet, named, styled
 from tactile_tools.plot.series import BoardSeries
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def draw(
     title: str = "",
 ) -> None:
     """Write the overview of one board. ``applied``: times (s) and true forces (N), if known."""
-    with drawn(look):
+    with styled(look):
         overview_sheet(board, at, applied, look, title).save(out, dpi)
 
 
@@ -89,7 +89,7 @@ def draw_taxels(
     title: str = "",
 ) -> None:
     """Write taxel maps of the moments ``at`` (s), or of the strongest ones."""
-    with drawn(look):
+    with styled(look):
         taxels_sheet(board, at, look, title).save(out, dpi)
 
 

@@ -263,7 +263,7 @@ class Bridge:
         del self._new[key]
         log.info("%s -> %s", key, publisher.endpoint.topic)
         if topic is FEATURES and name not in self._boards:
-            self._greet(name)
+            self._add_board(name)
 
     def _publisher(self, topic: str, msgtype: str, *, latched: bool) -> RosPublisher:
         made = self._by_topic.get(topic)
@@ -272,7 +272,7 @@ class Bridge:
             self._by_topic[topic] = made
         return made
 
-    def _greet(self, board: str) -> None:
+    def _add_board(self, board: str) -> None:
         """A new board was heard: ask for its geometry, and listen for its reference."""
         self._boards.add(board)
         self._bus.get(service_key(board, "geometry"), lambda _: None, timeout=GEOMETRY_TIMEOUT_S)

@@ -80,7 +80,7 @@ POLICY = (
 MAX_RECORD_NAME = 80
 
 
-class Said(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+class ViewerMessage(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """Message of a viewer: the frame it has drawn, or a request (``do``)."""
 
     ack: int | None = None
@@ -128,7 +128,7 @@ class PageServer:
         self._read_only = read_only
         self._loopback = loopback
         self._encode = msgspec.json.Encoder().encode
-        self._decoder = msgspec.json.Decoder(Said)
+        self._decoder = msgspec.json.Decoder(ViewerMessage)
         self._viewers: set[_Viewer] = set()
         self._watched = asyncio.Event()
         self._fresh = asyncio.Condition()
@@ -347,13 +347,13 @@ class PageServer:
             if len(viewer.pending) >= MAX_PENDING:
                 self._reply(viewer, said.id, False, f"{MAX_PENDING} requests are waiting already")
                 continue
-            task = asyncio.create_task(self._obey(viewer, said))
+            task = asyncio.create_task(self._handle_request(viewer, said))
             viewer.pending.add(task)
             task.add_done_callback(viewer.pending.discard)
 
-    async def _obey(self, viewer: _Viewer, said: Said) -> None:
+    async def _handle_request(self, viewer: _Viewer, said: ViewerMessage) -> None:
         try:
-            text = await self._do(said)
+            text = await self._carry_out(said)
         except (ServiceError, PlayError, ValueError) as error:
             self._reply(viewer, said.id, False, str(error))
         else:
@@ -363,7 +363,7 @@ class PageServer:
         with contextlib.suppress(asyncio.QueueFull):  # the viewer does not read
             viewer.replies.put_nowait(self._encode({"reply": number, "ok": ok, "text": text}))
 
-    async def _do(self, said: Said) -> str:
+    async def _carry_out(self, said: ViewerMessage) -> str:
         """Carry a request out; returns what came of it."""
         source = self._source
         if isinstance(source, LogPlayer):
@@ -382,7 +382,7 @@ class PageServer:
             raise ServiceError(f"no such board: {said.board[:80]!r} (available: {known})")
         return await self._ask_board(source, said)
 
-    async def _ask_board(self, source: LiveSource, said: Said) -> str:
+    async def _ask_board(self, source: LiveSource, said: ViewerMessage) -> str:
         def key(service: str) -> str:
             return service_key(said.board, service)
 
@@ -390,23 +390,25 @@ class PageServer:
             return await asyncio.to_thread(source.ask, key, request, slow=slow)
 
         if said.do == "tare":
-            told = await ask(key("tare"), {"force": said.force}, slow=True)
-            return str(told["message"])
+            reply = await ask(key("tare"), {"force": said.force}, slow=True)
+            return str(reply["message"])
         if said.do == "record":
             name = (said.name or "").strip()[:MAX_RECORD_NAME] or None
-            told = await ask(key("record"), {"action": "start", "name": name})
-            return f"recording to {told['path']}"
+            reply = await ask(key("record"), {"action": "start", "name": name})
+            return f"recording to {reply['path']}"
         if said.do == "stop_record":
-            told = await ask(key("record"), {"action": "stop"})
-            lost = f", {told['dropped']} dropped" if told["dropped"] else ""
-            return f"{told['path']}: {told['messages']} messages in {told['seconds']:.1f} s{lost}"
+            reply = await ask(key("record"), {"action": "stop"})
+            lost = f", {reply['dropped']} dropped" if reply["dropped"] else ""
+            return (
+                f"{reply['path']}: {reply['messages']} messages in {reply['seconds']:.1f} s{lost}"
+            )
         if said.do == "rate":
-            told = await ask(key("set_rate"), {"rate_hz": said.rate_hz})
-            return f"{told['rate_hz']:g} Hz"
+            reply = await ask(key("set_rate"), {"rate_hz": said.rate_hz})
+            return f"{reply['rate_hz']:g} Hz"
         raise ServiceError(f"{said.do} is for logs")
 
 
-def _play(player: LogPlayer, said: Said) -> str:
+def _play(player: LogPlayer, said: ViewerMessage) -> str:
     if said.do == "seek":
         player.seek(said.share)
     elif said.do == "play":

@@ -95,7 +95,7 @@ class BoardModel:
     heard: Instant | None = None  # of the last features, by the page's clock
     forces: Any = None
     ambient: Any = None
-    told: dict[str, str] = field(default_factory=dict)
+    diagnostics: dict[str, str] = field(default_factory=dict)
     told_at: Instant | None = None
     log_state: str = ""
     history: deque[tuple[float, ...]] = field(default_factory=deque)
@@ -188,7 +188,7 @@ class PageModel:
                 self.version += 1
         elif topic == DIAGNOSTICS:
             board.told_at = now
-            board.told, board.log_state = _told(message, board.name)
+            board.diagnostics, board.log_state = _read_diagnostics(message, board.name)
 
     def _take_world(self, message: Any) -> None:
         objects = self.reach.objects
@@ -277,9 +277,9 @@ class PageModel:
 
 
 def _board_frame(board: BoardModel, now: Instant, t: float) -> dict[str, Any]:
-    told = board.told
+    diagnostics = board.diagnostics
     fresh = board.told_at is not None and seconds_between(board.told_at, now) < DIAGNOSTICS_STALE_S
-    rate = _float(told.get("rate_hz")) if fresh else None
+    rate = _float(diagnostics.get("rate_hz")) if fresh else None
     age = None if board.heard is None else seconds_between(board.heard, now)
     limit = max(STALE_S, STALE_PERIODS / rate) if rate else STALE_S
     state = _state(board, age, limit, fresh)
@@ -288,10 +288,10 @@ def _board_frame(board: BoardModel, now: Instant, t: float) -> dict[str, Any]:
     if state == "streaming" and features is not None:
         reasons = [text[:MAX_TEXT] for text in features.reasons[:MAX_REASONS]]
     elif state in REMEDIES:
-        refusal = told.get("refused", "") if state == "refused" else ""
+        refusal = diagnostics.get("refused", "") if state == "refused" else ""
         reasons = [refusal or REMEDIES[state]]
-    if fresh and told.get("alarms"):
-        reasons.append(told["alarms"][:MAX_TEXT])
+    if fresh and diagnostics.get("alarms"):
+        reasons.append(diagnostics["alarms"][:MAX_TEXT])
     live = state == "streaming"
     frame: dict[str, Any] = {
         "state": state,
@@ -299,9 +299,9 @@ def _board_frame(board: BoardModel, now: Instant, t: float) -> dict[str, Any]:
         "valid": bool(live and features is not None and features.valid),
         "reasons": reasons,
         "rate": rate,
-        "latency": _float(told.get("latency_p50_s")) if fresh else None,
-        "drops": _drops(told),
-        "recording": _recording(told) if fresh else None,
+        "latency": _float(diagnostics.get("latency_p50_s")) if fresh else None,
+        "drops": _drops(diagnostics),
+        "recording": _recording(diagnostics) if fresh else None,
         "log": board.log_state,
         "nominal": None if features is None else not features.calibrated,
         "force": None if features is None else _force(features),
@@ -317,12 +317,12 @@ def _state(board: BoardModel, age: float | None, limit: float, fresh: bool) -> s
     """State of a board as the page shows it."""
     if not board.alive:
         return "gone"
-    told = board.told.get("state", "") if fresh else ""
-    if age is not None and age < limit and told in ("", "streaming", "identified", "waiting"):
+    reported = board.diagnostics.get("state", "") if fresh else ""
+    if age is not None and age < limit and reported in ("", "streaming", "identified", "waiting"):
         return "streaming"
-    if told and told != "streaming":
-        return told if told in REMEDIES else "waiting"
-    if told == "streaming" and age is None:
+    if reported and reported != "streaming":
+        return reported if reported in REMEDIES else "waiting"
+    if reported == "streaming" and age is None:
         return "identified"
     return "stale" if age is not None or board.told_at is not None else "waiting"
 
@@ -449,7 +449,7 @@ def _grid(rows: int, columns: int) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.stack([x, y], axis=-1).reshape(-1, 2)
 
 
-def _told(message: Any, name: str) -> tuple[dict[str, str], str]:
+def _read_diagnostics(message: Any, name: str) -> tuple[dict[str, str], str]:
     """Values of a board's diagnostics, and the state of its log ("" if it has none)."""
     values: dict[str, str] = {}
     log_state = ""
@@ -461,24 +461,24 @@ def _told(message: Any, name: str) -> tuple[dict[str, str], str]:
     return values, log_state
 
 
-def _drops(told: Mapping[str, str]) -> dict[str, int]:
+def _drops(diagnostics: Mapping[str, str]) -> dict[str, int]:
     counts = {
         key.removeprefix(DROPS_PREFIX): _float(value) or 0.0
-        for key, value in told.items()
+        for key, value in diagnostics.items()
         if key.startswith(DROPS_PREFIX)
     }
     return {key: int(value) for key, value in counts.items() if value}
 
 
-def _recording(told: Mapping[str, str]) -> dict[str, Any] | None:
-    if told.get("recording.recording") != "True":
+def _recording(diagnostics: Mapping[str, str]) -> dict[str, Any] | None:
+    if diagnostics.get("recording.recording") != "True":
         return None
     return {
-        "path": told.get("recording.path", ""),
-        "seconds": _float(told.get("recording.seconds")),
-        "messages": _float(told.get("recording.messages")),
-        "dropped": _float(told.get("recording.dropped")),
-        "state": told.get("recording.state", ""),
+        "path": diagnostics.get("recording.path", ""),
+        "seconds": _float(diagnostics.get("recording.seconds")),
+        "messages": _float(diagnostics.get("recording.messages")),
+        "dropped": _float(diagnostics.get("recording.dropped")),
+        "state": diagnostics.get("recording.state", ""),
     }
 
 
