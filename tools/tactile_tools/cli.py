@@ -657,7 +657,7 @@ def _fill_crash(parser: Parser) -> None:
 def _fill_mutation(parser: Parser) -> None:
     parser.description = (
         "Changes the safety gate in small ways and runs its tests on each: what no test fails on "
-        "is listed. Works in a checkout only, for it needs the tests."
+        "is listed. Needs the tests, so it works only in a checkout."
     )
     parser.former(limit="patience")
     parser.add_argument(

@@ -71,5 +71,5 @@ def wait_for(path: Path, process: subprocess.Popen[bytes], log: Path) -> None:
     while not path.exists():
         if process.poll() is not None or time.monotonic() > deadline:
             said = log.read_text(errors="replace").strip()
-            raise RuntimeError(f"there is no {path.name} yet: {said or 'nothing was said'}")
+            raise RuntimeError(f"{path.name} has not appeared: {said or 'it printed nothing'}")
         time.sleep(0.05)

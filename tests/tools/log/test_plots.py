@@ -119,7 +119,7 @@ def test_bad_arguments_are_refused(
         ([skin_log, "--name", "thumb"], 2, "no board 'thumb' in the log; it holds finger"),
         ([skin_log, "--at", "99", "--what", "taxels"], 2, "--at 99; the log of finger goes from"),
         ([skin_log, "--out", tmp_path / "a.gif"], 2, "allowed: a file that ends in"),
-        ([skin_log, "--out", tmp_path / "no" / "a.png"], 2, "there is no folder"),
+        ([skin_log, "--out", tmp_path / "no" / "a.png"], 2, "no such folder"),
         ([skin_log, "--format", "pdf", "--out", tmp_path / "a.png"], 2, "say two things"),
         ([skin_log, "--dpi", "9"], 2, "--dpi 9; allowed: 30 to 600"),
         ([skin_log, "--what", "forces", "--reach", "1"], 2, "leave them out with forces"),

@@ -108,7 +108,7 @@ def _fit(options: argparse.Namespace) -> None:
     if not out.name.endswith(SUFFIX):
         raise ActionError(f"--out {out}; allowed: a name that ends in {SUFFIX}")
     if not out.resolve().parent.is_dir():
-        raise ActionError(f"--out {out}: there is no folder {out.parent}; create it", REFUSED)
+        raise ActionError(f"--out {out}: no such folder: {out.parent}; create it", REFUSED)
     if out.is_dir():
         raise ActionError(f"--out {out} is a folder; name a file", REFUSED)
     recordings = open_recordings(options.recordings, options.board, options.measured)

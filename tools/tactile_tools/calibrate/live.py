@@ -172,5 +172,5 @@ def refuse_existing(out: Path) -> str | None:
     if out.exists():
         return f"--out {out} is there already; name a new file"
     if not out.resolve().parent.is_dir():
-        return f"--out {out}: there is no folder {out.parent}; create it"
+        return f"--out {out}: no such folder: {out.parent}; create it"
     return None

@@ -268,8 +268,8 @@ def _merge(parser: Parser) -> None:
 def _reprocess(parser: Parser) -> None:
     parser.description = (
         "Run field, compensation, force and features again over the raw bytes of a "
-        "log. With the settings and calibration of the log they come out the same to the bit; "
-        "with others, as they would have been. Everything else is carried over."
+        "log. With the settings and calibration of the log they come out bit for bit the same; "
+        "with others, as they would have been. Everything else is copied."
     )
     add_log_files(parser)
     add_out(parser, "new log (default: FILE's name with _reprocessed)")

@@ -168,7 +168,7 @@ class Player:
         if publisher is None:
             try:
                 if any(c in key for c in "*$?#"):
-                    raise ValueError(f"{key} is no key")
+                    raise ValueError(f"{key} is not a key")
                 publisher = Publisher(self._session, key, stream.msgtype or "unknown")
             except (zenoh.ZError, ValueError) as error:
                 self.refused[stream.topic] = str(error).partition(" at /")[0]

@@ -106,7 +106,7 @@ def _show(work: Reprocessing, out: Path, *, same: bool) -> None:
         before, after = compare.before.get(topic, 0), compare.after.get(topic, 0)
         console.print(
             f"{topic}: {after} messages, {before} in the log; "
-            f"{compare.same.get(topic, 0)} the same to the bit"
+            f"{compare.same.get(topic, 0)} bit for bit the same"
         )
     if not work.exact:
         console.print(

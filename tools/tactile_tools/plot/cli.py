@@ -64,7 +64,7 @@ def _check_output(out: Path, options: argparse.Namespace) -> None:
     if out.is_dir() or any(out == source for source in options.files):
         raise ToolError(f"--out {out} is a folder or the log itself: name another file")
     if not out.parent.is_dir():
-        raise ToolError(f"--out {out}: there is no folder {out.parent}")
+        raise ToolError(f"--out {out}: no such folder: {out.parent}")
 
 
 def _draw(options: argparse.Namespace, out: Path) -> str:

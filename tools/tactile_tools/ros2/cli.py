@@ -33,8 +33,8 @@ def fill(parser: Parser) -> None:
 def _fill_bridge(bridge: Parser) -> None:
     bridge.description = (
         "Runs until it is stopped. Connects to a ROS 2 router (rmw_zenohd) as a client and to the "
-        "bus of this rig as a tool. Requests from ROS are refused unless accepted by name, for "
-        "whoever reaches the router may send them."
+        "bus of this rig as a tool. Requests from ROS are refused unless accepted by name, because "
+        "anyone who reaches the router may send them."
     )
     bridge.epilog = "exit status: 0 stopped; 2 bad argument; 3 no router."
     bridge.add_argument(
