@@ -50,11 +50,11 @@ not writable.
 
 
 VIEW_PORT = 8420
-"""Where the live page is, unless another port is asked for."""
+"""Default TCP port of the live page."""
 
 
 class _Port(argparse.Action):
-    """Collects --port and --can in one list, in the order in which they were given."""
+    """Collects --port and --can in one list, in the order given."""
 
     def __call__(
         self,

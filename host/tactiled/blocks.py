@@ -1,4 +1,4 @@
-"""What flows between the rooms of tactiled: chunks from a port, samples of an array, results."""
+"""Data passed between the parts of tactiled: chunks of a port, samples of an array, results."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from tactile_core.types import Instant
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """What one read of a port returned. ``received``: right after the read."""
+    """Bytes or CAN frames from one read of a port. ``received``: instant right after the read."""
 
     received: Instant
     payload: bytes | tuple[CanFrame, ...]
 
 
 class TaxelHealth(IntFlag):
-    """Why a taxel is not to be trusted; the low bits are `sensor_proto.packets.TaxelStatus`."""
+    """Why a taxel is unhealthy; the low bits are `sensor_proto.packets.TaxelStatus`."""
 
     OK = 0
     SATURATED = 1
@@ -46,9 +46,9 @@ class SampleBlock:
     ``field_ut``: (n, 3) float µT in chip axes. ``temperature_c``: (1,) or (n,) °C.
     ``status``: (n,) uint8 of `TaxelHealth`. ``captured``: start of the conversion, mapped from
     board ticks (or from arrivals where the board has no clock); ``uncertainty`` in s.
-    ``thermometer``: False where the board sends no temperatures, which are then NaN and no fault.
-    ``clock_usable``: False where the board's clock is so wrong that ``captured`` is of no use.
-    ``lsb_ut``: µT a count of x and y, and of z, where the board tells.
+    ``thermometer``: False where the board sends no temperatures, which are then NaN, not a fault.
+    ``clock_usable``: False where the board's clock is so wrong that ``captured`` is useless.
+    ``lsb_ut``: µT per count of x and y, and of z; None where the board does not report it.
     """
 
     array: int
@@ -64,9 +64,10 @@ class SampleBlock:
     lsb_ut: tuple[float, float] | None = None
 
     def split(self, sizes: Sequence[int]) -> tuple[SampleBlock, ...]:
-        """One block an array, of a block that holds all ``sizes`` taxels of a board together.
+        """Split a block that holds all taxels of a board into one block per array.
 
-        So send boards that know nothing of arrays. Any other block comes back as it is.
+        ``sizes``: taxels of each array. Boards without a notion of arrays send such blocks; any
+        other block is returned unchanged.
         """
         if len(sizes) < 2 or self.array != 0 or self.field_ut.shape != (sum(sizes), 3):
             return (self,)
@@ -86,12 +87,12 @@ class SampleBlock:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ambient:
-    """What compensation took off in one cycle, per array (A of them).
+    """The ambient field that compensation removed in one cycle, for each of A arrays.
 
     ``plane``: (A, 3, 3) µT; [a, c] = value at the array's centre, slope per m along its surface x,
     along its y, for component c of the field in ``ee``. ``support``: (A,) fraction of healthy
-    taxels that agree. ``residual_ut``: (A,) rms of those about the fit. ``age``: (A,) s since the
-    last valid fit. ``valid``: (A,) bool.
+    taxels that agree with the fit. ``residual_ut``: (A,) their rms residual, µT. ``age``: (A,) s
+    since the last valid fit. ``valid``: (A,) bool.
     """
 
     method: str
@@ -105,8 +106,8 @@ class Ambient:
 class Reason(NamedTuple):
     """Why features are degraded or not valid.
 
-    ``code``: stable word for programs, with ``:name`` of the array where it concerns one. ``text``:
-    for people, with the remedy.
+    ``code``: stable identifier for programs, with ``:name`` of the array if it concerns one.
+    ``text``: for people, with the remedy.
     """
 
     code: str
@@ -115,7 +116,7 @@ class Reason(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patch:
-    """Neighbouring taxels in contact; see ``ContactPatch.msg``. Vectors (3,) in ``ee``."""
+    """Neighbouring taxels in contact; see ``ContactPatch.msg``. N and m; vectors (3,) in ``ee``."""
 
     array: int
     side: Side
@@ -152,20 +153,20 @@ class Features:
 
     @property
     def codes(self) -> tuple[str, ...]:
-        """Codes of the reasons."""
+        """Codes of ``reasons``."""
         return tuple(reason.code for reason in self.reasons)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cycle:
-    """Everything known of one sampling cycle of a board, all N taxels one array after another.
+    """Results of one sampling cycle of a board; its N taxels are ordered array by array.
 
-    ``force``: (N, 3) N in taxel axes, NaN where the taxel is not healthy. ``field_ut``: (N, 3) µT
-    in taxel axes after rest field and temperature, before compensation; NaN likewise.
-    ``normal_bound``: (N,) N that hold the true normal force in 95 % of cycles; NaN likewise.
-    ``health``: (N,) uint8 of `TaxelHealth`. ``features_due``: by the feature
-    rate, these features are to be sent; they are computed in every cycle. ``fault``: (N,) uint8 of
-    `readings.Fault`, what exactly is wrong with each taxel.
+    ``force``: (N, 3) N in taxel axes, NaN where the taxel is unhealthy. ``field_ut``: (N, 3) µT in
+    taxel axes with rest field and temperature removed, before compensation; NaN likewise.
+    ``normal_bound``: (N,) 95 % bounds of the normal forces' errors, N; NaN likewise. ``health``:
+    (N,) uint8 of `TaxelHealth`. ``fault``: (N,) uint8 of `sensing.reasons.Fault`, the exact fault
+    of each taxel. ``features_due``: whether the feature rate lets these features be sent; they are
+    computed in every cycle.
     """
 
     sequence: int

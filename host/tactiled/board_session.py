@@ -1,4 +1,4 @@
-"""One board in service: from its link's events to messages, with its pipeline and its counts."""
+"""One board in service: turns the events of its link into messages, through its pipeline."""
 
 from __future__ import annotations
 
@@ -46,51 +46,52 @@ LATENCIES = 512
 """Latencies kept for the percentiles: a second at the fastest rate of the chip (493 Hz)."""
 
 RATE_CYCLES, RATE_OVER = 20, 20
-"""Cycles that a rate is taken from, and s it may take until there are as many: one second counts
-too few of a slow board."""
+"""The rate is measured over the last `RATE_CYCLES` cycles, but over `RATE_OVER` s at most: a slow
+board sends too few in one second."""
 STATE_EVERY = 10
-"""s between notes of a rest field that follows the drift."""
+"""s between records of a rest field that tracks the drift."""
 
 FIRMWARE_LEVELS = (10, 20, 30, 40)
 
 FIRMWARE_RATE, FIRMWARE_BURST = 10.0, 50
-"""Texts a second that a board's firmware may pass on, and how many at once; the bytes of the rest
-are in the log all the same."""
+"""Texts of a board's firmware passed on per second, and at once; the bytes of the others are in the
+log all the same."""
 
 COMPLAINT_RATE, COMPLAINT_BURST = 0.2, 10
-"""Lines a second, and at once, about messages of one kind that cannot be sent."""
+"""Log lines per second, and at once, about messages of one kind that cannot be sent."""
 
 SET_UP_RATE, SET_UP_BURST = 0.5, 10
-"""How often a board may turn out to be another than it was: each time its calibration is logged."""
+"""How often per second, and at once, a board may describe itself anew: each time its calibration is
+logged."""
 
 TEXT_OLDEST_S, TEXT_AHEAD_S = 3600.0, 1.0
-"""A text of a board whose clock says that it is older, or of the future, has no usable stamp."""
+"""s; the stamp of a firmware text that is older, or further in the future, is not believed."""
 
 UNSENT = "unsent_"
-"""Counters that begin so are of messages that could not be encoded, by the end of their key."""
+"""Prefix of counters of messages that could not be sent; the last part of their key follows."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """Received to published, s."""
+    """Percentiles of the time from received to published, s."""
 
     p50: float = math.nan
     p99: float = math.nan
 
 
 class BoardSession:
-    """Owned by the pipeline's thread; others read its plain attributes."""
+    """A board in service. Owned by the pipeline's thread; others read its plain attributes."""
 
     def __init__(
         self, name: str, sink: Sink, store: CalibrationStore, settings: PipelineSettings
     ) -> None:
         self.name = name
         self.node = 0
-        """Of the board on its bus; 0 on a serial line."""
+        """Node of the board on its CAN bus; 0 on a serial line."""
         self.rest_seed: RecordedRest | None = None
-        """Rest field to begin with, of a recording whose beginning is not there."""
+        """Rest field to start from, for a recording whose beginning is missing."""
         self.identity: Identity | None = None
         self.choice: Choice | None = None
         self.pipeline: BoardPipeline | None = None
@@ -134,16 +135,16 @@ class BoardSession:
 
     @property
     def clock_problem(self) -> str:
-        """What is to be said of the stamps of this board's messages; see `WallClock`."""
+        """What is wrong with the stamps of this board's messages, or empty; see `WallClock`."""
         return self._sink.wall.problem
 
     # Who it is
 
     def admit(self, identity: Identity) -> Refusal | None:
-        """Judge a board by whether there is a calibration for it."""
+        """Accept a board that a calibration fits (None), or say why not."""
         if identity == self.identity and self.pipeline is not None:
             return None
-        # Asked before anything is worked out: a calibration of 2048 taxels takes its time.
+        # Checked first, because choosing a calibration of 2048 taxels takes a while.
         if not self._set_ups.allow(self._sink.now()):
             return Refusal(
                 f"{identity} describes itself anew again and again",
@@ -158,7 +159,7 @@ class BoardSession:
         return None
 
     def recalibrate(self) -> dict[str, Any]:
-        """Use the board's calibration as its file now says; ValueError when it does not fit."""
+        """Use the board's calibration file as it is now; ValueError when it does not fit."""
         if self.identity is None:
             raise ValueError("no board has been identified yet")
         choice = self._store.choose(self.identity)
@@ -201,7 +202,7 @@ class BoardSession:
         self.send_geometry()
 
     def describe_to(self, recorder: Recorder | None) -> None:
-        """Begin another log of this board: its calibration there, its geometry to everybody."""
+        """Begin another log of this board: attach its calibration and publish its geometry."""
         if recorder is not None and self.choice is not None and self.identity is not None:
             self._attach_calibration(recorder, self.choice.calibration, self.identity)
         self.send_geometry()
@@ -218,7 +219,7 @@ class BoardSession:
         )
 
     def _note_state(self) -> None:
-        """Have every later file of the log say what is needed to run it by itself."""
+        """Write into every later file of the log what is needed to reprocess it by itself."""
         if self.recorder is not None and self.identity is not None:
             state = None if self.pipeline is None else self.pipeline.rest_to_record()
             table = describe_state(self.node, self.identity, state)
@@ -226,7 +227,7 @@ class BoardSession:
             self._state_age = 0
 
     def _warn(self) -> None:
-        """Say once what is to be said of the calibration, and of a board too large to describe."""
+        """Warn once about the calibration, and about a board too large to describe whole."""
         choice = self.choice
         if self._maker is not None and not self._maker.whole:
             text = "so many taxels that their geometry goes without the unrolled skin"
@@ -236,7 +237,7 @@ class BoardSession:
             self._say(logging.WARNING, choice.warning)
 
     def send_geometry(self) -> None:
-        """Publish where the taxels are; nothing before a board has been identified."""
+        """Publish where the taxels are; does nothing before a board has been identified."""
         if self._maker is not None:
             maker, now_ns = self._maker, self._sink.wall.wall_ns(self._sink.now())
             self._publish(GEOMETRY, lambda: maker.geometry(now_ns), now_ns)
@@ -251,7 +252,7 @@ class BoardSession:
             case Identified(identity, _):
                 self.identity, self.refusal, self.state = identity, None, "identified"
                 if self.pipeline is not None and self.sent:
-                    self.pipeline.reset()  # what it felt before it was out of sight is over
+                    self.pipeline.reset()  # contacts from before it was away are over
                     if self._unplugged and not identity.serial_number:
                         self.pipeline.forget_rest(REPLUGGED)  # it may be another board
                 self._unplugged = False
@@ -309,22 +310,23 @@ class BoardSession:
                 raise TypeError(f"no board's event: {event!r}")
 
     def port_lost(self, reason: str) -> None:
-        """The port went away under the board."""
+        """The board's port is gone."""
         self.state = "unplugged"
         self._unplugged = True
         self._silences.gone()
         self._say(logging.WARNING, f"{reason}; waiting for it to come back", "lost")
 
     def await_answer(self, request: int) -> Future[Event]:
-        """What the board answers to a request."""
+        """Return a future for the board's answer to a request, given by its number."""
         future: Future[Event] = Future()
         self._answers[request] = future
         return future
 
     def tare(self, force: bool = False) -> Future[dict[str, Any]]:
-        """Begin a tare; the future holds its report when it ends. ValueError without a board.
+        """Begin a tare; the future holds its report when it ends.
 
-        ``force``: take what the skin reads for its rest, whatever speaks against it.
+        ``force``: take the present reading as the rest field even where it looks loaded.
+        ValueError when the board is not streaming.
         """
         if self.pipeline is None:
             raise ValueError("no board has been identified yet")
@@ -345,13 +347,13 @@ class BoardSession:
         self._tares.clear()
 
     def flush(self) -> None:
-        """Send the cycle under way, as it stands."""
+        """Publish the cycle under way, even if incomplete."""
         if self.pipeline is not None:
             for cycle in self.pipeline.flush():
                 self._send(cycle)
 
     def each_second(self, now: Instant) -> None:
-        """Work out rate and latency of the last second; say what repeats and who is masked."""
+        """Work out rate and latency; report repeated messages and masked chips."""
         self._measure_rate(now)
         for level, text in self._repeats.due(now):
             self._say(level, text)
@@ -371,10 +373,10 @@ class BoardSession:
             self.latency = Latency()
         self._state_age += 1
         if self._settings.rest_tracking_s is not None and self._state_age >= STATE_EVERY:
-            self._note_state()  # it moves all the time
+            self._note_state()  # a tracked rest field moves all the time
 
     def _measure_rate(self, now: Instant) -> None:
-        """Cycles a second over the shortest span that holds enough of them."""
+        """Cycles per second over the shortest span that holds enough of them."""
         marks = self._rate_from
         if self.state != "streaming":
             marks.clear()
@@ -388,7 +390,7 @@ class BoardSession:
         marks.append((now, self.sent))
 
     def drops(self) -> dict[str, int]:
-        """Cycles and blocks that did not make it through the pipeline, by reason."""
+        """Count by reason of the cycles, blocks and messages that were lost."""
         counts = Counter(self.counters)
         if self.pipeline is not None:
             counts.update(asdict(self.pipeline.counters))
@@ -459,7 +461,7 @@ class BoardSession:
             self._show(self._picture, cycle, stamp_ns)
 
     def _show(self, picture: SkinPicture, cycle: Cycle, stamp_ns: int) -> None:
-        """Send a picture when one is due: for viewers only, so that it may fail, and be counted."""
+        """Send a picture when one is due; it is for viewers only, so a failure is just counted."""
         try:
             parts = picture.draw(cycle, stamp_ns) if picture.due(cycle.captured) else []
             for part in parts:
@@ -468,7 +470,7 @@ class BoardSession:
             self._note_unsent(CONTACTS, error)
 
     def _publish(self, topic: Topic, make: Callable[[], Any], stamp_ns: int) -> None:
-        """Make a message and send it; one that cannot be is counted, and the next ones go on."""
+        """Make a message and send it; count it when that fails."""
         try:
             self._sink.send(topic, self.name, make(), stamp_ns)
         except Exception as error:  # noqa: BLE001 - one message must not end the others
@@ -481,7 +483,7 @@ class BoardSession:
             log.error("%s: a message of %s cannot be sent: %s", self.name, kind, error)
 
     def spoilt(self, error: Exception) -> None:
-        """What became of one event is not known: what the pipeline felt so far is over."""
+        """Count an event lost to an error; reset the pipeline, whose state may be inconsistent."""
         self.counters["spoilt_events"] += 1
         if self._throttle("spoilt").allow(self._sink.now()):
             log.error("%s: an event could not be worked off", self.name, exc_info=error)
@@ -489,11 +491,11 @@ class BoardSession:
             self.pipeline.reset()
 
     def say_of_log(self, level: int, text: str) -> None:
-        """Tell of the log that this board's messages go to."""
+        """Announce a change of the log that this board's messages go to."""
         self._say(level, text)
 
     def _pass_on(self, level: int, captured: Instant, text: str) -> None:
-        """Publish and log a text of the firmware, unless there are too many of them."""
+        """Publish and log a text of the firmware, unless there have been too many."""
         now = self._sink.now()
         if not self._firmware.allow(now):
             self.counters["texts_held_back"] += 1
@@ -506,14 +508,14 @@ class BoardSession:
         self._speak(known, text, f"{self.name} firmware", captured)
 
     def _say(self, level: int, text: str, kind: str = "") -> None:
-        """Announce ``text``; of a ``kind``, only if the last of that is some time ago."""
+        """Announce ``text``; one with a ``kind`` only when the last of that kind is a while ago."""
         if not kind or self._repeats.tell(kind, text, level, self._sink.now()):
             self._speak(level, text)
         else:
             self.counters["texts_held_back"] += 1
 
     def _tell_of_floods(self, now: Instant) -> None:
-        """Say how many texts of the firmware were held back, once there is room for it."""
+        """Say how many texts of the firmware were held back, once the limit allows it."""
         firmware = self._firmware
         if firmware.held and firmware.ready(now):
             held = firmware.take_held()

@@ -1,4 +1,4 @@
-"""The calibrations the user gave, and which of them belongs to a board."""
+"""The calibrations that the user gave, and the choice of one for a board."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ UNNUMBERED = "unknown"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Choice:
-    """The calibration to use. ``path``: None for nominal figures. ``warning``: empty for none."""
+    """The calibration to use. ``path``: None for nominal figures. ``warning``: may be empty."""
 
     calibration: BoardCalibration
     path: Path | None
@@ -36,8 +36,8 @@ class Choice:
 class CalibrationStore:
     """Calibration files by serial number.
 
-    ``strict``: a board that no file belongs to is refused rather than run on nominal figures; so
-    it is when there are as many files as ports, for then one of them must be wrong.
+    ``strict``: refuse a board without a file rather than use nominal figures. Set when there are as
+    many files as ports, because then one of the files must be wrong.
     """
 
     def __init__(self, paths: Sequence[Path], strict: bool) -> None:
@@ -47,13 +47,13 @@ class CalibrationStore:
         self.reload()
 
     def reload(self) -> None:
-        """Read every file again; `CalibrationError` (and nothing changed) when one is bad."""
+        """Read every file again; `CalibrationError`, and nothing changes, when one is bad."""
         self._files = {path: load(path) for path in self._paths}
 
     def adopt_from_log(self, log: Path, board: str) -> None:
         """Use the calibration that ``board`` was recorded with, unless files were given.
 
-        Nominal figures are not adopted: they follow from what the board says of itself.
+        Nominal figures are not adopted: they follow from the board's descriptor.
         """
         if self._paths:
             return
@@ -67,13 +67,13 @@ class CalibrationStore:
                     return
 
     def add(self, source: Path, calibration: BoardCalibration) -> None:
-        """Take a calibration that is in no file of its own; it stands in for that board's other."""
+        """Add a calibration that has no file; it replaces any other of that board."""
         serial = calibration.serial_number
         self._files = {p: c for p, c in self._files.items() if c.serial_number != serial}
         self._files[source] = calibration
 
     def choose(self, identity: Identity) -> Choice | Refusal:
-        """Calibration for a board, or why there is none."""
+        """Choose the calibration for a board, or say why there is none."""
         own = [(p, c) for p, c in self._files.items() if c.serial_number == identity.serial_number]
         if own:
             path, calibration = own[-1]
@@ -135,9 +135,9 @@ def _fitting(identity: Identity, calibration: BoardCalibration, path: Path) -> C
 
 
 def _alike(identity: Identity, calibration: BoardCalibration) -> bool:
-    """Whether a calibration is of arrays like the board's.
+    """Whether a calibration has the same arrays as the board.
 
-    A board that describes itself names its arrays; of one that does not the file knows better.
+    A descriptor lists the arrays; for a board without one, the arrays of the file are believed.
     """
     if identity.descriptor is not None:
         return _shapes(calibration) == identity.shapes

@@ -22,9 +22,9 @@ ARPHRD_CAN = "280"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run tactiled; the exit status: 0 done, 1 failed, 2 usage, 3 refused.
+    """Run tactiled and return the exit status: 0 done, 1 failed, 2 usage, 3 refused.
 
-    Without ``argv`` this is the whole process, which then ends here.
+    Without ``argv`` the arguments are those of the process, which ends here.
     """
 
     def parser(shutdown: Shutdown) -> argparse.ArgumentParser:
@@ -77,7 +77,7 @@ def _run(shutdown: Shutdown, options: argparse.Namespace) -> int:
 
 
 def _watch(daemon: Daemon, status: StatusLines, shutdown: Shutdown) -> str | None:
-    """Wait for the end; what kept the job from being done, None when it was."""
+    """Run until the end; returns what went wrong, or None."""
     from tactile_core.types import monotonic_now, seconds_between
     from tactiled.status import REFRESH
 
@@ -96,7 +96,7 @@ def _watch(daemon: Daemon, status: StatusLines, shutdown: Shutdown) -> str | Non
 
 
 def _unserved(daemon: Daemon) -> str | None:
-    """Ports of which no board ever came into service."""
+    """Names the ports from which no samples came; None when there are none."""
     missing = [port.name for port in daemon.ports if not port.served]
     if not missing:
         return None
@@ -118,14 +118,14 @@ def _list_ports() -> int:
 
 
 def can_networks(folder: Path = Path("/sys/class/net")) -> list[str]:
-    """CAN networks of this machine, by what Linux says of each network."""
+    """CAN interfaces of this machine, found by their type in sysfs."""
     found = []
     for entry in sorted(folder.iterdir()) if folder.is_dir() else ():
         try:
             if (entry / "type").read_text().strip() == ARPHRD_CAN:
                 found.append(entry.name)
         except OSError:
-            continue  # it went away meanwhile
+            continue  # it disappeared meanwhile
     return found
 
 

@@ -1,7 +1,8 @@
-"""The daemon: threads and I/O round the pure parts.
+"""The daemon: threads and I/O around the pure core.
 
-Threads: one reader a port (`reader`), the pipeline's (here), the log's writer (`recorder`), zenoh's
-own for services, and the main thread, which watches. Each that dies takes the daemon down loudly.
+Threads: one reader per port (`reader`), the pipeline's (here), the log's writer (`recorder`),
+zenoh's own for services, and the main thread, which watches. If one dies, the daemon ends with an
+error.
 """
 
 from __future__ import annotations
@@ -50,17 +51,17 @@ from tactiled.transports.serial_port import SerialTransport
 log = logging.getLogger(__name__)
 
 TICK = 0.01
-"""s between looks at the clock when nothing arrives."""
+"""s between turns of the pipeline's thread when nothing arrives."""
 
 SWITCH_INTERVAL = 0.0005
-"""s after which Python hands the interpreter on: a reader must stamp soon after its data came."""
+"""s after which Python switches threads: a reader must stamp its data soon after it came."""
 
 READER_STUCK = 5.0
-"""s after which a reader that does not come back from its driver is stuck: it reads for a fraction
-of a second at a time. Then the service manager is not told any more that all is well."""
+"""s after which a reader still inside its driver counts as stuck: one read takes a fraction of a
+second. From then on the service manager's watchdog is no longer fed."""
 
 CALLS = 64
-"""Requests that may wait for the pipeline's thread."""
+"""Most requests that may wait for the pipeline's thread."""
 
 NAME_TIMEOUT = 0.3
 """s to ask the bus whether a name is in use."""
@@ -69,10 +70,10 @@ JOIN_TIMEOUT = 1.0
 """s for the pipeline's thread to end before the log is closed."""
 
 LEAVE_TIMEOUT = 2.0
-"""s more for it to end, on a machine so busy that it needs them, before it is left behind."""
+"""Further s for it to end, for a very busy machine, before it is left behind."""
 
 STOPPING = ServiceError("tactiled is stopping")
-"""What whoever asks for something is told from then on."""
+"""The answer to every request made while the daemon stops."""
 
 
 class Daemon(Service):
@@ -188,7 +189,7 @@ class Daemon(Service):
         assert recordings is not None
         board = BoardSession(name, publisher, self._store, self.settings.pipeline)
         if self._prefix:
-            # A recording is nobody to be spoken to.
+            # Replays offer no services.
             return board
         if _is_taken(session, name):
             return Trouble(
@@ -259,7 +260,7 @@ class Daemon(Service):
         return clean
 
     def trouble(self) -> str | None:
-        """Why a port has not come into service and will not by itself; None: all is well yet."""
+        """Why a port is not in service and will not be without help; None: no trouble so far."""
         for port in self.ports:
             if port.served:
                 continue
@@ -297,14 +298,14 @@ class Daemon(Service):
             self.fail(error)
 
     def _part(self, port: Port) -> None:
-        """Let a port take its leave; one that cannot does not keep the others from it."""
+        """Stop a port's boards; an error at one port must not keep the others running."""
         try:
             port.stop_streaming(monotonic_now())
         except Exception as error:
             log.error("%s: it could not be told to stop", port.name, exc_info=error)
 
     def _call(self, work: Callable[[], Any]) -> Future[Any]:
-        """Have ``work`` done by the pipeline's thread."""
+        """Have the pipeline's thread run ``work``."""
         future: Future[Any] = Future()
         if self._stopping.is_set():
             future.set_exception(STOPPING)
@@ -327,13 +328,13 @@ class Daemon(Service):
                 future.set_exception(ServiceError(f"{type(error).__name__}: {error}"))
 
     def _abandon_requests(self) -> None:
-        """Answer everyone who still waits, so that zenoh can close at once."""
+        """Answer every request under way, so that zenoh can close at once."""
         self._abandon_calls()
         for board in self.boards:
             board.abandon_requests(STOPPING)
 
     def _abandon_calls(self) -> None:
-        """Answer those whom the pipeline has not heard yet; from any thread."""
+        """Answer the requests that the pipeline's thread has not taken yet; from any thread."""
         while (call := self._next_call()) is not None:
             call[1].set_exception(STOPPING)
 
@@ -387,7 +388,7 @@ class Daemon(Service):
 def _as_recorded(
     wanted: PortSettings, name: str, metadata: Mapping[str, Mapping[str, str]]
 ) -> PortSettings:
-    """Settings of a replay, with what its log says of how the board was read."""
+    """Settings of a replay, with kind and arrays of the board as its log states them."""
     table = metadata.get(PORT_PREFIX + name)
     if table is None:
         return wanted

@@ -1,4 +1,4 @@
-"""State of a board and of the daemon as ROS diagnostics and as the status service's reply."""
+"""State of a board and of the daemon, as ROS diagnostics and as reply of the status service."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from tactiled.board_session import BoardSession
 from tactiled.boards.board import BoardLink
 from tactiled.port import Port
 
-# What somebody should look at before it becomes a fault: a disk that fills, a skin that drifts.
+# Alarms warn before something becomes a fault: a disk that fills, a skin that drifts.
 
 
 DRIFT_N = 0.1
-"""N below which nothing counts as touch anywhere in this project."""
+"""N; less never counts as touch anywhere in this project."""
 
 ALARM_WINDOW_S = 60.0
-"""s of which the least force is kept."""
+"""s of one window; the lowest force in it is kept."""
 
 WINDOWS = 10
-"""Windows that must all lie above `DRIFT_N`: a skin in use is let go of within ten minutes."""
+"""Windows that must all stay above `DRIFT_N`: a skin in use is released within ten minutes."""
 
 
 class DriftWatch:
-    """Tells a zero that wanders from touch: touch ends, now and then, and a wandered zero does not.
+    """Tells zero drift from touch: touch ends now and then, drift does not. Pure.
 
-    Pure. Given the peak force once a second, it keeps the least of each minute; when the least of
-    ten minutes is still above `DRIFT_N` the skin drifts, or something lies on it.
+    Given the peak force once a second, it keeps the minimum of each minute. When the minimum over
+    ten minutes is still above `DRIFT_N`, the skin has drifted or something lies on it.
     """
 
     def __init__(self) -> None:
@@ -44,7 +44,7 @@ class DriftWatch:
         self._since: Instant | None = None
 
     def add(self, force_n: float, now: Instant) -> None:
-        """Peak force (N) of valid features at ``now``."""
+        """Take the peak force (N) of valid features at ``now``."""
         if self._since is None:
             self._since = now
         if seconds_between(self._since, now) >= ALARM_WINDOW_S:
@@ -55,12 +55,12 @@ class DriftWatch:
             self._now = min(self._now, force_n)
 
     def forget(self) -> None:
-        """Begin anew: the zero was taken again, or the board is another."""
+        """Start over: the board was tared or replaced."""
         self._least.clear()
         self._now, self._since = math.inf, None
 
     def alarm(self) -> str | None:
-        """What is wrong, None: nothing."""
+        """What is wrong and what to do, or None."""
         if len(self._least) < WINDOWS or min(self._least) <= DRIFT_N:
             return None
         if self._now <= DRIFT_N:
@@ -81,17 +81,17 @@ class Alarms:
         self._seen: dict[str, str] = {}
 
     def watch(self, recorder: Recorder) -> None:
-        """Look after the disk of a log."""
+        """Watch the free space of a log's disk."""
         self._disk = DiskWatch(lambda: Path(recorder.stats.path).parent)
         self._disk.start()
 
     def stop(self) -> None:
-        """End the looks at the disk."""
+        """Stop watching the disk."""
         if self._disk is not None:
             self._disk.stop()
 
     def each_second(self, board: BoardSession, now: Instant) -> list[str]:
-        """Alarms of a board, in words that say what to do."""
+        """Alarms of a board; each says what to do."""
         watch = self._drift.setdefault(board.name, DriftWatch())
         serial_number = "" if board.identity is None else str(board.identity.serial_number)
         taring = board.pipeline is not None and board.pipeline.taring
@@ -118,7 +118,7 @@ LEVELS = {
 
 
 def summary(port: Port, node: int, board: BoardSession, now: Instant) -> dict[str, Any]:
-    """Everything worth knowing of one board, for the status service. s, Hz, N, µT."""
+    """State of one board for the status service, in s, Hz, N and µT."""
     link = port.line.links.get(node)
     values: dict[str, Any] = {
         "state": board.state,
@@ -177,13 +177,13 @@ def summary(port: Port, node: int, board: BoardSession, now: Instant) -> dict[st
 
 
 def health(flags: np.ndarray[Any, np.dtype[np.uint8]]) -> dict[str, int]:
-    """Taxels that are not to be trusted, by reason."""
+    """Count the unhealthy taxels by reason; ``flags``: (N,) uint8 of `TaxelHealth`."""
     reasons = {flag.name or "": int(np.count_nonzero(flags & flag)) for flag in TaxelHealth}
     return {name.lower(): n for name, n in reasons.items() if n}
 
 
 def drops(port: Port, node: int, board: BoardSession) -> dict[str, int]:
-    """Everything lost on the way from the wire to the features of one board, by reason."""
+    """Count by reason what was lost between the wire and the features of one board."""
     counts = port.drops() | {k: n for k, n in board.drops().items() if n}
     link = port.line.links.get(node)
     if isinstance(link, BoardLink):
@@ -197,7 +197,7 @@ def drops(port: Port, node: int, board: BoardSession) -> dict[str, int]:
 
 
 def message(name: str, values: dict[str, Any], recorder: Recorder | None, wall_ns: int) -> Any:
-    """``DiagnosticArray`` with the board and, where there is one, the log."""
+    """``DiagnosticArray`` of the board and, if there is one, the log."""
     state = values["state"]
     level = LEVELS.get(state, WARNING)
     alarms = values.get("alarms", ())

@@ -1,7 +1,7 @@
-"""What a port's pipeline acted on beside the bytes, into the log.
+"""The journal in the log: what a port's pipeline acted on besides the bytes.
 
-The links are pure: the same chunks, and the same few instants at which they did something of their
-own accord, make the same features. `rerun` drives them by this and by the raw chunks.
+Links are pure: the same chunks, and the same instants at which they acted on their own, give the
+same features. `rerun` drives them with the journal and the raw chunks.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from tactiled.boards.events import Identity
 from tactiled.publisher import Sink
 from tactiled.sensing.rest import RecordedRest
 
-# What every file of a log says of each board, so that a later file can be run by itself.
+# State of each board, kept in every file of a log so that a later file can be reprocessed alone.
 
 
 STATE_PREFIX = "state:"
-"""Names of these tables begin so; the name of the board follows."""
+"""Prefix of the names of these tables; the name of the board follows."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedState:
-    """A board as it stood. ``descriptor``: None for boards that have none; ``rest``: None before
-    the first tare; ``node``: on its bus, 0 on a serial line."""
+    """State of a board. ``descriptor``: None for boards that have none; ``rest``: None before the
+    first tare; ``node``: on its CAN bus, 0 on a serial line."""
 
     name: str
     node: int = 0
@@ -40,7 +40,7 @@ class RecordedState:
 
 
 def describe_state(node: int, identity: Identity, rest: RecordedRest | None) -> dict[str, str]:
-    """The table of a board: its own words as it sends them, and its rest field in JSON."""
+    """Metadata table of a board: its descriptor as sent, in hex, and its rest field in JSON."""
     said = identity.descriptor
     return {
         "node": str(node),
@@ -51,7 +51,7 @@ def describe_state(node: int, identity: Identity, rest: RecordedRest | None) -> 
 
 
 def recorded_state(name: str, values: Mapping[str, str]) -> RecordedState | None:
-    """The state of board ``name`` in a log; None when its table is spoilt."""
+    """The state of board ``name`` in a log; None when its table is damaged."""
     try:
         descriptor: Descriptor | None = None
         if values["descriptor"]:
@@ -71,12 +71,12 @@ TARE, SET_RATE, RECALIBRATE = "tare", "set_rate", "recalibrate"
 """Kinds of a ``PortEvent``."""
 
 PROGRESS_NS = NS_PER_S // 4
-"""At least this often it says how far the chunks have been worked off: whoever reads the log holds
-chunks back until then."""
+"""Longest time between notes of how far the chunks have been processed: `rerun` holds chunks back
+until then."""
 
 
 class Journal:
-    """Of one port; used by the pipeline's thread alone. ``name``: that of its raw chunks."""
+    """Journal of one port; used only by the pipeline's thread. ``name``: of its raw chunks."""
 
     def __init__(self, sink: Sink, name: str, port: str) -> None:
         self._sink = sink
@@ -86,7 +86,7 @@ class Journal:
         self._said: Instant | None = None
 
     def worked(self, received: Instant) -> None:
-        """The chunk that came at ``received`` has been worked off."""
+        """Note that the chunk received then has been processed."""
         self._after = received
 
     def note(
@@ -99,7 +99,7 @@ class Journal:
         value: float = 0.0,
         text: str = "",
     ) -> None:
-        """Something of ``kind`` was acted on at ``now``; see ``PortEvent.msg``."""
+        """Write that ``kind`` was acted on at ``now``; see ``PortEvent.msg``."""
         self._said = self._after
         wall_ns = self._sink.wall.wall_ns(now)
         message = MSG.PortEvent(
@@ -115,6 +115,6 @@ class Journal:
         self._sink.send(PORT, self._name, message, wall_ns)
 
     def progress(self, now: Instant) -> None:
-        """Say how far the chunks have been worked off, where that was not said for a while."""
+        """Write how far the chunks have been processed, if the last note is a while ago."""
         if self._after and (self._said is None or self._after - self._said >= PROGRESS_NS):
             self.note(WORKED, now)

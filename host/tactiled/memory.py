@@ -1,4 +1,4 @@
-"""Keeping memory flat for weeks: collections off the hot path, large buffers back to the system."""
+"""Keep memory flat for weeks: garbage is collected between cycles, large buffers are returned."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ M_MMAP_THRESHOLD = -3
 """Parameter number in glibc's malloc.h."""
 
 LARGE = 65_536
-"""Bytes from which a buffer is mapped for itself and given back when freed. Left alone, glibc
-raises its limit to the largest buffer freed so far, then places the log's chunks (some 150 kB
-twice a second) between small objects and never gets the holes back: 2.5 kB/s of growth measured."""
+"""Bytes from which a buffer is mapped on its own and returned when freed. By default glibc raises
+this limit to the largest buffer freed so far, then places the log's chunks (some 150 kB twice a
+second) between small objects and never reuses the holes: 2.5 kB/s of growth measured."""
 
 FREEZE_AFTER = 5
-"""s after the start at which what lives then is taken out of the collector's sight for good."""
+"""s after the start at which all objects alive are exempted from collection for good."""
 
 COLLECT_EVERY = 10
 """s between collections thereafter; with so few objects left to look at they take 1 ms."""
 
 
 def return_large_buffers() -> None:
-    """Have malloc map large buffers for themselves, where it is glibc's."""
+    """Make malloc map large buffers on their own, if it is glibc's."""
     if sys.platform == "linux":
         mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
         if mallopt is not None:
@@ -30,13 +30,13 @@ def return_large_buffers() -> None:
 
 
 class Collector:
-    """Collects garbage when told the time is good: at any other it would stop every thread."""
+    """Collects garbage at a good moment; at any other it would stop every thread."""
 
     def __init__(self) -> None:
         self._seconds = 0
 
     def each_second(self) -> None:
-        """Called once a second, between two cycles."""
+        """Call once a second, between two cycles."""
         self._seconds += 1
         if self._seconds == FREEZE_AFTER:
             gc.collect()

@@ -1,6 +1,6 @@
-"""The live page beside the daemon (``--view``): a process of its own, which ends with it.
+"""The live page (``--view``): a separate process that ends with the daemon.
 
-It joins the bus as any tool does, so whatever the page costs is not taken from the pipeline.
+It joins the bus like any tool, so the page takes no time from the pipeline.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 from tactile_core.bus.session import BusConfig
 
 END_S = 3.0
-"""For the page to end in order."""
+"""Time for the page to end by itself."""
 
 
 class PageError(Exception):
@@ -21,9 +21,9 @@ class PageError(Exception):
 
 
 class PageProcess:
-    """``tactile view`` on the bus of this daemon; `PageError` when the command is not there.
+    """``tactile view`` on the bus of this daemon; `PageError` when the command is not installed.
 
-    The page ends when its standard input does: also when this process is killed.
+    The page ends when its standard input closes, so also when this process is killed.
     """
 
     def __init__(self, port: int, bus: BusConfig) -> None:
@@ -32,7 +32,7 @@ class PageProcess:
         if command is None:
             raise PageError("--view needs the command `tactile`: install the whole package")
         words = [command, "view", "--port", str(port), "--until-stdin-ends"]
-        # Also those whom a tool meets by itself: the page shows arm and reach, too.
+        # Also a tool's default endpoints: the page shows arm and reach as well.
         default = BusConfig(role="tool", keys=bus.keys, tls=bus.tls, insecure=bus.insecure)
         endpoints = [*bus.listen_endpoints(), *(bus.connect or default.connect_endpoints())]
         for endpoint in dict.fromkeys(endpoints):

@@ -22,23 +22,23 @@ from tactiled.transports.base import Transport
 log = logging.getLogger(__name__)
 
 TURN = 64
-"""Chunks worked off at a time: however far behind a port is, others and requests get their turn."""
+"""Most chunks processed in one turn, so that a port that lags does not hold up the others."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """Why a port or board never came into service; ends the daemon at the start."""
+    """Why a port or board cannot come into service; ends the daemon at the start."""
 
     problem: str
     remedy: str
 
     def __str__(self) -> str:
-        """As people read it."""
+        """Problem and remedy in one line."""
         return f"{self.problem}; {self.remedy}"
 
 
 class Source(Protocol):
-    """What a port has of its reader."""
+    """The part of a reader that a port uses."""
 
     reopened: int
 
@@ -48,12 +48,12 @@ class Source(Protocol):
 
 
 class Port:
-    """Owned by the pipeline's thread.
+    """A port with its boards; owned by the pipeline's thread.
 
-    ``names``: of the boards at some nodes, and whether those came later than the others of their
-    bus. ``open_board``: opens the session of a board; `Trouble` when its name is taken.
-    ``live`` False: a recording, whose time is that of its chunks. ``journal``: where it is noted
-    what was acted on beside the bytes.
+    ``names``: gives the names of boards by node; its second argument says whether they joined the
+    bus later than the others. ``open_board``: opens the session of a board; `Trouble` when its name
+    is taken. ``live`` False: a recording, whose time is that of its chunks. ``journal``: takes
+    notes of everything acted on besides the bytes.
     """
 
     def __init__(
@@ -74,11 +74,11 @@ class Port:
         self.boards: dict[int, BoardSession] = {}
         self.ended = False
         self.trouble: Trouble | None = None
-        """What keeps this port out of service, as far as is known."""
+        """What keeps this port out of service; None when nothing is known to."""
         self.spoilt = 0
-        """Chunks, and turns, that could not be worked off for a reason nobody foresaw."""
+        """Chunks and turns lost to an unexpected error."""
         self.unnoted = 0
-        """Events that the journal could not hold."""
+        """Events that the journal could not encode."""
         self._complaints = Throttle(rate=0.1, burst=3)
         self._names = names
         self._open_board = open_board
@@ -92,17 +92,17 @@ class Port:
         return any(board.sent for board in self.boards.values())
 
     def admit(self, node: int, identity: Identity) -> Refusal | None:
-        """Judge a board that introduced itself."""
+        """Accept a board that has identified itself (None) or say why not."""
         board = self.boards.get(node)
         if board is None:
             return Refusal(f"no name is free for {identity}", "see the message above")
         return board.admit(identity)
 
     def pump(self, now: Instant, stopping: Callable[[], bool] = lambda: False) -> None:
-        """Work off what the reader handed over, then what time demands, then write.
+        """Process what the reader handed over, then whatever is due, then write.
 
-        ``stopping``: asked between two chunks; when true the rest is left. Nothing is raised: what
-        cannot be worked off is counted and told.
+        ``stopping``: asked between chunks; when true the rest is left. Never raises: chunks that
+        cannot be processed are counted and reported.
         """
         for _ in range(TURN):
             item = None if stopping() else self.inbox.take()
@@ -115,7 +115,7 @@ class Port:
             except Exception as error:  # noqa: BLE001 - one chunk must not end the others
                 self._spoilt(error)
         try:
-            # A recording's time is that of its chunks, which at high speed run ahead of ours.
+            # A recording runs on the time of its chunks; at high speed that is ahead of ours.
             self.tick(now if self._live else self._clock)
             if self._journal is not None:
                 self._journal.progress(now)
@@ -123,7 +123,7 @@ class Port:
             self._spoilt(error)
 
     def work(self, item: Item, now: Instant) -> None:
-        """Work off one chunk, or one piece of news of the port itself."""
+        """Process one item: a chunk, or that the port opened, was lost or ended."""
         if isinstance(item, Chunk):
             self._clock = item.received
             self._handle(self.line.receive(item))
@@ -146,30 +146,30 @@ class Port:
                 board.flush()
 
     def tick(self, now: Instant) -> None:
-        """Let the links do what time demands, and write what they want to say."""
+        """Let the links do what is due, and write what they send."""
         events, payloads = self.line.tick(now), self.line.outgoing()
-        if events or payloads:  # else it left no trace, whenever it was
+        if events or payloads:  # a tick without effect need not be rerun
             self.note(kinds.TICK, now)
         self._handle(events)
         for payload in payloads:
             self.reader.transport.write(payload)
 
     def note(self, kind: str, now: Instant, **values: Any) -> None:
-        """Have the journal note what is acted on; see `Journal.note`."""
+        """Note an event in the journal, if there is one; see `Journal.note`."""
         if self._journal is not None:
             try:
                 self._journal.note(kind, now, **values)
-            except (ValueError, TypeError) as error:  # a text that no message can hold
+            except (ValueError, TypeError) as error:  # the text cannot be encoded
                 self.unnoted += 1
                 log.debug("%s: %s cannot be noted: %s", self.name, kind, error)
 
     @property
     def behind(self) -> bool:
-        """Whether more waits than one turn works off."""
+        """Whether chunks are still waiting after the last turn."""
         return self.inbox.waiting
 
     def retry(self, node: int, now: Instant) -> None:
-        """Have a refused board judged again."""
+        """Give a refused board another chance."""
         link = self.line.links.get(node)
         if isinstance(link, BoardLink):
             link.retry(now)
@@ -177,7 +177,7 @@ class Port:
             link.retry()
 
     def stop_streaming(self, now: Instant) -> None:
-        """Stop the boards, send what is under way."""
+        """Tell the boards to stop, and publish the cycles under way."""
         self.note(kinds.ENDED, now)
         for node, link in self.line.links.items():
             if isinstance(link, BoardLink):
@@ -188,7 +188,7 @@ class Port:
             self.reader.transport.write(payload)
 
     def add_board(self, node: int, name: str) -> None:
-        """Make room for a board under ``name``."""
+        """Open the session of a board under ``name``; sets `trouble` when that fails."""
         board = self._open_board(self, node, name)
         if isinstance(board, Trouble):
             self.trouble = board
@@ -198,7 +198,7 @@ class Port:
             self.boards[node] = board
 
     def drops(self) -> dict[str, int]:
-        """What this port lost or refused before any board's pipeline, by reason."""
+        """Count by reason of what was lost or refused before it reached a pipeline."""
         counts = dict(self.line.rejects)
         counts.update(self.reader.transport.losses)
         counts["inbox_overflow"] = self.inbox.dropped
@@ -210,7 +210,7 @@ class Port:
 
     @property
     def identified(self) -> bool:
-        """Whether any board of this port has ever said who it is."""
+        """Whether any board of this port has ever identified itself."""
         return any(board.identity is not None for board in list(self.boards.values()))
 
     def _spoilt(self, error: Exception) -> None:
@@ -220,7 +220,7 @@ class Port:
 
     def _hand_over(self, board: BoardSession, event: Event) -> None:
         if not self._live:
-            board.handle(event)  # a recording is judged by whether it comes out the same
+            board.handle(event)  # no error may be hidden: a rerun must reproduce the recording
             return
         try:
             board.handle(event)

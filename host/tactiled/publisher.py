@@ -1,4 +1,4 @@
-"""Cycles and events as ROS 2 messages: pure translation, no bus and no log."""
+"""Turn cycles and events into ROS 2 messages, and send those to the bus and into the log."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from tactiled.blocks import Chunk, Cycle, Patch
 from tactiled.transports.recorded_log import to_raw
 
 RAW_PART = 32_768
-"""Bytes of serial data in one RawChunk: with its header below the 64 KiB a message may have."""
+"""Most bytes of serial data in one RawChunk: with its header below the 64 KiB of a message."""
 
 
 MAX_PATCHES = 512
-"""Patches that one message of features holds, 64 B each; the strongest, should there be more."""
+"""Most patches in one message of features, 64 B each; if there are more, the strongest are sent."""
 
 MAX_WITH_SURFACE = 2000
-"""Taxels whose geometry fits into one message whole, 32 B each. The largest board of PROTOCOL.md
-has 2048; its unrolled skin, which is for pictures, is left out."""
+"""Most taxels whose geometry fits whole into one message, 32 B each. The largest board of
+PROTOCOL.md has 2048; its unrolled skin, which is for pictures, is left out."""
 
 
 class MessageMaker:
-    """Messages of one board; what does not change from cycle to cycle is kept.
+    """Makes the messages of one board. Pure: no bus and no log.
 
-    ``patches_cut``: patches left out of messages of features so far. ``whole``: whether the
-    geometry is all there.
+    ``patches_cut``: patches left out of messages of features so far. ``whole``: whether messages
+    of geometry include the unrolled skin.
     """
 
     def __init__(self, calibration: BoardCalibration, wall: WallClock) -> None:
@@ -141,7 +141,7 @@ class MessageMaker:
         )
 
     def _strongest(self, patches: tuple[Patch, ...]) -> tuple[Patch, ...]:
-        """The patches to send, in their order."""
+        """The patches to send, in their order; counts the others."""
         self.patches_cut += max(0, len(patches) - MAX_PATCHES)
         return strongest(patches, MAX_PATCHES)
 
@@ -158,7 +158,7 @@ def strongest(patches: tuple[Patch, ...], count: int) -> tuple[Patch, ...]:
 
 
 def split(chunk: Chunk) -> Iterable[Chunk]:
-    """Parts of a chunk that each fit into one message."""
+    """Split a chunk into parts that each fit into one message."""
     payload = chunk.payload
     if not isinstance(payload, bytes) or len(payload) <= RAW_PART:
         return (chunk,)
@@ -182,7 +182,7 @@ def _flat(values: Any) -> Any:
     return np.ascontiguousarray(values, np.float32).ravel()
 
 
-# Where messages leave the daemon: encoded once, the same bytes to the bus and into the log.
+# Messages leave the daemon here: encoded once, the same bytes to the bus and into the log.
 
 
 log = logging.getLogger(__name__)
@@ -192,13 +192,13 @@ NODE = "tactiled"
 
 
 class Sink(Protocol):
-    """Where a board's messages go: bus and log, or the log of a run over recorded bytes."""
+    """Where a board's messages go: bus and log, or only the log of a rerun."""
 
     wall: WallClock
     recorder: Recorder | None
 
     def now(self) -> Instant:
-        """Present instant of whatever clock the messages live by."""
+        """Present instant of the clock that stamps the messages."""
 
     def send(self, topic: Topic, name: str, message: Any, stamp_ns: int) -> None:
         """Encode and send; ``stamp_ns``: wall-clock time that the message stands for."""
@@ -213,10 +213,10 @@ class Sink(Protocol):
 
 
 class MessagePublisher:
-    """Bus and log behind one call. ``recorder`` None: nothing is logged.
+    """Sends messages to the bus and into the log. ``recorder`` None: nothing is logged.
 
-    After `end` nothing is published any more, whichever thread asks for it. ``late`` counts what
-    came after it, ``refused`` what the bus did not take.
+    After `end` nothing is published, whichever thread asks for it. ``late`` counts messages that
+    came after it, ``refused`` those that the bus did not take.
     """
 
     def __init__(
@@ -229,7 +229,7 @@ class MessagePublisher:
         self.wall = wall
         self.recorder = recorder
         self.recording: Recorder | None = None
-        """A second log, of what is published, while somebody has asked for one."""
+        """A second log, of what is published, while one has been asked for."""
         self.late = 0
         self.refused = 0
         self._ended = False
@@ -245,9 +245,9 @@ class MessagePublisher:
         return monotonic_now()
 
     def send(self, topic: Topic, name: str, message: Any, stamp_ns: int) -> None:
-        """Encode and send; ``stamp_ns``: wall-clock time that the message stands for.
+        """Encode and send. ``stamp_ns``: wall-clock time that the message stands for.
 
-        ValueError or TypeError for a message that cannot be encoded, and for nothing else.
+        Raises ValueError or TypeError only for a message that cannot be encoded.
         """
         data = self._codec.encode(topic, message)
         recorder, recording = self.recorder, None
@@ -261,7 +261,7 @@ class MessagePublisher:
                     log_of.write(topic, name, data, now_ns, stamp_ns)
 
     def raw(self, name: str, port: str, chunk: Chunk) -> None:
-        """Log what one read returned; called from the reader's thread."""
+        """Log a chunk; called from the reader's thread."""
         if self.recorder is None:
             return
         stamp_ns = self.wall.wall_ns(chunk.received)
@@ -282,12 +282,12 @@ class MessagePublisher:
         self.send(LOG, name, log_message(stamp_ns, level, speaker, text), stamp_ns)
 
     def end(self) -> None:
-        """Publish nothing from now on; what is being published is published first."""
+        """Publish nothing from now on; waits for a message that is just being published."""
         with self._publishing:
             self._ended = True
 
     def close(self) -> None:
-        """Take all streams back."""
+        """Undeclare all publishers."""
         self.end()
         for publisher in self._publishers.values():
             with suppress(zenoh.ZError):  # the session has closed by itself

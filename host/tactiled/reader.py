@@ -1,4 +1,4 @@
-"""The thread that reads one port: stamp, hand over, log, and reopen what vanished."""
+"""The thread that reads one port: stamps, hands over and logs chunks, and reopens a lost port."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ from tactiled.publisher import MessagePublisher
 from tactiled.transports import EndOfLog, PortClosed, PortGone, Transport, TransportError
 from tactiled.transports.serial_port import SerialTransport
 
-# Between a port's reader and the pipeline: bounded, the oldest dropped first and counted.
+# The queue between a port's reader and the pipeline: bounded; drops the oldest first, and counts.
 
 
 CHUNKS = 1024
-"""Chunks that may wait for the pipeline: a second of a busy CAN bus."""
+"""Most chunks that may wait for the pipeline: a second of a busy CAN bus."""
 
 MAX_AGE = 0.5
-"""s that a chunk may wait: features as old as that are of no use to anyone, and a pipeline that
-cannot keep up must show what is now, with gaps, rather than everything, late."""
+"""s that a chunk may wait. Older features are useless, and a pipeline that cannot keep up must show
+the present with gaps rather than everything late."""
 
 
 @dataclass(frozen=True, slots=True)
 class PortOpened:
-    """The port is open. ``usb_serial``: of its USB device; ``byte_time``: s per byte on a UART."""
+    """The port is open. ``usb_serial``: serial number of its USB device; ``byte_time``: s per byte
+    on a UART, else 0."""
 
     usb_serial: str = ""
     byte_time: float = 0.0
@@ -37,7 +38,7 @@ class PortOpened:
 
 @dataclass(frozen=True, slots=True)
 class PortLost:
-    """The port is gone; ``reason`` for people."""
+    """The port is gone. ``reason``: text for people."""
 
     reason: str
 
@@ -51,13 +52,13 @@ Item = Chunk | PortOpened | PortLost | PortEnded
 
 
 class Wake:
-    """Rouses the pipeline; shared by all ports."""
+    """Wakes the pipeline's thread; shared by all ports."""
 
     def __init__(self) -> None:
         self._event = threading.Event()
 
     def ring(self) -> None:
-        """There is something to do."""
+        """Wake the thread: there is something to do."""
         self._event.set()
 
     def wait(self, timeout: float) -> None:
@@ -67,7 +68,7 @@ class Wake:
 
 
 class Inbox:
-    """What one port's reader hands over; drops chunks, never news of the port itself."""
+    """Queue from one port's reader. Drops chunks when full, never opened, lost or ended."""
 
     def __init__(self, wake: Wake, limit: int = CHUNKS, max_age: float | None = None) -> None:
         """``max_age``: s after which a chunk that waits is dropped; None: never, for recordings."""
@@ -80,12 +81,12 @@ class Inbox:
         self.dropped = 0
         """Chunks dropped since the start."""
         self.skipped = 0
-        """Of these, the ones between the chunk taken last and the one before it."""
+        """How many of these lay between the chunk taken last and the one before it."""
         self._told = 0
 
     @property
     def full(self) -> bool:
-        """Whether the next chunk would push out the oldest."""
+        """Whether the next chunk would displace the oldest."""
         return self._chunks >= self._limit
 
     @property
@@ -94,7 +95,7 @@ class Inbox:
         return bool(self._items)
 
     def put(self, item: Item) -> None:
-        """Hand over one item; never waits."""
+        """Add one item; never waits."""
         with self._lock:
             if isinstance(item, Chunk):
                 if self._chunks >= self._limit:
@@ -106,7 +107,7 @@ class Inbox:
         self._wake.ring()
 
     def take(self) -> Item | None:
-        """Oldest item, None when there is none."""
+        """Remove and return the oldest item; None when empty."""
         with self._lock:
             if not self._items:
                 return None
@@ -117,7 +118,7 @@ class Inbox:
             return item
 
     def _oldest(self) -> tuple[int, Chunk]:
-        """Place of the oldest chunk, and the chunk; there must be one."""
+        """Index of the oldest chunk, and the chunk; there must be one."""
         return next((i, item) for i, item in enumerate(self._items) if isinstance(item, Chunk))
 
     def _is_stale(self, newest: Chunk) -> bool:
@@ -134,31 +135,31 @@ class Inbox:
 log = logging.getLogger(__name__)
 
 READ_TIMEOUT = 0.2
-"""s a read waits; `Transport.close` ends it sooner."""
+"""s that a read waits; `Transport.close` ends it sooner."""
 
 REOPEN_FIRST = 0.05
-"""s to the second attempt at a port that vanished; grows to `REOPEN_SLOWEST`."""
+"""s before the first attempt to reopen a lost port; doubles up to `REOPEN_SLOWEST`."""
 
 REOPEN_SLOWEST = 0.5
 """s between attempts: data must be back 2 s after a replug."""
 
 LOG_DELAY = 0.003
-"""s for which the log of a chunk waits: the pipeline works on it first, undisturbed."""
+"""s by which a chunk is logged late, so that the pipeline can process it first, undisturbed."""
 
 LOG_BATCH = 32
-"""Chunks that may wait so, when they come faster than that."""
+"""Most chunks that wait to be logged, when they come faster than that."""
 
 RESOLVE_EVERY = 0.5
-"""s between looks at where the path of a port leads, while no board was found on it."""
+"""s between checks of where a port's path leads, while no board has been found on it."""
 
 PACE = 0.002
-"""s between looks whether the pipeline has caught up with a recording."""
+"""s between checks whether the pipeline has caught up with a recording."""
 
 JOIN_TIMEOUT = 0.5
 """s for the thread to end; closing the port wakes it."""
 
 BITS_PER_BYTE = 10
-"""On a UART: start bit, eight data bits, stop bit."""
+"""Bits per byte on a UART: start bit, eight data bits, stop bit."""
 
 NO_UART = ("/dev/ttyACM", "/dev/pts/", "/dev/ttys")
 """Beginnings of devices whose baud rate means nothing: USB CDC and pseudo-terminals."""
@@ -167,8 +168,8 @@ NO_UART = ("/dev/ttyACM", "/dev/pts/", "/dev/ttys")
 class PortReader:
     """Reads ``transport`` into ``inbox`` on a thread of its own until `stop`.
 
-    ``name``: under which raw chunks are logged. ``paced``: wait for the pipeline rather than drop,
-    for recordings. ``failed`` is called with what the thread died of.
+    ``name``: raw chunks are logged under it. ``paced``: wait for the pipeline rather than drop,
+    for recordings. ``failed``: called with the error that ended the thread.
     """
 
     def __init__(
@@ -183,12 +184,12 @@ class PortReader:
         self.transport = transport
         self.reopened = 0
         self.identified: Callable[[], bool] = lambda: True
-        """Whether a board has said who it is on this port; until then the port's path is resolved
-        anew now and then, for it may be a link that comes to lead elsewhere."""
+        """Whether a board has identified itself on this port. Until then the port's path is
+        resolved again now and then: it may be a symbolic link that is moved to another device."""
         self.unlogged = 0
-        """Chunks that the log did not take."""
+        """Chunks that could not be logged."""
         self._resolve_at = 0.0
-        self.beat = monotonic_now()  # when its thread was last seen to go on
+        self.beat = monotonic_now()  # when its thread last made progress
         self._inbox = inbox
         self._publisher = publisher
         self.name = name
@@ -199,7 +200,7 @@ class PortReader:
         self._thread = threading.Thread(target=self._run, name=f"read-{name}", daemon=True)
 
     def open(self, wait: bool) -> None:
-        """Open the port; `TransportError` when it cannot be opened, unless ``wait``."""
+        """Open the port. `TransportError` when that fails, unless ``wait``: the thread retries."""
         try:
             self.transport.open()
         except TransportError as error:
@@ -262,7 +263,7 @@ class PortReader:
             self._log_waiting()
 
     def _check_path(self) -> None:
-        """`PortGone` when no board was found yet and the path leads to another device now."""
+        """Raise `PortGone` when no board was found yet and the path now leads to another device."""
         now = time.monotonic()
         if now < self._resolve_at:
             return

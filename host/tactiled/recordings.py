@@ -1,8 +1,8 @@
 """Recordings on request: a log beside the daemon's own, started, named and stopped over the bus.
 
-A recording holds what is published of every board of this daemon from its start to its stop. The
-bytes of the boards are in the daemon's own log alone. It ends by itself after its time limit, and
-nothing it does holds up the pipeline: files are opened and closed on the caller's thread.
+A recording holds everything published for every board of this daemon from its start to its stop;
+raw bytes are only in the daemon's own log. It ends at its time limit, and never holds up the
+pipeline: files are opened and closed on the caller's thread.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from tactiled.publisher import MessagePublisher
 log = logging.getLogger(__name__)
 
 FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
-"""What a recording may be called: a plain file name, never a path and never hidden."""
+"""Allowed names of recordings: plain file names, never a path and never hidden."""
 
 LONGEST_S = 86_400.0
 """Longest time limit of one recording."""
 
 USUAL_LIMIT_S = 3600.0
-"""Time limit where none is asked for, so that one forgotten recording does not fill the disk."""
+"""Time limit when none is given, so that a forgotten recording does not fill the disk."""
 
 CLOSE_TIMEOUT_S = 5.0
-"""For a recording to reach the disk when it is stopped on request."""
+"""Time for a recording to reach the disk when it is stopped on request."""
 
 GEOMETRY_TIMEOUT_S = 1.0
-"""For the pipeline to describe the boards at the start of a recording."""
+"""Time for the pipeline to describe the boards at the start of a recording."""
 
 
 class RecordRequest(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """``name``: of the file, without folder; dated when left out. ``limit_s``: it stops then."""
+    """``name``: file name without folder; default: the date. ``limit_s``: time limit."""
 
     action: Literal["start", "stop", "status"] = "status"
     name: str | None = None
@@ -55,7 +55,7 @@ class RecordRequest(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 class Recordings:
     """One recording at a time for the whole daemon. Thread-safe.
 
-    ``run``: carries a function out on the pipeline's thread. ``boards``: the boards known now.
+    ``run``: runs a function on the pipeline's thread. ``boards``: returns the boards known now.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Recordings:
         boards: Callable[[], list[BoardSession]],
     ) -> None:
         self._publisher = publisher
-        # Whoever asks for a recording wants all of it: nothing is deleted to make room.
+        # A recording is kept whole: no part is deleted to make room.
         self._settings = msgspec.structs.replace(settings, max_files=None, max_bytes=None)
         self._folder = _folder_of(destination)
         self._run = run
@@ -78,7 +78,7 @@ class Recordings:
         self._limit_s = USUAL_LIMIT_S
 
     def serve(self, request: RecordRequest) -> dict[str, Any]:
-        """Answer a request; `ServiceError` with the reason and the remedy."""
+        """Answer a request; `ServiceError` names reason and remedy."""
         if request.action == "start":
             return self._start(request)
         if request.action == "stop":
@@ -86,14 +86,14 @@ class Recordings:
         return self.summary()
 
     def summary(self) -> dict[str, Any]:
-        """What is being recorded now."""
+        """State of the recording for status and replies."""
         recorder = self._recorder
         if recorder is None:
             return {"recording": False}
         return {"recording": True, "limit_s": self._limit_s} | self._account(recorder)
 
     def each_second(self, now: Instant) -> None:
-        """Stop a recording whose time is over; never waits for the disk."""
+        """Stop a recording that has reached its time limit; never waits for the disk."""
         if self._recorder is None or now < after(self._started, self._limit_s):
             return
         recorder = self._detach()
@@ -104,7 +104,7 @@ class Recordings:
             ).start()
 
     def close(self) -> bool:
-        """End with the daemon; False when the file could not be finished in time."""
+        """End the recording; False when the file could not be finished in time."""
         recorder = self._detach()
         return recorder is None or recorder.close()
 
@@ -148,7 +148,7 @@ class Recordings:
         return recorder
 
     def _describe_boards(self) -> None:
-        """Put geometry and calibration of every board into the new file."""
+        """Write geometry and calibration of every board into the new file."""
 
         def describe() -> None:
             for board in self._boards():
@@ -161,7 +161,7 @@ class Recordings:
 
     def _account(self, recorder: Recorder) -> dict[str, Any]:
         stats = recorder.stats
-        # What comes between the stop and the end of the file belongs to no recording.
+        # Messages that come after the stop, while the file is closed, are not losses.
         dropped = sum(n for reason, n in stats.dropped.items() if reason != "closed")
         return {
             "path": stats.path,
@@ -187,7 +187,7 @@ class Recordings:
 
 
 def _folder_of(destination: Path | None) -> Path:
-    """Folder of the recordings: that of the daemon's own log."""
+    """Folder of the recordings: the same as the daemon's own log."""
     if destination is None:
         return Path(DEFAULT_LOG)
     return destination.parent if destination.suffix == ".mcap" else destination

@@ -1,8 +1,8 @@
-"""The pipeline again over what a log recorded: the same links and pipelines, no thread, no clock.
+"""Run the links and pipelines again over a log, without threads and without a clock.
 
-Where the log tells from the start what each port acted on beside its bytes (`journal`), every
-message comes out the same to the bit. Else the boards are only listened to, as in a replay: the
-same samples, their capture times estimated anew.
+Where the log has, from its start, the journal of what each port acted on besides its bytes
+(`journal`), every message is reproduced bit for bit. Otherwise the boards are only listened to, as
+in a replay: the samples are the same, but their capture times are estimated anew.
 """
 
 from __future__ import annotations
@@ -37,26 +37,23 @@ from tactiled.sensing.settings import PipelineSettings
 from tactiled.settings import Settings
 from tactiled.transports.base import Medium
 
-# What a log needs so that it can be run again to the bit, and running it.
-
-
-# What a log says of how its boards were read, so that its bytes can be run again the same way.
+# How the boards of a log were read; a log holds it so that its bytes can be processed the same way.
 
 
 PIPELINE = "pipeline"
 """Name of the metadata record with the fields of `PipelineSettings`, in JSON."""
 
 PORT_PREFIX = "port:"
-"""Names of the records of ports begin so; the name of the port's raw chunks follows."""
+"""Prefix of the names of ports' metadata records; the name of the port's raw chunks follows."""
 
 
 class RecordedError(ValueError):
-    """A log says something of its making that this program does not know; the text says what."""
+    """The log states how it was made in terms unknown to this version; the text says which."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedPort:
-    """How one port was read. ``nodes``: names of boards on a CAN bus; ``rate``: Hz that was set.
+    """How one port was read. ``nodes``: names of boards on a CAN bus; ``rate``: rate set, Hz.
 
     ``strict``: boards without a calibration file of their own were refused.
     """
@@ -74,7 +71,7 @@ class RecordedPort:
 
 
 def describe(settings: Settings) -> dict[str, dict[str, str]]:
-    """Metadata records of a daemon's log, by name; none for a replay, whose log says it all."""
+    """Metadata records of a daemon's log, by name; none for a replay, whose log has them."""
     if settings.replay:
         return {}
     pipeline = {key: json.dumps(value) for key, value in asdict(settings.pipeline).items()}
@@ -96,7 +93,7 @@ def describe(settings: Settings) -> dict[str, dict[str, str]]:
 
 
 def recorded_pipeline(values: Mapping[str, str]) -> PipelineSettings:
-    """Settings that a log was made with; `RecordedError` for one that is not known here."""
+    """Settings that a log was made with; `RecordedError` for one unknown to this version."""
     known = {field.name for field in fields(PipelineSettings)}
     if strange := set(values) - known:
         raise RecordedError(
@@ -111,10 +108,10 @@ def recorded_pipeline(values: Mapping[str, str]) -> PipelineSettings:
 
 
 def recorded_port(name: str, values: Mapping[str, str]) -> RecordedPort:
-    """Port ``name`` (without the prefix) of a log; `RecordedError` when its record is none."""
+    """Port ``name`` (without the prefix) of a log; `RecordedError` when its record is damaged."""
     try:
         nodes = {int(node): text for node, text in json.loads(values["nodes"]).items()}
-        arrays = json.loads(values.get("arrays", "null"))  # older logs do not say it
+        arrays = json.loads(values.get("arrays", "null"))  # missing in older logs
         return RecordedPort(
             name=name,
             spec=values["spec"],
@@ -132,15 +129,15 @@ def recorded_port(name: str, values: Mapping[str, str]) -> RecordedPort:
 
 
 HELD = 32_768
-"""Chunks held back until the journal has caught up with them: twice what the recorder's queue may
-hold, so that only a spoilt log gets there."""
+"""Most chunks held back until the journal has caught up with them: twice the recorder's queue, so
+that only a damaged log reaches it."""
 
 LOG = Path("the log")
-"""Where a calibration came from that no file was given for."""
+"""Source of a calibration that was taken from the log."""
 
 
 class RecordedSource:
-    """The port of a recording: nothing is written to it, and nothing is lost."""
+    """Transport of a recorded port: discards writes and loses nothing."""
 
     def __init__(self, name: str, medium: Medium) -> None:
         self.name = name
@@ -151,30 +148,31 @@ class RecordedSource:
 
     @property
     def transport(self) -> RecordedSource:
-        """Itself."""
+        """This object, which is its own transport."""
         return self
 
     def open(self) -> None:
         """Nothing to open."""
 
     def read(self, timeout: float) -> Chunk | None:
-        """Chunks are handed over by `Rerun`."""
+        """Always None: `Rerun` hands the chunks over."""
         del timeout
         return None
 
     def write(self, data: bytes | tuple[CanFrame, ...]) -> None:
-        """What was said then is not said again."""
+        """Discard: there is no board."""
 
     def close(self) -> None:
         """Nothing to close."""
 
 
 class Rerun:
-    """One port of a log. ``journal``: the log has its events; ``versions``: calibrations by hash.
-    ``states``: of boards by name, as they stood where the log begins if that is amid a run.
+    """Reprocesses one port of a log. ``journal``: whether the log has its events. ``versions``:
+    calibrations by hash. ``states``: states of boards by name at the beginning of a log that begins
+    in the middle of a run.
 
-    Hand over chunks and events, each in the order of the log, then `end`. ``exact``: whether all
-    so far is as it was; ``chunks``: worked off.
+    Hand over chunks and events, each in the order of the log, then call `end`. ``chunks``: number
+    of chunks processed.
     """
 
     def __init__(
@@ -189,7 +187,8 @@ class Rerun:
         states: Mapping[str, RecordedState] | None = None,
     ) -> None:
         self.chunks = 0
-        self._follow: bool | None = None if journal else False  # the journal's instants; not known
+        # Whether to follow the journal's instants; None: not known before its first event.
+        self._follow: bool | None = None if journal else False
         self._spoilt = False
         self._recorded = recorded
         self._store = store
@@ -206,7 +205,7 @@ class Rerun:
 
     @property
     def exact(self) -> bool:
-        """Whether every message is the same to the bit as it was, with the same settings."""
+        """Whether every message so far is, with the same settings, the recorded one bit for bit."""
         return bool(self._follow) and not self._spoilt
 
     @property
@@ -215,7 +214,7 @@ class Rerun:
         return [] if self._port is None else list(self._port.boards.values())
 
     def chunk(self, chunk: Chunk) -> None:
-        """Take the next chunk; parts of one that was too long for a message are put together."""
+        """Take the next chunk; joins the parts of one that was too long for a message."""
         part, self._part = self._part, None
         if part is not None and isinstance(chunk.payload, bytes):
             if part.received == chunk.received and isinstance(part.payload, bytes):
@@ -235,11 +234,11 @@ class Rerun:
         self._settle()
 
     def lost(self) -> None:
-        """Chunks or events are missing here: what comes after cannot be the same to the bit."""
+        """Note that chunks or events are missing here: the rest cannot be exact."""
         self._spoilt = True
 
     def end(self) -> None:
-        """The log is at its end: work off what is held back."""
+        """Process what is held back: the log has ended."""
         if self._part is not None:
             self._take(self._part)
             self._part = None
@@ -247,7 +246,7 @@ class Rerun:
         while self._events:
             event = self._events.popleft()
             if event.after_ns > self._newest:
-                break  # the bytes before it are behind the cut
+                break  # the bytes before this event were cut off
             self._act(event)
         while self._held and not self._over:
             self._work(self._held.popleft())
@@ -263,7 +262,7 @@ class Rerun:
         self._settle()
 
     def _settle(self) -> None:
-        """Act on every event whose place among the chunks is known."""
+        """Act on every event whose place among the chunks is settled."""
         while self._events and _place(self._events[0]) <= self._newest:
             self._act(self._events.popleft())
 
@@ -312,7 +311,7 @@ class Rerun:
         self._sink.set(chunk.received)
         port = self._port
         if port is None:
-            # Nothing tells how the port was opened: it was, before its first bytes came.
+            # The log does not say how the port was opened, only that bytes came.
             self._follow = False
             port = self._open(chunk)
             self._introduce(port, chunk)
@@ -322,7 +321,7 @@ class Rerun:
             port.tick(chunk.received)
 
     def _introduce(self, port: Port, first: Chunk) -> None:
-        """Open the port with what the log says of its boards: they do not say it again."""
+        """Open the port with the boards' recorded descriptors: the boards do not repeat them."""
         floats = [s.serial_number for s in self._states.values() if s.descriptor is None]
         port.work(PortOpened(floats[0] if len(floats) == 1 else ""), first.received)
         for state in self._states.values():
@@ -368,12 +367,12 @@ class Rerun:
 
 
 def _place(event: Any) -> int:
-    """Up to which chunk an event tells what became of them."""
+    """Instant of the last chunk whose fate an event settles."""
     return max(int(event.after_ns), int(event.until_ns))
 
 
 class ClockedSink(Sink, Protocol):
-    """A `Sink` whose time is that of what is being worked off."""
+    """A `Sink` whose clock is set to the time of what is being processed."""
 
     def set(self, now: Instant) -> None:
-        """It is ``now``."""
+        """Set the clock to ``now``."""

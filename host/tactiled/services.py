@@ -1,7 +1,7 @@
 """Services of a running board: status, tare, set_rate, recalibrate, geometry, record.
 
-Requests come on zenoh's threads and are carried out by the pipeline's thread. Whatever goes wrong
-comes back as an error reply.
+Requests arrive on zenoh's threads and are carried out by the pipeline's thread. Every failure is
+answered with an error reply.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ from tactiled.port import Port
 from tactiled.recordings import Recordings, RecordRequest
 
 PIPELINE_TIMEOUT = 1.0
-"""s the pipeline's thread may take to look at a request: it does so every 10 ms."""
+"""s for the pipeline's thread to take up a request; it looks for one every 10 ms."""
 
 TARE_TIMEOUT = 15.0
 """s for a tare: ten times its usual half second, and the retries of a first one."""
 
 TARE_CYCLES = 40
-"""Cycles it may take at that, which on a slow board last longer."""
+"""Further cycles that a tare may take; on a slow board they last longer."""
 
 SLOWEST_HZ = 0.5
-"""Rate of the slowest boards that are served."""
+"""Lowest rate that timeouts allow for."""
 
 COMMAND_TIMEOUT = 3.0
-"""s for a board's answer: five tries of 0.2 s, after those of commands before it."""
+"""s for a board's answer: five tries of 0.2 s, and time for the commands queued before it."""
 
 T = TypeVar("T")
 
 Run = Callable[[Callable[[], T]], "Future[T]"]
-"""Carries a function out on the pipeline's thread."""
+"""Runs a function on the pipeline's thread."""
 
 
 class Nothing(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -55,13 +55,13 @@ class Nothing(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
 
 class TareRequest(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """``force``: take what the skin reads for its rest, whatever speaks against it."""
+    """``force``: take the present reading as the rest field even where it looks loaded."""
 
     force: bool = False
 
 
 class RateRequest(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """``rate_hz``: samples a second, above 0."""
+    """``rate_hz``: samples per second, above 0."""
 
     rate_hz: float
 
@@ -101,7 +101,7 @@ class BoardServices:
         ]
 
     def close(self) -> None:
-        """Take the services back."""
+        """Undeclare the services."""
         for service in self._services:
             service.close()
 

@@ -1,7 +1,7 @@
-"""What tactiled is to do: a TOML file and flags, checked once, as one frozen value.
+"""Settings of tactiled from a TOML file and flags, checked once, as one frozen value.
 
-Flags win over the file. `SettingsError` says what was given and what is allowed; the command then
-exits with 2.
+Flags take precedence over the file. `SettingsError` says what was given and what is allowed; the
+command then exits with 2.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tactiled.transports import listing
 from tactiled.transports.slcan import slcan_commands
 
 REPLAY_PREFIX = "replay"
-"""First part of every key of a replay, so that nothing old is taken for live."""
+"""First part of every key of a replay, so that old data is never taken for live data."""
 
 T = TypeVar("T")
 
@@ -55,7 +55,7 @@ Arrays = Annotated[
 
 
 class SettingsError(Exception):
-    """Arguments or configuration that are refused."""
+    """Arguments or configuration that are refused; the text names the remedy."""
 
 
 class BoardTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -140,8 +140,9 @@ class ConfigFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 class PortSettings:
     """One port. ``spec``: path, CAN spec or log. ``nodes``: names of boards on a CAN bus by node.
 
-    ``name``: of the board on a serial port; on a bus of its only board, or the stem of the names.
-    ``arrays``: magnetometers of each board of a controller that does not say it.
+    ``name``: name of the board on a serial port or alone on a bus; with several boards on a bus,
+    their names start with it. ``arrays``: magnetometers of each array, for controllers that do not
+    report it.
     """
 
     name: str
@@ -155,9 +156,10 @@ class PortSettings:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Everything. ``log``: folder or file, None for none. ``duration``: s, None: until stopped.
+    """All settings. ``log``: folder or file; None: no log. ``duration``: s; None: until stopped.
 
-    ``speed``: of a replay, inf for as fast as can be.
+    ``rate``: Hz; None: the board's own. ``speed``: of a replay, times real time; inf: as fast as
+    possible.
     """
 
     ports: tuple[PortSettings, ...]
@@ -179,7 +181,7 @@ class Settings:
 
 
 def make_settings(options: argparse.Namespace) -> Settings:
-    """Settings from parsed flags and the file they name; `SettingsError` for anything wrong."""
+    """Make settings from parsed flags and the file they name; `SettingsError` for any mistake."""
     path: Path | None = options.config
     try:
         file = ConfigFile() if path is None else load_toml(path, ConfigFile)
@@ -292,7 +294,7 @@ def _ports_of_file(boards: tuple[BoardTable, ...], path: Path | None) -> tuple[P
 
 
 def array_sizes(text: str) -> tuple[int, ...]:
-    """Magnetometers of each array of a controller, as in ``5+5``; ValueError names the allowed."""
+    """Parse the magnetometers of each array, as in ``5+5``; ValueError says what is allowed."""
     words = text.split("+")
     if not all(word.isdecimal() and int(word) > 0 for word in words):
         raise ValueError(
@@ -343,7 +345,7 @@ def _check_names(ports: tuple[PortSettings, ...]) -> None:
 def _calibrations(
     options: argparse.Namespace, file: ConfigFile, path: Path | None
 ) -> tuple[Path, ...]:
-    """Flags, or else the file's, whose paths are relative to the file."""
+    """Calibration files of the flags, else of the file, whose paths are relative to it."""
     base = Path() if path is None else path.parent
     named = [Path(p) for p in options.calibration or ()]
     if not named:
@@ -363,7 +365,7 @@ def _calibrations(
 
 
 def pipeline_settings(file: ConfigFile) -> PipelineSettings:
-    """Settings of the sensing core in a file; `ConfigError` for what does not fit together."""
+    """Settings of the sensing core in a file; `ConfigError` for combinations not allowed."""
     return PipelineSettings(**given(file.compensation), **given(file.sensing))
 
 
@@ -371,7 +373,7 @@ def _pipeline(options: argparse.Namespace, file: ConfigFile, path: Path | None) 
     try:
         settings = pipeline_settings(file)
         method = options.compensation or settings.method
-        if method == "ransac":  # before a board is opened, not on the pipeline's thread
+        if method == "ransac":  # check now: later it would fail on the pipeline's thread
             require("sklearn", extra="calibrate", what="compensation ransac")
         return replace(
             settings,
@@ -384,7 +386,7 @@ def _pipeline(options: argparse.Namespace, file: ConfigFile, path: Path | None) 
 
 
 def _log(options: argparse.Namespace, file: ConfigFile, replay: bool) -> Path | None:
-    """A replay is logged only when --log asks for it: everything is in its log already."""
+    """Destination of the log. A replay is logged only with --log: its data is in a log already."""
     if replay and options.log is None:
         return None
     return log_destination(options, file.log)

@@ -1,4 +1,4 @@
-"""What a skin feels as shapes for a 3D view, at a rate for eyes: taxels, patches, their forces."""
+"""Markers of a skin for a 3D view, at a rate for viewers: taxels, patches and their forces."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from tactiled.blocks import Cycle
 from tactiled.publisher import strongest
 
 TAXELS, CONTACT, FORCE, LABEL = "taxels", "contacts", "forces", "labels"
-"""Namespaces of the markers; the number of a contact is that of its patch."""
+"""Namespaces of the markers; contacts are numbered like their patches."""
 
 FULL_N = 3.0
-"""N on a taxel at which its colour is full: a firm press spread over some taxels."""
+"""N on a taxel at which its colour is full: a firm press spread over several taxels."""
 
 METRES_PER_N = 0.01
-"""How long an arrow is drawn: the paper's threshold of 10 N is as long as the finger's side."""
+"""Length of an arrow: the paper's threshold of 10 N is as long as the finger's side."""
 
 TAXEL_M, SHAFT_M, LETTERS_M = 0.003, 0.002, 0.01
 
 LIST_MAX = 1024
-"""Taxels in one marker, 40 B each."""
+"""Most taxels in one marker, 40 B each."""
 
 SMALL, FEW = 512, 32
-"""Taxels, and patches (some 1.1 kB each), that one message may hold together; beyond, the picture
-is made of several."""
+"""Most taxels, and patches (some 1.1 kB each), in a picture of one message; larger pictures take
+several."""
 
 MAX_DRAWN = 128
-"""Patches drawn: more than anyone tells apart."""
+"""Most patches drawn: more cannot be told apart."""
 
 IDLE: Colour = (0.55, 0.58, 0.62, 1.0)
 SICK: Colour = (0.85, 0.0, 0.6, 1.0)
@@ -44,7 +44,7 @@ AT_ORIGIN = (0.0, 0.0, 0.0, 0.0)
 
 
 class SkinPicture:
-    """Pictures of one board; `due` tells when the next one is."""
+    """Draws one board; `due` says when the next picture is."""
 
     def __init__(self, geometry: SkinGeometry) -> None:
         self._frame = geometry.frame
@@ -53,7 +53,7 @@ class SkinPicture:
         self._due: Instant | None = None
 
     def due(self, captured: Instant) -> bool:
-        """Whether a cycle captured then is to be drawn; by capture times alone."""
+        """Whether to draw a cycle with this capture time; depends on capture times alone."""
         period = round(NS_PER_S / CONTACTS.rate)
         if self._due is not None and self._due - 2 * period <= captured < self._due:
             return False
@@ -63,8 +63,8 @@ class SkinPicture:
     def draw(self, cycle: Cycle, wall_ns: int) -> list[Any]:
         """``MarkerArray`` of the taxels by their normal force, and of the contact patches.
 
-        One message, or several that make up the picture in their order: none of them is longer
-        than a message may be. Of more than `MAX_DRAWN` patches the strongest are drawn.
+        One message, or several that make up the picture in order, each within the size limit of a
+        message. Of more than `MAX_DRAWN` patches the strongest are drawn.
         """
         size = (TAXEL_M, TAXEL_M, TAXEL_M)
         colours = self._colours(cycle)
@@ -104,9 +104,9 @@ class SkinPicture:
 def patch_markers(
     wall_ns: int, frame: str, patches: Iterable[tuple[Triple, Triple, float]]
 ) -> list[Any]:
-    """Markers of contact patches: where (m), what pushes on the skin there (N), normal force (N).
+    """Markers of contact patches: position (m), force on the skin there (N), normal force (N).
 
-    The arrow of a force ends on the skin.
+    Vectors in ``frame``. The arrow of a force ends on the skin.
     """
     made = []
     for number, ((x, y, z), force, normal) in enumerate(patches):

@@ -1,6 +1,6 @@
-"""What people see while tactiled runs: a live line for each board, or plain lines now and then.
+"""The status shown while tactiled runs: a live line per board, or plain lines now and then.
 
-A line says first what the skin feels, or why that is not known, and fits 80 columns.
+A line starts with the force on the skin, or why there is none, and fits 80 columns.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ REFRESH = 0.2
 """s between refreshes of the live lines."""
 
 WIDTH = 80
-"""Columns of a plain line, and of a terminal that does not say."""
+"""Columns of a plain line, and of a terminal of unknown width."""
 
 NAME_WIDTH = 12
-"""Columns of a board's name; longer ones are cut in their middle."""
+"""Columns of a board's name; longer ones are shortened in the middle."""
 
 FULL_BAR_N = 10.0
-"""N at which a force bar is full: the paper's thresholds lie below."""
+"""N at which a force bar is full; the paper's thresholds are lower."""
 
 BAR = " ▁▂▃▄▅▆▇█"
 
@@ -39,18 +39,18 @@ STALE_AFTER = 0.5
 """s without data after which a board's figures are shown as old."""
 
 STALE_PERIODS = 3
-"""Or so many of its periods, if that is longer."""
+"""The same in periods of its rate, if that is longer."""
 
 SIDES = ((Side.LEFT, "left"), (Side.RIGHT, "right"), (Side.TIP, "tip"))
 
 
 @dataclass(frozen=True, slots=True)
 class Glimpse:
-    """What is shown of a board. ``forces``: N, the normal force of the contacts on each side.
+    """What is shown of a board. ``forces``: normal force of the contacts on each side, N.
 
-    ``bound``: N that their sum may err by (95 %), inf where nothing says. ``rate``: Hz.
-    ``latency``: s, median from the last byte to the features; NaN: none measured. ``alarms``: what
-    somebody should look at before it becomes a fault.
+    ``bound``: 95 % bound of the error of their sum, N; inf where unknown. ``rate``: Hz.
+    ``latency``: median from the last byte to the features, s; NaN when not measured. ``alarms``:
+    warnings of faults to come.
     """
 
     name: str
@@ -66,7 +66,7 @@ class Glimpse:
 
 
 def glimpse(board: BoardSession, now: Instant) -> Glimpse:
-    """What there is to be seen of a board at ``now``."""
+    """Collect what is shown of a board at ``now``."""
     cycle, limit = board.last, STALE_AFTER
     if board.rate > 0:
         limit = max(limit, STALE_PERIODS / board.rate)
@@ -76,7 +76,7 @@ def glimpse(board: BoardSession, now: Instant) -> Glimpse:
     if cycle is not None and seconds_between(cycle.received, now) < limit:
         features = cycle.features
         valid = features.valid
-        if cycle.calibrated:  # nominal figures are right to a factor of two, which says little
+        if cycle.calibrated:  # nominal figures are accurate only to within a factor of two
             bound = features.normal_force_bound
         reasons = tuple(reason.text for reason in features.reasons)
         if board.choice is not None:
@@ -100,9 +100,9 @@ def side_forces(features: Features, sides: Sequence[Side]) -> dict[Side, float]:
 
 
 def line(seen: Glimpse, width: int = WIDTH, name_width: int = 0) -> Text:
-    """One line of at most ``width`` columns: name, force or why there is none, then the rest.
+    """Format at most ``width`` columns: name, force or why there is none, then the rest.
 
-    ``name_width``: columns that the names of all boards need.
+    ``name_width``: columns of the longest name, to align the lines.
     """
     text = Text(no_wrap=True)
     text.append(f"{_cut_middle(seen.name, NAME_WIDTH):{min(name_width, NAME_WIDTH)}}", "bold")
@@ -130,7 +130,7 @@ def line(seen: Glimpse, width: int = WIDTH, name_width: int = 0) -> Text:
 
 
 def force_text(forces: Mapping[Side, float], bound: float = math.inf) -> str:
-    """Force of each side in N with a bar; of the only side, its bound instead of its name."""
+    """Force of each side in N with a bar; a single side has its bound instead of a name."""
     shown = [(name, forces[side]) for side, name in SIDES if side in forces]
     if len(shown) <= 1:
         force = sum(forces.values())
@@ -146,7 +146,7 @@ def bar(force: float) -> str:
 
 
 class StatusLines(LiveLines):
-    """Shows the boards of ``ports``."""
+    """Live lines of the boards of ``ports``."""
 
     def __init__(self, console: Console, ports: list[Port], recorder: Recorder | None) -> None:
         super().__init__(console, recorder)

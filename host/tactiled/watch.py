@@ -1,4 +1,4 @@
-"""Which chips of a board are masked, since when, how often: for the log, status and diagnostics."""
+"""Report what repeats without flooding the log: masked chips, silences, messages of one kind."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from tactile_core.geometry import SkinGeometry
 from tactile_core.types import Instant, seconds_between
 from tactiled.sensing.reasons import Fault
 
-# What is said once, and what that happens again and again comes to: pure, time passed in.
+# Repeated messages; pure, time is passed in.
 #
-# The first few of a kind are told at once. What follows within `WINDOW_S` is counted, and told as
-# one line at the end of it, so that a flood of one kind hides neither the rest nor its own size.
+# The first few of a kind are reported at once. Those that follow within `WINDOW_S` are counted, and
+# one line reports them at its end, so that a flood of one kind hides neither the others nor itself.
 
 
 WINDOW_S = 10.0
-"""s within which what happens again is only counted."""
+"""s within which repeats are only counted."""
 
 FEW = 3
-"""Of one kind that are told at once: a person who plugs and unplugs is not a flood."""
+"""Messages of one kind reported at once: someone who plugs and unplugs is not a flood."""
 
 KINDS = 64
-"""Kinds that are followed at a time; others, from boards that make up ever new texts, are told."""
+"""Most kinds tracked at a time; messages of further kinds are all reported."""
 
 
 @dataclass(slots=True)
@@ -39,13 +39,13 @@ class _Window:
 
 
 class Repeats:
-    """Events of several kinds, each a text."""
+    """Decides which repeated messages to report, by kind."""
 
     def __init__(self) -> None:
         self._windows: dict[str, _Window] = {}
 
     def tell(self, kind: str, text: str, level: int, now: Instant) -> bool:
-        """Whether to say ``text`` now; else it is counted. ``level``: of the log."""
+        """Whether to report ``text`` now; if not, it is counted. ``level``: logging level."""
         window = self._windows.get(kind)
         if window is not None and window.told < FEW:
             window.told += 1
@@ -59,7 +59,7 @@ class Repeats:
         return True
 
     def due(self, now: Instant) -> list[tuple[int, str]]:
-        """Level and text of what to say of the windows that are over."""
+        """Levels and texts of the summaries that are due."""
         said = []
         for kind, window in list(self._windows.items()):
             past = seconds_between(window.begun, now)
@@ -75,7 +75,7 @@ class Repeats:
 
 
 class Silences:
-    """Silences of one board. Short ones in a row are one line; one that lasts is told by itself."""
+    """Silences of one board: several short ones make one line, a long one has its own."""
 
     def __init__(self) -> None:
         self._begun: Instant | None = None  # of the window
@@ -86,7 +86,7 @@ class Silences:
         self._told = False
 
     def fell(self, seconds: float, now: Instant) -> str | None:
-        """A silence has been noticed after so many s; what to say of it at once."""
+        """Take a silence noticed after ``seconds``; returns what to report at once, or None."""
         self._since, self._before = now, seconds
         self._told = self._begun is None
         if not self._told:
@@ -95,7 +95,7 @@ class Silences:
         return f"no samples for {seconds:.2f} s"
 
     def ended(self, seconds: float) -> str | None:
-        """It is over after so many s; what to say at once."""
+        """Take the end of a silence of ``seconds``; returns what to report at once, or None."""
         self._since = None
         if self._told:
             return f"samples again after {seconds:.2f} s"
@@ -104,11 +104,11 @@ class Silences:
         return None
 
     def gone(self) -> None:
-        """The board is not there any more: that is told elsewhere."""
+        """Forget the silence under way: the board is gone, which is reported elsewhere."""
         self._since = None
 
     def due(self, now: Instant) -> str | None:
-        """What to say of a silence that lasts, or of a window that is over; to be called often."""
+        """What to report of a lasting silence or a window that is over, or None; call it often."""
         if self._since is not None and not self._told:
             lasts = self._before + seconds_between(self._since, now)
             if lasts >= max(LASTING_S, 3 * self._before):
@@ -128,18 +128,18 @@ class Silences:
 
 
 LASTING_S = 2.0
-"""s after which a silence that was only counted is told after all."""
+"""s after which a silence that was only counted is reported after all."""
 
 
 REPEAT_S = 10.0
-"""s between two lines about the same fault of the same array."""
+"""s between lines about the same fault of the same array."""
 QUIET_S = 3.0
-"""s that a chip must read well before it is said to be well again."""
+"""s that a chip must read without fault before it counts as recovered."""
 MOST_NAMED = 6
-"""Chips named in a line; of more it says how many."""
+"""Most chips named in a line; for more, their number is given."""
 
 _UNTOLD = (Fault.NONE, Fault.MISSING)
-"""Of an array that is missing others tell."""
+"""Faults not reported here; a missing array is reported elsewhere."""
 _TOLD = np.array([fault not in _UNTOLD for fault in Fault])
 
 
@@ -147,7 +147,8 @@ _TOLD = np.array([fault not in _UNTOLD for fault in Fault])
 class Masked:
     """One chip that is masked, or was in the last `QUIET_S`.
 
-    ``seconds``: since it was first masked. ``share``: of the cycles of the last second.
+    ``seconds``: time since it was first masked. ``share``: fraction of the last second's cycles in
+    which it was.
     """
 
     array: str
@@ -157,13 +158,13 @@ class Masked:
     share: float
 
     def __str__(self) -> str:
-        """As status and diagnostics show it."""
+        """Text for status and diagnostics."""
         often = "" if self.share > 0.99 else f" in {self.share:.0%} of cycles"
         return f"{self.fault.text}; masked{often} since {self.seconds:.0f} s: {self.fault.remedy}"
 
 
 class ChipWatch:
-    """Watches the cycles of one board; memory of a few numbers a taxel."""
+    """Tracks the masked chips of one board; keeps a few numbers per taxel."""
 
     def __init__(self, geometry: SkinGeometry) -> None:
         self._names = [
@@ -180,10 +181,10 @@ class ChipWatch:
         self._cycles = 0
         self._said: dict[tuple[str, Fault], Instant] = {}
         self.masked: list[Masked] = []
-        """Chips masked now or just now, as of the last `each_second`; replaced as a whole."""
+        """Chips masked now or shortly before, as of the last `each_second`; replaced as a whole."""
 
     def observe(self, fault: NDArray[np.uint8], captured: Instant) -> None:
-        """Take (N,) uint8 of `Fault` of one cycle."""
+        """Take the faults of one cycle, (N,) uint8 of `Fault`."""
         self._cycles += 1
         if not fault.any():
             return
@@ -196,7 +197,7 @@ class ChipWatch:
         self._count[bad] += 1
 
     def each_second(self, now: Instant) -> list[tuple[int, str]]:
-        """Levels and texts of what has changed, for the log."""
+        """Levels and texts of changes, for the log."""
         lines: list[tuple[int, str]] = []
         self._share = self._count / max(self._cycles, 1)
         cycles = self._cycles
@@ -258,7 +259,7 @@ class ChipWatch:
         return float((self._until[members] - self._since[members]).max() * 1e-9)
 
     def _called(self, array: str, members: Sequence[int]) -> str:
-        """``chip 2 of skin``, ``chips 2, 4 of skin``, ``16 chips of left``."""
+        """``chip 2 of skin``, ``each of chips 2, 4 of skin``, ``each of 16 chips of left``."""
         if len(members) > MOST_NAMED:
             return f"each of {len(members)} chips of {array}"
         which = ", ".join(str(self._names[i][1]) for i in members)

@@ -1,1 +1,1 @@
-"""Boards behind a port: who they are, their clocks, their frames in order. Pure."""
+"""Boards behind a port: their identification, clocks and frames. Pure."""

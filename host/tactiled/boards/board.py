@@ -1,7 +1,7 @@
-"""One board that speaks our protocol, from the first Identify to streaming and back again.
+"""State machine of one board that speaks our protocol, from the first Identify to streaming.
 
-Pure: messages and instants in, events and messages to send out. Nothing is used of a board before
-it has said who it is and was admitted, neither at the start nor after a reset or a silence.
+Pure: messages and instants in; events, and messages to send, out. No data of a board is used before
+it has identified itself and was admitted, neither at the start nor after a reset or a silence.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from tactiled.boards.events import (
     Streaming,
 )
 
-# Exact account of the frames of one array: which came, which came twice, which are missing.
+# Exact count of the frames of one array: received, duplicate and missing.
 
 
 HISTORY = 64
@@ -63,19 +63,19 @@ WRAP = 1 << 32
 
 
 class Verdict(Enum):
-    """What a sequence number says of its frame."""
+    """What the sequence number of a frame shows."""
 
     FRESH = auto()
     DUPLICATE = auto()
-    LATE = auto()  # fills a gap, but newer ones were used already
-    FOREIGN = auto()  # further back than anything is reordered: the board started anew
+    LATE = auto()  # fills a gap, but newer frames have been used already
+    FOREIGN = auto()  # further back than reordering explains: the board has restarted
 
 
 class SequenceTracker:
-    """32-bit sequence numbers of one array.
+    """Tracks the 32-bit sequence numbers of one array.
 
-    Counters, since the start and through `restart`: ``accepted``, ``missing`` (in a gap and never
-    seen), ``duplicate``, ``late``; sent = accepted + late + missing.
+    Counters, which `restart` keeps: ``accepted``, ``missing`` (in a gap and never received),
+    ``duplicate``, ``late``; sent = accepted + late + missing.
     """
 
     def __init__(self) -> None:
@@ -85,11 +85,11 @@ class SequenceTracker:
         self._seen = 0  # bit i: newest - i came
 
     def restart(self) -> None:
-        """The next number, whatever it is, follows on; the counters go on."""
+        """Accept any number next; the counters are kept."""
         self._newest = None
 
     def resume(self) -> None:
-        """The board was out of sight: it goes on, or, if the next number is no newer, anew."""
+        """Note that the board was away: if the next number is not newer, it has restarted."""
         self._unsure = True
 
     def take(self, sequence: int) -> Verdict:
@@ -118,11 +118,11 @@ class SequenceTracker:
         return Verdict.LATE
 
 
-# Samples of one array on their way in: counted, scaled to µT, stamped in order. Pure.
+# Intake of samples: counts them, scales them to µT, and stamps them in order. Pure.
 
 
 class ArrayIntake:
-    """One array of a board; outlives the board's resets, so that its counts go on."""
+    """Intake of one array; survives resets of the board, so that its counts continue."""
 
     def __init__(self) -> None:
         self.tracker = SequenceTracker()
@@ -133,21 +133,21 @@ class ArrayIntake:
         self._captured = Instant(0)
 
     def describe(self, index: int, array: ArrayDescriptor) -> None:
-        """Take over what the board says of the array; ``index``: its place in the descriptor."""
+        """Take the array's description; ``index``: its position in the descriptor."""
         self._index, self._taxels = index, array.taxels
         self._lsb_ut = array.lsb_xy_nt * 1e-3, array.lsb_z_nt * 1e-3
         self._scale = np.array([self._lsb_ut[0], self._lsb_ut[0], self._lsb_ut[1]])
 
     def fits(self, message: Samples) -> bool:
-        """Whether these are as many taxels as the board said."""
+        """Whether the message has as many taxels as the descriptor."""
         return len(message.field) == self._taxels
 
     def block(
         self, message: Samples, stamp: Stamp, arrival: Instant, clock_usable: bool = True
     ) -> SampleBlock:
-        """The samples in µT. Their stamp is after that of earlier ones, whatever the ticks.
+        """Convert samples to µT. Their stamp is always after that of earlier ones.
 
-        What that moves the stamp by is added to its uncertainty.
+        If that moves the stamp, the shift is added to its uncertainty.
         """
         captured = Instant(max(stamp.captured, min(self._captured + 1, arrival)))
         self._captured = captured
@@ -165,25 +165,25 @@ class ArrayIntake:
         )
 
 
-# Commands to a board: one at a time, repeated until answered or given up. Pure.
+# Commands to a board: sent one at a time, repeated until answered or given up. Pure.
 
 
 COMMAND_RETRY = 0.2
-"""s a command waits for its answer: longer than any answer over a 115 200 baud line."""
+"""s to wait for an answer: longer than any answer takes over a 115 200 baud line."""
 
 COMMAND_TRIES = 5
-"""Times a command is sent before it is given up."""
+"""Times that a command is sent before it is given up."""
 
 COMMANDS = 8
-"""Commands that may wait: what a person can ask of a board within a second."""
+"""Most commands that may wait: what a person can request within a second."""
 
 REQUESTS = 1 << 16
-"""Request numbers wrap here: they are 16 bits on the wire."""
+"""Number of request numbers, which are 16 bits on the wire."""
 
 
 @dataclass(slots=True)
 class Command:
-    """One command under way. ``own``: of the link itself, not asked for from outside."""
+    """A command under way. ``own``: sent by the link itself, not requested from outside."""
 
     message: HostMessage
     request: int
@@ -193,7 +193,7 @@ class Command:
 
 
 class CommandQueue:
-    """Order of commands, their repetitions and answers; ``send`` is called with each message."""
+    """Sends commands in order and matches answers; ``send`` is called with each message."""
 
     def __init__(self, send: Callable[[HostMessage], None]) -> None:
         self._send = send
@@ -206,7 +206,7 @@ class CommandQueue:
         return len(self._waiting) >= COMMANDS
 
     def next_request(self) -> int:
-        """A fresh request number."""
+        """Next request number."""
         self._request = (self._request + 1) % REQUESTS
         return self._request
 
@@ -220,13 +220,13 @@ class CommandQueue:
         return number
 
     def clear(self) -> list[Command]:
-        """Forget all commands; returns them."""
+        """Remove all commands and return them."""
         dropped = list(self._waiting)
         self._waiting.clear()
         return dropped
 
     def answered(self, ack: Ack, now: Instant) -> Command | None:
-        """The command that ``ack`` answers; None for an answer that came twice or too late."""
+        """Remove and return the command that ``ack`` answers; None if repeated or late."""
         if not self._waiting or ack.request != self._waiting[0].request:
             return None
         head = self._waiting.popleft()
@@ -234,7 +234,7 @@ class CommandQueue:
         return head
 
     def drive(self, now: Instant) -> Command | None:
-        """Repeat the command under way if it is time; returns it when it is given up."""
+        """Repeat the command under way when due; returns it when it is given up."""
         if not self._waiting or now < self._waiting[0].due:
             return None
         head = self._waiting[0]
@@ -254,42 +254,42 @@ class CommandQueue:
 
 
 IDENTIFY_FIRST = 0.1
-"""s to the second Identify; doubles up to `IDENTIFY_SLOWEST`."""
+"""s from the first Identify to the second; doubles up to `IDENTIFY_SLOWEST`."""
 
 IDENTIFY_SLOWEST = 1.0
-"""s between attempts on a board that does not answer: data must be back 2 s after a replug."""
+"""s between attempts to reach a silent board: data must be back 2 s after a replug."""
 
 REFUSED_RETRY = 2.0
-"""s between questions to a refused board, which may be exchanged for the right one."""
+"""s between questions to a refused board, which may have been exchanged for the right one."""
 
 KEEPALIVE = 10.0
-"""s between questions to a board in service: shows an exchanged board, and puts a descriptor into
-every log file so that each replays by itself."""
+"""s between questions to a board in service. They reveal an exchanged board, and put a descriptor
+into every log file so that it can be replayed alone."""
 
 POLL_AT_ONCE = 0.02
-"""s between clock polls while the map is new or in doubt; an answer settles most doubts."""
+"""s between clock polls while the map is new or in doubt; one answer settles most doubts."""
 
 POLL_FAST = 0.1
 """s between clock polls at first."""
 
 POLL_FAST_FOR = 2.0
-"""s for which polls are fast: enough for the regression to settle."""
+"""s for which polls are fast: long enough for the regression to settle."""
 
 POLL_SLOW = 0.25
 """s between clock polls afterwards: two for every bucket of the regression."""
 
 RELINK = 1.0
-"""s without samples (or three periods, if longer) after which the board is asked anew who it is."""
+"""s without samples (or three periods, if longer) after which the board is identified again."""
 
 JUDGE_CLOCK = 0.25
-"""s between looks at whether the clock can be used."""
+"""s between checks whether the clock is usable."""
 
 Admission = Callable[[Identity], Refusal | None]
-"""Judges a board by what it says of itself; None: welcome."""
+"""Judges a board by its identity; None: admitted."""
 
 
 class State(Enum):
-    """Where a link stands."""
+    """State of a link."""
 
     DOWN = auto()
     IDENTIFYING = auto()
@@ -299,11 +299,11 @@ class State(Enum):
 
 
 class BoardLink:
-    """State machine of one board; ``rate`` in Hz, None leaves the board's own.
+    """State machine of one board. ``rate``: Hz; None: the board's own.
 
-    ``listen_only``: for recordings, which answer nobody; a descriptor alone brings the board into
-    service, and arrivals alone place its clock.
-    ``counters``: samples dropped here, by reason. ``arrays``: by their numbers.
+    ``listen_only``: for recordings, which do not answer: a descriptor is enough to bring the board
+    into service, and its clock is mapped by arrivals alone.
+    ``counters``: samples dropped here, by reason. ``arrays``: intakes by array number.
     """
 
     def __init__(
@@ -334,59 +334,59 @@ class BoardLink:
 
     @property
     def silence_limit(self) -> float:
-        """s without samples that are no cause for concern."""
+        """Silence considered normal, s."""
         said = None if self.status is None else self.status.rate_mhz / 1000
         return self._pace.silence_limit(self.rate, said)
 
     @property
     def relink_limit(self) -> float:
-        """s without samples after which the board is asked anew who it is."""
+        """Silence after which the board is identified again, s."""
         return max(RELINK, self._pace.silence_limit(self.rate))
 
     @property
     def clock_trouble(self) -> str:
-        """Why the board's clock cannot be used; empty while it can."""
+        """Why the board's clock is unusable; empty while it is usable."""
         return self._clock_trouble
 
-    # What the outside tells
+    # Inputs
 
     def connect(self, now: Instant) -> None:
-        """The line is up: ask who is there."""
+        """Start: the line is open. Asks the board to identify itself."""
         self._identify(now)
 
     def disconnect(self) -> list[Event]:
-        """The line is down; commands that waited are given up."""
+        """Stop: the line is closed. Gives up waiting commands."""
         self.state = State.DOWN
         self._out.clear()
         return self._drop_commands()
 
     def retry(self, now: Instant) -> None:
-        """Have a refused board judged again at once."""
+        """Judge a refused board again, at once."""
         if self.state is State.REFUSED:
             self._refusal = None
             self._identify_due = now
 
     def request(self, make: Callable[[int], HostMessage], now: Instant) -> int:
-        """Queue a command and return its number, to be met again in `Answered`.
+        """Queue a command and return its number, which `Answered` will repeat.
 
-        ValueError when the board is not in service or too many commands wait already.
+        ValueError when the board is not in service or too many commands are waiting.
         """
         if self.state not in (State.CONFIGURING, State.STREAMING):
             raise ValueError(f"the board is {self.state.name.lower()}, not in service")
         return self._commands.push(make, now, own=False)
 
     def stop_streaming(self) -> None:
-        """Ask the board to cease streaming; no answer is awaited."""
+        """Tell the board to stop streaming, without waiting for an answer."""
         if self.state in (State.CONFIGURING, State.STREAMING):
             self._out.append(Stop(self._commands.next_request()))
 
     def outgoing(self) -> list[HostMessage]:
-        """Messages to send now, taken out."""
+        """Remove and return the messages to send."""
         out, self._out = self._out, []
         return out
 
     def receive(self, message: Message, arrival: Instant) -> list[Event]:
-        """Take one message whose last byte came at ``arrival``."""
+        """Process a message whose last byte came at ``arrival``."""
         match message:
             case Samples():
                 return self._on_samples(message, arrival)
@@ -405,11 +405,11 @@ class BoardLink:
                     captured = self.clock.place(message.ticks, arrival)
                 return [BoardLog(message.level, captured, message.text)]
             case _:
-                self.counters["from_host"] += 1  # an echo: only hosts send these
+                self.counters["from_host"] += 1  # an echo: only hosts send such messages
         return []
 
     def tick(self, now: Instant) -> list[Event]:
-        """Do what time demands: repeat questions and commands, poll the clock, notice silence."""
+        """Do what is due: repeat questions and commands, poll the clock, notice silence."""
         if self.state is State.DOWN:
             return []
         if self._listen_only:
@@ -430,7 +430,7 @@ class BoardLink:
             events += self._watch_silence(now)
         return events
 
-    # Who is there
+    # Identification
 
     def _identify(self, now: Instant) -> list[Event]:
         self.state = State.IDENTIFYING
@@ -457,7 +457,7 @@ class BoardLink:
         in_service = self.state in (State.CONFIGURING, State.STREAMING)
         if in_service:
             if message == self.descriptor and not self._has_ceased(now):
-                return []  # answer to the keepalive, or to another host's question
+                return []  # the answer to the keepalive or to another host
             events = [Reset(self._what_is_new(message)), *self._drop_commands()]
         identity = self._take_on(message, now, rebooted=in_service)
         events.append(Identified(identity, rebooted=in_service))
@@ -467,7 +467,7 @@ class BoardLink:
         return events
 
     def _has_ceased(self, now: Instant) -> bool:
-        """Whether a board that answers no longer streams; one whose pace is unknown may be slow."""
+        """Whether a board that still answers has stopped streaming, and is not just slow."""
         quiet = seconds_between(max(self._last_sample, self._started), now)
         return self._silent and (self._pace.period is not None or quiet >= self.relink_limit)
 
@@ -560,7 +560,7 @@ class BoardLink:
             if good and isinstance(message, SetRate):
                 self.rate = message.rate_mhz / 1000
                 self._pace.restart()
-                self._started = now  # the first sample at a slow rate takes its time
+                self._started = now  # the first sample at a slow rate takes a while
                 for array in self.arrays.values():
                     array.steps.restart()
             return [Answered(command.request, ack)]
@@ -589,7 +589,7 @@ class BoardLink:
         if self.state not in (State.CONFIGURING, State.STREAMING) or self.clock is None:
             self.counters["unidentified"] += 1
             if self.state is State.IDENTIFYING:
-                # It is there after all: do not wait for the back-off.
+                # The board is there: do not wait for the back-off.
                 self._identify_due = min(self._identify_due, after(arrival, IDENTIFY_FIRST))
             return []
         array = self.arrays.get(message.array)
@@ -623,7 +623,7 @@ class BoardLink:
         return events
 
     def _judge_clock(self, clock: ClockMap, now: Instant) -> list[Event]:
-        """Say when the clock becomes unusable, or usable again."""
+        """Report when the clock becomes unusable or usable again."""
         if now < self._judge_due:
             return []
         self._judge_due = after(now, JUDGE_CLOCK)

@@ -1,14 +1,14 @@
-"""Board clock to host clock: regression over clock polls, with a bound on the error it makes.
+"""Map a board's clock to the host's: a regression over clock polls, with a bound on its error.
 
-Every answered poll proves an interval: the board's reading happened after the poll left and before
-the reply was read. A line through the middles of the narrowest intervals therefore errs by no
-more than a known amount, which is published beside every stamp. Nothing is taken for granted of
-the board's rate but that it lies within `WIDEST` of what the board says; a clock beyond
-`RATE_LIMIT` keeps its bound, but is named unusable (`ClockMap.trouble`).
+Every answered poll proves an interval: the board read its clock after the poll was sent and before
+the reply was read. The error of a line through the middles of the narrowest intervals is therefore
+bounded, and the bound is published with every stamp. The board's rate is only assumed to be within
+`WIDEST` of what the board states; beyond `RATE_LIMIT` the bound still holds, but the clock is
+reported as unusable (`ClockMap.trouble`).
 
-Between polls the clock may jump. Whatever a sample shows of that (a step of its ticks that its
-sequence does not explain, a delay outside those seen lately, an arrival before its own instant)
-widens the bound until a poll has settled it.
+Between polls the clock may jump. Any sign of that in a sample (a step of its ticks that its
+sequence does not explain, a delay outside recent ones, an arrival before its own instant) widens
+the bound until a poll has settled it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from sensor_proto.packets import ClockReply
 from tactile_core.types import NS_PER_S, Instant, seconds_between
 
-# Line along the earliest arrivals: delays only ever add, so the lowest points are the truest.
+# A line along the earliest arrivals: delays are never negative, so the lowest points are the best.
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +35,8 @@ class _Fit:
 class LowerEnvelope:
     """Least-squares line through the lowest point of each of the last ``buckets`` buckets.
 
-    ``bucket``: width in units of x. ``slope``: first guess, kept until two buckets hold points;
-    the line's slope stays within ``tolerance`` of it.
+    ``bucket``: width in units of x. ``slope``: initial guess, used until two buckets hold points;
+    the slope of the line stays within ``tolerance`` of it.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class LowerEnvelope:
 
     @property
     def ready(self) -> bool:
-        """Whether there is a point to go by."""
+        """Whether there is any point."""
         return self._fit is not None
 
     @property
@@ -60,17 +60,17 @@ class LowerEnvelope:
 
     @property
     def span(self) -> float:
-        """Width of what the points cover, in units of x; 0 before the second."""
+        """Range of the points in x; 0 before the second."""
         return self._points[-1][0] - self._points[0][0] if self._points else 0.0
 
     @property
     def middle(self) -> float:
-        """Where the line is best known, in x; 0 before the first point."""
+        """Mean x of the points, where the line is best known; 0 before the first."""
         return 0.0 if self._fit is None else self._fit.x
 
     @property
     def slope(self) -> float:
-        """Present slope, or the first guess."""
+        """Present slope, or the initial guess."""
         return self._guess if self._fit is None else self._fit.slope
 
     @property
@@ -85,7 +85,7 @@ class LowerEnvelope:
         return self._fit.y + (x - self._fit.x) * self._fit.slope
 
     def add(self, x: float, y: float) -> None:
-        """Take one arrival."""
+        """Add an arrival."""
         if self._points:
             last_x, last_y = self._points[-1]
             if x // self._bucket == last_x // self._bucket:
@@ -113,61 +113,61 @@ class LowerEnvelope:
         return _Fit(mean_x, mean_y, slope, math.sqrt(total / n))
 
 
-# How fast a board really sends, and how long a silence therefore means nothing. Pure.
+# The actual rate of a board, and the silence that is normal for it. Pure.
 
 
 SLOWEST_S = 2.0
-"""s between frames of the slowest boards that are served, 0.5 Hz."""
+"""s between frames of the slowest boards supported, 0.5 Hz."""
 
 SILENCE_PERIODS = 3
-"""Periods without a frame that are no cause for concern: one may be lost, the next late."""
+"""Periods of silence considered normal: one frame may be lost and the next late."""
 
 SILENCE = 0.2
-"""s without frames that are none either, however fast the board: a busy host."""
+"""s of silence considered normal for any board, because the host may be busy."""
 
 HEARD = 8
-"""Arrivals that the period is taken from. It is the mean over them: frames that come in bursts
-have the same mean."""
+"""Arrivals over which the mean period is taken; bursts do not change the mean."""
 
 KNOWN = 3
-"""Arrivals from which on the period is known."""
+"""Arrivals needed for the period."""
 
 
 class Pace:
-    """Mean time between the frames of a board, from the last few that came."""
+    """Mean period of a board's frames, from the last few arrivals."""
 
     def __init__(self) -> None:
         self._heard: deque[tuple[Instant, int]] = deque(maxlen=HEARD)
 
     @property
     def period(self) -> float | None:
-        """s between frames; None until `KNOWN` of them came."""
+        """s between frames; None until `KNOWN` have arrived."""
         if len(self._heard) < KNOWN:
             return None
         (first, number), (last, newest) = self._heard[0], self._heard[-1]
         return seconds_between(first, last) / max(newest - number, 1)
 
     def restart(self) -> None:
-        """What came before tells nothing any more: another rate, or another board."""
+        """Forget all arrivals: the rate or the board has changed."""
         self._heard.clear()
 
     def heard(self, now: Instant, number: int) -> None:
-        """Frame ``number`` came at ``now``; the parts of one frame have one number."""
+        """Add the arrival of frame ``number``; all parts of a frame have the same number."""
         if self._heard and number <= self._heard[-1][1]:
             if number < self._heard[-1][1]:
                 self.restart()
             else:
                 return
-        if self._heard and now == self._heard[-1][0]:  # several in one read: they came as one
+        if self._heard and now == self._heard[-1][0]:  # several frames of one read count as one
             self._heard[-1] = (now, number)
         else:
             self._heard.append((now, number))
 
     def silence_limit(self, asked_hz: float | None = None, said_hz: float | None = None) -> float:
-        """s without a frame that are no cause for concern.
+        """Silence considered normal, s.
 
-        By what was heard; before that by the rate the board was told, else by the one it says
-        (down to the slowest that is served: what it says may be wrong), else that of the slowest.
+        From the measured period; before it is known, from the rate set, ``asked_hz``, else from the
+        rate that the board reports, ``said_hz`` (but at least the slowest supported, because the
+        report may be wrong), else from the slowest supported.
         """
         period = self.period
         if period is None and asked_hz:
@@ -178,73 +178,72 @@ class Pace:
 
 
 BUCKET_S = 0.5
-"""s of board time from which only the poll with the shortest round trip is kept."""
+"""s of board time of which only the poll with the shortest round trip is kept."""
 
 WINDOW = 16
 """Buckets in the regression: 8 s, so short that thermal drift stays near a straight line."""
 
 SETTLING_S = 2.0
-"""s of board time that the regression must span before polls are gathered in buckets: until then
-each of them narrows the slope."""
+"""s of board time that the regression must span before polls are reduced to buckets; until then
+every poll improves the slope."""
 
 OUTSTANDING = 16
-"""Polls that may await an answer: 1.6 s of the fastest polling; later answers are worthless."""
+"""Most polls that may await an answer: 1.6 s of the fastest polling; later answers are useless."""
 
 WORST_HALF_WIDTH = 0.25
-"""s; a poll slower than this bounds nothing that matters."""
+"""s, half the round trip; slower polls bound nothing useful."""
 
 RATE_LIMIT = 0.11
-"""Largest departure of a usable oscillator from what its board says of it: ±5 % trim and ±5 %
-thermal (MLX90393)."""
+"""Largest relative rate error of a usable oscillator: ±5 % trim and ±5 % thermal (MLX90393)."""
 
 WIDEST = 0.6
-"""Departure up to which the bound holds: a clock that is so wrong is unusable, but said to be."""
+"""Relative rate error up to which the bound holds; such a clock is unusable, but reported."""
 
 SLOPE_ERROR = 1 / (1 - WIDEST) - 1
 """Largest error of a slope of 1 (host s per board s at the nominal rate) on such a clock."""
 
 RATE_CHANGE = 2e-5
-"""1/s, how fast the rate may drift: ±5 % over 125 K is 400 ppm/K, at 3 K a minute."""
+"""1/s, fastest drift of the rate: ±5 % over 125 K is 400 ppm/K, at 3 K per minute."""
 
 JUMPS, JUMPS_WITHIN_S = 3, 30.0
-"""So many jumps within so many s make a clock unusable."""
+"""This many jumps within this many s make a clock unusable."""
 
 WORST_ERROR_S = 0.1
-"""s; an instant that is known no better is of no use: features are stale at twice that."""
+"""s; a larger uncertainty makes an instant useless: features are stale at twice that."""
 
 WORST_FOR_S = 1.0
-"""s for which instants must be so bad before the clock, and not a moment, is to blame."""
+"""s for which instants must be that uncertain before the clock counts as unusable."""
 
 ONE_WAY_ALLOWANCE = 0.02
-"""s assumed between a conversion and its arrival when no poll was answered: one conversion at the
+"""s assumed from a conversion to its arrival when no poll was answered: one conversion at the
 slowest usual rate, or the 16 ms latency timer of a USB bridge."""
 
 LATEST = 0.5
-"""s by which samples may all be late before their ticks must be of another clock than that of the
-replies, or the line holds everything up for as long."""
+"""s by which all samples may be late. Beyond, their ticks are of another clock than the replies, or
+the line delays everything by that much."""
 
 UNSURE_S = 0.5
-"""s that a sample of a board that has begun anew may have taken, until a poll is answered."""
+"""s of delay that samples of a restarted board may have, until a poll is answered."""
 
 DELAYS = 32
-"""Polls, and the delays of the samples between them, that are remembered: 8 s at the slow pace."""
+"""Polls for which the delays of the samples between them are kept: 8 s of slow polling."""
 
 LOG_AGE_S = 60.0
-"""s that a line of text of the firmware may be old; what claims more came when it came."""
+"""s, oldest believable text of the firmware; an older one gets its arrival as stamp."""
 
 WRAP = 1 << 32
 
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """A board reading on the host's clock; the true instant is within ``uncertainty`` (s) of it."""
+    """Instant of a board reading on the host's clock, correct to within ``uncertainty`` s."""
 
     captured: Instant
     uncertainty: float
 
 
 class TickUnwrapper:
-    """Extends 32-bit ticks to a number that never wraps."""
+    """Extends 32-bit ticks to a count that never wraps."""
 
     def __init__(self) -> None:
         self._last: int | None = None
@@ -255,13 +254,13 @@ class TickUnwrapper:
         return self._last
 
     def unwrap(self, ticks: int, elapsed: int = 0) -> int:
-        """Count that ends in ``ticks`` and is nearest to the last one plus ``elapsed`` ticks."""
+        """Count that ends in ``ticks`` and is nearest to the last count plus ``elapsed`` ticks."""
         value = self.near(ticks, elapsed)
         self._last = value if self._last is None else max(self._last, value)
         return value
 
     def near(self, ticks: int, elapsed: int = 0) -> int:
-        """The same, leaving no trace."""
+        """The same, without changing the state."""
         if self._last is None:
             return ticks
         expected = self._last + elapsed
@@ -272,7 +271,7 @@ class TickUnwrapper:
 class _Pair:
     board: float  # s of board time at the nominal rate
     host: float  # s since the first stamp
-    half: float  # s; the host time is within this of ``host``
+    half: float  # s; the true host time is within this of ``host``
     sent: Instant
 
 
@@ -294,7 +293,7 @@ class _Line:
 
 
 class _Delays:
-    """Least and greatest delay of samples, s, as far as polls have shown the map to be right."""
+    """Least and greatest delay of samples, s, while polls confirmed the map."""
 
     def __init__(self) -> None:
         self.least, self.greatest = 0.0, ONE_WAY_ALLOWANCE
@@ -302,14 +301,14 @@ class _Delays:
         self._low, self._high = math.inf, -math.inf
 
     def add(self, late: float) -> float:
-        """Take the delay of one sample; how far the map may be wrong if that is not its delay."""
+        """Add the delay of a sample; returns the error of the map if that delay is not real, s."""
         self._low, self._high = min(self._low, late), max(self._high, late)
         if late > self.greatest:
             return late - self.least
         return self.greatest - late if late < self.least else 0.0
 
     def confirm(self) -> None:
-        """A poll agrees with the map, and so the delays since the last poll were real."""
+        """Accept the delays since the last poll: a poll agrees with the map."""
         if self._low <= self._high:
             self._shown.append((self._low, self._high))
             self.least = min(low for low, _ in self._shown)
@@ -320,8 +319,8 @@ class _Delays:
 class ClockMap:
     """Maps the ticks of one board to instants; pure, fed with polls, replies and arrivals.
 
-    Until a poll is answered the earliest arrivals stand in, with a wider uncertainty. Stamps never
-    run backwards while ticks do not, and never lie after the arrival they are asked for.
+    Until a poll is answered the earliest arrivals are used, with a larger uncertainty. Stamps never
+    run backwards while ticks do not, and are never after the arrival of their sample.
     ``counters``: replies used and refused, by reason, and jumps.
     """
 
@@ -334,9 +333,9 @@ class ClockMap:
         self.restart(tick_hz)
 
     def restart(self, tick_hz: int | None = None) -> None:
-        """Forget everything but the counters: the board has a new clock, of ``tick_hz`` if given.
+        """Forget everything but the counters: the board has restarted.
 
-        ValueError unless that is above 0.
+        ``tick_hz``: its new tick rate, if it has changed; ValueError unless above 0.
         """
         if tick_hz is not None:
             if tick_hz <= 0:
@@ -365,26 +364,26 @@ class ClockMap:
 
     @property
     def tick_hz(self) -> int:
-        """Ticks a second, as the board says."""
+        """Nominal ticks per second, from the board's descriptor."""
         return self._tick_hz
 
     @property
     def synchronised(self) -> bool:
-        """Whether a poll was answered since the start."""
+        """Whether a poll has been answered since the start."""
         return self._line is not None
 
     @property
     def unsettled(self) -> bool:
-        """Whether another poll soon would tell much: the map is new, or in doubt."""
+        """Whether to poll again soon, because the map is new or in doubt."""
         return self._line is not None and (self._doubt > 0 or len(self._pairs) < 3)
 
     @property
     def rate_error(self) -> float:
-        """How much faster than nominal the board's clock runs (0.01: 1 %)."""
+        """Relative rate error of the board's clock; positive: fast."""
         return 1.0 / self._slope - 1.0
 
     def trouble(self, now: Instant) -> str | None:
-        """Why the board's clock cannot be used; None while it can."""
+        """Why the board's clock is unusable; None while it is usable."""
         slowest, fastest = self._rates()
         if slowest > RATE_LIMIT or fastest < -RATE_LIMIT:
             off = self.rate_error
@@ -395,7 +394,7 @@ class ClockMap:
             )
         elif slowest >= -RATE_LIMIT and fastest <= RATE_LIMIT:
             self._rate_trouble = ""
-        if self._rate_trouble:  # it stays while the map is too new to tell
+        if self._rate_trouble:  # kept until the map is good enough to tell
             return self._rate_trouble
         recent = [at for at in self._jumps if seconds_between(at, now) <= JUMPS_WITHIN_S]
         if len(recent) >= JUMPS:
@@ -407,17 +406,17 @@ class ClockMap:
         return None
 
     def polled(self, token: int, sent: Instant) -> None:
-        """Note that a poll is about to be written."""
+        """Note that a poll with ``token`` is about to be sent."""
         while len(self._sent) >= OUTSTANDING:
             self._sent.pop(next(iter(self._sent)))
         self._sent[token] = sent
 
     def replied(self, reply: ClockReply, received: Instant) -> bool:
-        """Take the answer to a poll; False, and counted, when it is of no use."""
+        """Process the answer to a poll; False when it cannot be used, which is counted."""
         sent = self._sent.pop(reply.token, None)
         if sent is None or received < sent:
             return self._refuse("unasked")
-        # What was asked before is answered before, or never.
+        # Earlier polls have been answered already or never will be.
         self._sent = {token: at for token, at in self._sent.items() if at >= sent}
         arrived = self._unwrap(reply.ticks_received, received)
         left = self._unwrap(reply.ticks_sent, received)
@@ -436,7 +435,7 @@ class ClockMap:
             return self._refuse("contradiction")
         if self._doubt and sent >= self._doubted:
             if self._line is not None and self._least <= 2 * self._allowed(pair, self._line):
-                self._begin_with(pair)  # too wide a poll to tell whether the clock jumped so far
+                self._begin_with(pair)  # this poll is too wide to tell whether the clock jumped
             self._doubt, self._least = 0.0, math.inf
         self._delays.confirm()
         self._keep(pair)
@@ -444,9 +443,9 @@ class ClockMap:
         return True
 
     def doubt(self, ticks: float, now: Instant) -> None:
-        """Something shows that the clock may have jumped by so much; a poll from now on settles it.
+        """Note a sign that the clock jumped by ``ticks``.
 
-        Until then every stamp is that much less certain.
+        Widens the uncertainty of every stamp until a poll sent after ``now`` settles it.
         """
         low, high = 1 / (1 + WIDEST), 1 / (1 - WIDEST)
         if self._line is not None:
@@ -456,7 +455,7 @@ class ClockMap:
         self._suspect((jump + 1 / self._tick_hz) * high, jump * low, now)
 
     def arrived(self, ticks: int, received: Instant) -> None:
-        """Take the arrival of a message that carried ``ticks``."""
+        """Add the arrival of a message with ``ticks``; used only before the first answered poll."""
         if self._line is None:
             board = self._board(self._unwrap(ticks, received), received)
             self._arrivals.add(board, self._host(received))
@@ -480,7 +479,7 @@ class ClockMap:
         return Stamp(Instant(captured), error)
 
     def place(self, ticks: int, received: Instant) -> Instant:
-        """Likely instant of a line of text that carried ``ticks``; leaves no trace in the map."""
+        """Likely instant of a firmware text with ``ticks``; does not change the map."""
         if self._line is None or self._origin is None:
             return received
         long_ticks = self._ticks.near(ticks, self._since_seen(received))
@@ -496,7 +495,7 @@ class ClockMap:
             error = self._line.error(board) + 1.0 / self._tick_hz
             hidden = self._delays.add(late)
             if late < -error:
-                # It has come before it was measured: the clock jumped, how far is not known yet.
+                # It arrived before it was measured, so the clock has jumped by an unknown amount.
                 hidden = max(hidden, self._delays.greatest + ONE_WAY_ALLOWANCE)
                 self._doubted = received
             if late > WORST_HALF_WIDTH:
@@ -504,7 +503,7 @@ class ClockMap:
             return host, error + hidden + self._doubt
         allowance = max(ONE_WAY_ALLOWANCE, self._waited(received)) + 1.0 / self._tick_hz
         if self._before and self._arrivals.span < SETTLING_S:
-            # The board began anew. Whatever comes now was measured after what came before.
+            # The board has restarted. New samples were measured after the last ones before.
             since = seconds_between(self._before, received)
             allowance = max(allowance, min(since, UNSURE_S), 2 * self._line_delay)
         if not self._arrivals.ready:
@@ -517,17 +516,17 @@ class ClockMap:
 
     @property
     def _slope(self) -> float:
-        """Host s per board s, within what a clock may do at all."""
+        """Host s per board s, limited to possible rates."""
         slope = self._line.slope if self._line is not None else self._arrivals.slope
         return min(max(slope, 1 / (1 + WIDEST)), 1 / (1 - WIDEST))
 
     def _waited(self, now: Instant) -> float:
-        """s that a message may take as far as polls show: those slowly answered, or not yet."""
+        """Delay that a message may have, s, judged by polls answered slowly or not yet."""
         oldest = next(iter(self._sent.values()), now)
         return max(self._slowest, seconds_between(oldest, now))
 
     def _rates(self) -> tuple[float, float]:
-        """Least and greatest rate error that the clock may have."""
+        """Lower and upper bound of the relative rate error."""
         error = SLOPE_ERROR
         if self._line is not None:
             error = self._line.slope_error
@@ -537,7 +536,7 @@ class ClockMap:
         return 1 / (slope + error) - 1, 1 / max(slope - error, 1e-3) - 1
 
     def _suspect(self, seconds: float, least: float, now: Instant) -> None:
-        """The clock may have jumped, if so by ``least`` s and at most ``seconds``."""
+        """Note that the clock may have jumped, by at least ``least`` and at most ``seconds`` s."""
         self._doubt += seconds
         self._least = min(self._least, least)
         self._doubted = now
@@ -547,7 +546,7 @@ class ClockMap:
         return False
 
     def _since_seen(self, now: Instant) -> int:
-        """Ticks that should have gone by since the newest that was unwrapped."""
+        """Expected number of ticks since the newest count."""
         return round(seconds_between(self._seen, now) * self._tick_hz / self._slope)
 
     def _unwrap(self, ticks: int, received: Instant) -> int:
@@ -571,10 +570,10 @@ class ClockMap:
         return Instant((self._origin or 0) + round(host * NS_PER_S))
 
     def _contradicts(self, pair: _Pair, received: Instant) -> bool:
-        """Whether ``pair`` cannot be true if the line is.
+        """Whether ``pair`` contradicts the line.
 
-        One alone is held against the clock, but the line stays; one that comes while the clock is
-        in doubt settles it: the clock has jumped, and the map begins anew with this pair.
+        The first such pair only raises a doubt. One that comes while the clock is in doubt settles
+        it: the clock has jumped, and the map starts over with this pair.
         """
         if self._line is None:
             return False
@@ -593,11 +592,11 @@ class ClockMap:
 
     @staticmethod
     def _allowed(pair: _Pair, line: _Line) -> float:
-        """s that a pair and a line may differ by if both are true."""
+        """Largest difference of a pair and a line that are both correct, s."""
         return pair.half + line.error(pair.board)
 
     def _begin_with(self, pair: _Pair) -> None:
-        """Forget every pair but this."""
+        """Start over with this pair alone."""
         self._pairs.clear()
         self._pairs.append(pair)
         self._last_ticks = None
@@ -615,11 +614,11 @@ class ClockMap:
         self._line = self._fit()
 
     def _fit(self) -> _Line:
-        """Least squares weighted by 1/half²; the errors bound what intervals of that width allow.
+        """Least-squares line weighted by 1/half², with bounds of its errors.
 
-        The estimate at any point is a weighted sum of the pairs, so its error is at most the same
-        sum of the half widths with the weights made positive. To each half width comes how far the
-        rate may have drifted from a straight line at that pair.
+        The estimate at any point is a weighted sum of the pairs, so its error is at most the sum of
+        the half widths with the absolute weights. The possible drift of the rate from a straight
+        line is added to each half width.
         """
         weights = [pair.half**-2 for pair in self._pairs]
         total = sum(weights)
@@ -647,22 +646,22 @@ class ClockMap:
 
 
 class StepWatch:
-    """Whether the ticks of one array go on as its sequence does; a jump of the clock does not.
+    """Detects jumps of the clock, which make an array's ticks disagree with its sequence.
 
-    Sees jumps that are larger than what the steps vary by anyway, at the first sample after them.
+    Finds jumps larger than the usual variation of steps, at the first sample after them.
     """
 
     def __init__(self) -> None:
         self.restart()
 
     def restart(self) -> None:
-        """The next sample is the first: another rate, another clock, another board."""
+        """Forget the steps: rate, clock or board has changed."""
         self._newest: tuple[int, int] | None = None
         self._steps: deque[float] = deque(maxlen=STEPS)
         self._usual: deque[float] = deque(maxlen=4 * STEPS)
 
     def take(self, sequence: int, ticks: int) -> float:
-        """Ticks by which this sample's step is not explained; 0 while steps are being learnt."""
+        """Unexplained part of this sample's step, ticks; 0 while steps are being learnt."""
         before, self._newest = self._newest, (sequence, ticks)
         if before is None:
             return 0.0
@@ -682,7 +681,7 @@ class StepWatch:
 
 
 STEPS, LEAST_STEPS = 9, 3
-"""Steps of which the middle one is the usual, and from how many on."""
+"""Steps whose median is the usual step, and the fewest needed."""
 
 
 def _frequency(hz: int) -> str:
@@ -692,58 +691,58 @@ def _frequency(hz: int) -> str:
     return f"{hz} Hz"
 
 
-# Clock for boards that have none: frame k left at phase + k·period, and arrived no earlier.
+# A clock for boards without one: frame k was sent at phase + k·period, and arrived later.
 
 
 BUCKET = 16
-"""Frames of which only the least delayed is kept: a USB burst is shorter."""
+"""Frames in a bucket, of which the least delayed is kept: a USB burst is shorter."""
 
 BUCKETS = 16
-"""Buckets in the regression: 256 frames, 2.5 s at 100 Hz, so that a changed rate is followed."""
+"""Buckets in the regression: 256 frames, 2.5 s at 100 Hz, to track a changed rate."""
 
 SCATTER = 3.0
-"""Times the scatter of the buckets' earliest arrivals that the line through them may err by, with
-half as much again as the mean jitter on top: the earliest of sixteen is itself late."""
+"""Error of the line as a multiple of the scatter of the buckets' earliest arrivals, to which 1.5
+times the mean jitter is added: the earliest of sixteen is late itself."""
 
 UNPROVEN = 3.0
-"""Times the range of the delays seen so far that a delay may have while they are few."""
+"""Largest delay as a multiple of the range of delays so far, while there are few."""
 
 PROVEN = 4
-"""Buckets from which their scatter about the line says how good it is; two lie on it anyway."""
+"""Fewest buckets whose scatter about the line measures its quality; two always lie on it."""
 
 LATE_RUN = 8
-"""Reads whose frames must all be late before frames are held to be lost: a host stall ends in a
-few reads that catch up, a loss does not."""
+"""Reads in a row that must be late before frames count as lost: after a stall of the host a few
+reads catch up, after a loss they do not."""
 
 LATE = 0.75
-"""Periods a frame must be late to count towards such a run."""
+"""Lateness in periods from which a read counts towards such a run."""
 
 TOGETHER = 0.25
-"""Periods; frames that come closer than this came of one delay, and count as one read."""
+"""Periods; frames closer than this had the same delay and count as one read."""
 
 RESTARTS_AFTER = 3
-"""Losses found within one window after which the period itself must be wrong."""
+"""Losses within one window after which the period itself must be wrong."""
 
 LEARNING = 2 * BUCKET
-"""Frames from which the first guess of the period is made; until then arrivals are the stamps."""
+"""Frames for the first estimate of the period; until then arrivals are the stamps."""
 
 LEARNING_LEAST, LEARNING_S = 6, 1.0
-"""Fewer frames do when they span so many s: jitter is then small beside the period."""
+"""Fewest frames if they span this many s: jitter is then small compared with the period."""
 
 MIN_PERIOD = 5e-4
-"""s: four times the fastest rate of the chip. A shorter period is that of a backlog being read."""
+"""s, a quarter of the chip's shortest period; a shorter one is a backlog being read."""
 
 UNLEARNT = 0.05
-"""s of uncertainty until then, at least: the period of the slowest usual board (ReSkin, 20 Hz)."""
+"""s, least uncertainty until then: the period of the slowest common board (ReSkin, 20 Hz)."""
 
 LINE_DELAY = 2e-3
-"""s that every frame may take from board to host, which no arrival can show: two USB frames and
-the wait for the thread that reads."""
+"""s that every frame may take from board to host, which arrivals cannot show: two USB frames and
+the wait for the reading thread."""
 
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """One frame: its place in the board's sequence, lost frames counted, and its stamp."""
+    """A frame's number, which counts lost frames too, and its stamp."""
 
     sequence: int
     stamp: Stamp
@@ -752,10 +751,10 @@ class Arrival:
 class ArrivalClock:
     """Numbers and stamps frames that carry neither; pure, fed with arrivals in order.
 
-    What a frame holds was measured within the period before it was sent, so its stamp is half a
-    period before its jitter-free arrival, give or take half a period, the scatter of the earliest
-    arrivals and `LINE_DELAY`. Frames that were read together each have an instant of their own.
-    ``counters``: frames held to be lost, and restarts of the model.
+    The content of a frame was measured within the period before it was sent. Its stamp is therefore
+    half a period before its jitter-free arrival; the uncertainty is half a period plus the scatter
+    of the earliest arrivals and `LINE_DELAY`. Frames read together get different stamps.
+    ``counters``: frames considered lost, and restarts of the model.
     """
 
     def __init__(self) -> None:
@@ -767,7 +766,7 @@ class ArrivalClock:
         self._forget()
 
     def restart(self) -> None:
-        """Forget phase and sequence; the period stays a guess, and the numbering goes on."""
+        """Forget the phase; the period is kept as a guess, and the numbering continues."""
         self._guess = self.period or self._guess
         if self._guess:
             self._longest = max(2 * self._guess, UNLEARNT / 2)
@@ -787,7 +786,7 @@ class ArrivalClock:
 
     @property
     def period(self) -> float:
-        """Estimated s between frames; 0 while it is being learnt."""
+        """Estimated period, s; 0 while it is being learnt."""
         return 0.0 if self._envelope is None else max(self._envelope.slope, 0.0)
 
     def heard(self, received: Instant) -> None:
@@ -795,10 +794,10 @@ class ArrivalClock:
         self._place(received)
 
     def arrived(self, received: Instant, behind: int = 0, newest: Instant | None = None) -> Arrival:
-        """Number and stamp the frame that arrived at ``received``, wire time already taken off.
+        """Number and stamp the frame that arrived at ``received``, wire time already subtracted.
 
-        ``behind``: frames after it that were read together with it, and so were sent after it;
-        ``newest``: when the last of them arrived.
+        ``behind``: number of later frames in the same read; ``newest``: arrival of the last of
+        them.
         """
         self._sequence += 1
         origin, ideal, error = self._place(received, behind, newest)
@@ -810,12 +809,12 @@ class ArrivalClock:
     def _place(
         self, received: Instant, behind: int = 0, newest: Instant | None = None
     ) -> tuple[Instant, float, float]:
-        """Origin, s after it of the arrival without jitter, and the uncertainty, s."""
+        """Origin, jitter-free arrival in s after it, and its uncertainty, s."""
         origin = self._origin = self._origin or received
         self._index += 1
         host = seconds_between(origin, received)
         if behind:
-            # It was sent so many periods before the newest, which was sent before it arrived.
+            # It was sent ``behind`` periods before the newest, which was sent before it arrived.
             earlier = seconds_between(origin, newest or received)
             host = min(host, earlier - behind * (self.period or self._guess))
         if self._envelope is None:
@@ -826,7 +825,7 @@ class ArrivalClock:
         return origin, min(ideal, host), error
 
     def _learn(self, host: float) -> None:
-        """Guess the period by least squares once enough frames came, then sort them by it."""
+        """Estimate the period by least squares once enough frames have arrived."""
         heard = self._learning
         heard.append(host)
         n = len(heard)
@@ -853,7 +852,7 @@ class ArrivalClock:
     def _follow(
         self, host: float, received: Instant, behind: int, envelope: LowerEnvelope
     ) -> tuple[float, float]:
-        """Jitter-free arrival and its uncertainty, both s; numbering moves on after a loss."""
+        """Jitter-free arrival and its uncertainty, both s; advances the numbers after a loss."""
         period = self.period
         if period < MIN_PERIOD:
             return self._start_anew(host, received)
@@ -866,23 +865,23 @@ class ArrivalClock:
         late = host - envelope.at(self._index)
         self._group = min(self._group, late / period)
         if late <= LATE * period:
-            if not behind:  # the others of one read were no less delayed by it
+            if not behind:  # earlier frames of the same read were delayed at least as much
                 envelope.add(self._index, host)
                 self._scatter = max(self._scatter, late)
                 self._jitter += (max(late, 0.0) - self._jitter) / BUCKET
             if envelope.buckets < PROVEN:
-                # The line is not yet better than the arrival itself.
+                # The line is not better than the arrival itself yet.
                 return host, self.period / 2 + UNPROVEN * self._scatter + max(late, 0.0)
             late = 0.0
         scatter = SCATTER * envelope.spread + 1.5 * self._jitter + self._unproven(envelope)
         return envelope.at(self._index), self.period / 2 + scatter + late
 
     def _unproven(self, envelope: LowerEnvelope) -> float:
-        """s by which the line may err while it rests on what was learnt more than on buckets."""
+        """Error of the line, s, while there are too few buckets to measure it."""
         return 0.0 if envelope.buckets >= PROVEN else UNPROVEN * self._scatter
 
     def _judge(self, late: float) -> bool:
-        """Take the lateness of one read, in periods; False when the model cannot be right."""
+        """Add the lateness of one read, in periods; False when the model must be wrong."""
         self._late.append(late)
         if len(self._late) < LATE_RUN:
             return True
@@ -893,7 +892,7 @@ class ArrivalClock:
         return least <= LATE or not proven or self._lose(max(round(least), 1))
 
     def _lose(self, lost: int) -> bool:
-        """Count lost frames; False when they are so many that the period must be wrong."""
+        """Count lost frames; False when losses are so frequent that the period must be wrong."""
         while self._losses and self._losses[0] < self._index - BUCKET * BUCKETS:
             self._losses.popleft()
         self._losses.append(self._index)

@@ -1,4 +1,4 @@
-"""What a port carries that is no board: judged from counts over its first seconds."""
+"""Diagnose a serial port without a board, from byte counts over its first seconds."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ from tactile_core.types import Instant, seconds_between
 from tactiled.boards.events import Diagnosed, Waiting
 
 GARBAGE_AFTER = 3.0
-"""s of bytes without a frame before they are called garbage."""
+"""s of bytes without a frame before they count as garbage."""
 
 ENOUGH = 12
-"""Times that bytes came after a pause before they are called garbage: a board is known by the
-third of its frames, of which some may be cut."""
+"""Bursts of bytes before they count as garbage: a board is recognised by its third frame, and some
+frames may be cut."""
 
 PAUSE = 0.05
-"""s without a byte that part one frame of a slow board from the next."""
+"""s without a byte that separate the frames of a slow board."""
 
 PATIENCE = 30.0
-"""s after which they are called garbage however seldom they come: twelve frames at 0.5 Hz."""
+"""s after which bytes count as garbage however rare they are: twelve frames at 0.5 Hz."""
 
 LITTLE, LITTLE_UNTIL = 400, 15.0
-"""Bytes of which nothing can be said yet, and s until which more are awaited: five frames of a slow
+"""Bytes that are too few for a diagnosis, and s until which more are awaited: five frames of a slow
 board."""
 
 NOTHING_AFTER = 5.0
-"""s without a byte before the port is called silent: boards that reset on opening boot in two."""
+"""s without a byte before the port counts as silent: boards that reset on opening boot in two."""
 
 MOST_OF_A_FRAME = 2000
-"""Bytes without a pause that are more than any frame: 322 bytes for twenty magnetometers, with
-room for several in a row."""
+"""Bytes without a pause that exceed any frame: 322 bytes for twenty magnetometers, and room for
+several in a row."""
 
 SHOWN = 60
 """Characters of a foreign device's text that a message quotes."""
 
 MOSTLY = 0.9
-"""Share of zeros, or of printable characters, that settles what it is."""
+"""Share of zeros, or of printable characters, that decides what the bytes are."""
 
 _PRINTABLE = np.zeros(256, bool)
 _PRINTABLE[32:127] = True
@@ -55,9 +55,8 @@ class Diagnosis:
         self.begin(Instant(0))
 
     def begin(self, now: Instant, uart: bool | None = None) -> None:
-        """The port was opened. ``uart``: whether its baud rate means anything, as on USB none does.
-
-        None: it is still the same port.
+        """Start over. ``uart``: whether the port has a baud rate, which USB does not; None: the
+        same port as before.
         """
         self._uart = self._uart if uart is None else uart
         self._since = now
@@ -68,7 +67,7 @@ class Diagnosis:
         self._told = False
 
     def feed(self, data: bytes, now: Instant) -> None:
-        """Count what came at ``now``."""
+        """Count bytes that came at ``now``."""
         if not self._total:
             self._first_byte = now
         if not self._total or seconds_between(self._last_byte, now) >= PAUSE:
@@ -83,12 +82,12 @@ class Diagnosis:
 
     @property
     def _patience(self) -> float:
-        """s to wait in all before a judgement."""
+        """s from the start to the diagnosis."""
         if not self._total:
             return NOTHING_AFTER
         if self._bursts >= ENOUGH or self._is_text or self._is_zeros:
             return GARBAGE_AFTER
-        # Seldom: bytes that pour in without a pause are one burst, and garbage.
+        # Few bursts: either long ones, which are garbage, or the frames of a slow board.
         pouring = self._total / self._bursts > MOST_OF_A_FRAME
         return GARBAGE_AFTER if pouring else PATIENCE
 
@@ -101,7 +100,7 @@ class Diagnosis:
         return self._printable >= MOSTLY * self._total
 
     def waiting(self, now: Instant) -> Waiting | None:
-        """Said once: that bytes come too seldom to tell yet what they are."""
+        """Reports, once, that bytes are too rare for a diagnosis yet."""
         waited = seconds_between(self._since, now)
         if self._told or self._bursts < 2 or not GARBAGE_AFTER <= waited < self._patience:
             return None
@@ -115,9 +114,10 @@ class Diagnosis:
     def judge(
         self, now: Instant, answered: bool, finding: Finding | None = None
     ) -> Diagnosed | None:
-        """What is wrong, once it is time to say so.
+        """Diagnose what is wrong; None while it is too early.
 
-        ``answered``: frames of ours were decoded. ``finding``: what the bytes look like.
+        ``answered``: whether frames of our protocol were decoded. ``finding``: result of the survey
+        of the bytes.
         """
         waited = seconds_between(self._since, now)
         if waited < self._patience:
@@ -163,7 +163,7 @@ class Diagnosis:
         )
 
     def _declare(self, finding: Finding) -> str:
-        """How to have ``finding`` read."""
+        """How to declare the layout of ``finding``."""
         if not finding.declare:
             return "see sensor_proto/PROTOCOL.md, section 9, for what can be declared with --kind"
         remedy = f"declare it with --kind {' or --kind '.join(finding.declare)}"

@@ -1,4 +1,4 @@
-"""What the links tell the daemon: a few frozen events, each one thing that happened."""
+"""Events from the links to the daemon; frozen values."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from tactile_core.types import Instant
 from tactiled.blocks import SampleBlock
 
 RESET_CAUSES = {0: "power-on", 1: "command", 2: "watchdog", 3: "brown-out"}
-"""What a status message's ``reset_cause`` means (PROTOCOL.md)."""
+"""Meaning of a status message's ``reset_cause`` (PROTOCOL.md)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What is known of a board. ``serial_number`` is empty where neither board nor port has one.
+    """Identity of a board. ``serial_number``: empty when neither board nor port has one.
 
-    ``shapes``: rows and columns of each array. ``max_rate``: Hz, None where the board does not
-    say. ``descriptor``: the board's own words, None where it has none. Boards without one send all
-    their taxels as one array; ``arrays`` says how many each of them has, where the user said it.
-    ``layout``: how such a board writes its samples, empty for the usual floats.
+    ``shapes``: rows and columns of each array. ``max_rate``: Hz; None when not reported.
+    ``descriptor``: None for boards that have none. Such boards send all their taxels as one array;
+    ``arrays``: taxels of each array, if the user gave them. ``layout``: how such a board writes its
+    samples; empty for the usual floats.
     """
 
     serial_number: str
@@ -38,7 +38,7 @@ class Identity:
 
     @classmethod
     def of(cls, descriptor: Descriptor) -> Identity:
-        """Identity of a board that described itself."""
+        """Make the identity from a board's descriptor."""
         return cls(
             serial_number=descriptor.serial_number,
             model=descriptor.model,
@@ -49,14 +49,14 @@ class Identity:
         )
 
     def __str__(self) -> str:
-        """As messages name it."""
+        """Name of the board in messages."""
         number = f" {self.serial_number}" if self.serial_number else " without a serial number"
         return f"{self.model} board{number}"
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a board is not used, and what to do about it."""
+    """Why a board is not used, and the remedy."""
 
     problem: str
     remedy: str
@@ -64,7 +64,7 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """The board answered and was admitted. ``rebooted``: its clock and sequence start anew."""
+    """The board answered and was admitted. ``rebooted``: its clock and sequence have restarted."""
 
     identity: Identity
     rebooted: bool
@@ -72,14 +72,14 @@ class Identified:
 
 @dataclass(frozen=True, slots=True)
 class Streaming:
-    """The board took the order to stream; ``rate`` in Hz as it was set, None: the board's own."""
+    """The board has started to stream. ``rate``: as set, Hz; None: the board's own."""
 
     rate: float | None
 
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """The board is not used."""
+    """The board was not admitted."""
 
     refusal: Refusal
 
@@ -107,21 +107,21 @@ class Resumed:
 
 @dataclass(frozen=True, slots=True)
 class Reset:
-    """The board restarted by itself, or its sequence shows that it must have."""
+    """The board has restarted, or its sequence shows that it must have."""
 
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class ClockJudged:
-    """The board's clock cannot be used, for the reason ``trouble``; empty: it can again."""
+    """The board's clock is unusable because of ``trouble``; empty: it is usable again."""
 
     trouble: str
 
 
 @dataclass(frozen=True, slots=True)
 class BoardLog:
-    """A line of text from the firmware, levels as in `sensor_proto.packets.Log`."""
+    """A text of the firmware; levels as in `sensor_proto.packets.Log`."""
 
     level: int
     captured: Instant
@@ -130,14 +130,14 @@ class BoardLog:
 
 @dataclass(frozen=True, slots=True)
 class Reported:
-    """The board's own account of its health."""
+    """The board sent its status."""
 
     status: Status
 
 
 @dataclass(frozen=True, slots=True)
 class Answered:
-    """A command was answered, or given up (``ack`` None)."""
+    """A command was answered, or given up if ``ack`` is None."""
 
     request: int
     ack: Ack | None
@@ -145,7 +145,7 @@ class Answered:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosed:
-    """The port carries something, or nothing, but no board: what seems to be wrong."""
+    """No board was found on the port, and why that seems to be."""
 
     problem: str
     remedy: str
@@ -153,14 +153,14 @@ class Diagnosed:
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """What is on the port cannot be told yet, and why that takes longer than usual."""
+    """The diagnosis of the port takes longer than usual, and why."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Boards on a bus, by node. ``late``: they came after the others had been gathered."""
+    """Boards were found on a bus. ``late``: after the others had been gathered."""
 
     nodes: tuple[int, ...]
     late: bool

@@ -1,4 +1,4 @@
-"""One board that only ever sends floats (AnySkin, ReSkin, eFlesh): no questions, no clock."""
+"""State machine of a board that only sends floats (AnySkin, ReSkin, eFlesh) and has no clock."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from tactiled.boards.events import (
 )
 
 BACKLOG_GAP = 1e-3
-"""s between arrivals, `BACKLOG_GAPS` times running, that show that what had piled up before the
+"""s between arrivals, `BACKLOG_GAPS` times in a row, which show that the backlog from before the
 port was opened has been read: no such board is faster than 500 Hz."""
 
 BACKLOG_GAPS = 3
 
 LONE_GAP = 0.1
-"""s before a frame, once, that show the same: what has piled up is read without a pause."""
+"""s before a single frame that show the same: a backlog is read without pauses."""
 
 BACKLOG_LIMIT = 0.5
-"""s after the first frame at which it is taken as read in any case."""
+"""s after the first frame when the backlog counts as read in any case."""
 
 
 class FloatLink:
-    """State machine of one float board. ``serial_number``: of the USB port, for it has no other.
+    """State machine of one float board. ``serial_number``: of its USB port; it has no other.
 
-    ``model``: what calibrations call it. ``arrays``: magnetometers of each of its boards, where the
-    user said it. ``layout``: how it writes, empty for the usual floats; ``thermometer``: whether
-    that holds temperatures.
+    ``model``: name in calibrations. ``arrays``: magnetometers of each array, if the user gave them.
+    ``layout``: how it writes, empty for the usual floats; ``thermometer``: whether it sends
+    temperatures.
     """
 
     def __init__(
@@ -74,11 +74,11 @@ class FloatLink:
 
     @property
     def silence_limit(self) -> float:
-        """s without frames that are no cause for concern."""
+        """Silence considered normal, s."""
         return self._pace.silence_limit()
 
     def connect(self) -> None:
-        """The line is up."""
+        """Start: the line is open."""
         self.state = State.IDENTIFYING
         self.clock.restart()
         self._pace.restart()
@@ -86,7 +86,7 @@ class FloatLink:
         self._first, self._gaps = None, 0
 
     def disconnect(self) -> None:
-        """The line is down."""
+        """Stop: the line is closed."""
         self.state = State.DOWN
 
     def receive(
@@ -96,9 +96,9 @@ class FloatLink:
         behind: int = 0,
         newest: Instant | None = None,
     ) -> list[Event]:
-        """Take one frame whose last byte came at ``arrival``.
+        """Process a frame whose last byte came at ``arrival``.
 
-        ``behind``, ``newest``: frames that were read after it in one read, see `ArrivalClock`.
+        ``behind``, ``newest``: later frames in the same read, see `ArrivalClock.arrived`.
         """
         self._frames += 1
         if not self._fresh and self._is_backlog(arrival):
@@ -150,12 +150,12 @@ class FloatLink:
         return [FellSilent(quiet)]
 
     def retry(self) -> None:
-        """Have a refused board judged again."""
+        """Judge a refused board again."""
         if self.state is State.REFUSED:
             self.state = State.IDENTIFYING
 
     def _is_backlog(self, arrival: Instant) -> bool:
-        """Whether a frame may have waited: with no clock on board nobody knows how long."""
+        """Whether a frame may have waited in a buffer, for an unknown time."""
         first, heard = self._first, self._heard
         self._heard = arrival
         if first is None:
@@ -165,7 +165,7 @@ class FloatLink:
         self._gaps = self._gaps + 1 if gap >= BACKLOG_GAP else 0
         self._fresh = self._gaps >= BACKLOG_GAPS or gap >= LONE_GAP or waited >= BACKLOG_LIMIT
         if self._fresh and self._gaps == 1:
-            self.clock.heard(heard)  # the one before it: what lies between is the period
+            self.clock.heard(heard)  # the frame before it, from which the period follows
         return not self._fresh
 
     def _introduce(self, shape: tuple[int, int]) -> list[Event]:

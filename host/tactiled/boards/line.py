@@ -1,4 +1,4 @@
-"""One port: bytes or CAN frames on one side, the links of the boards behind it on the other.
+"""Lines: connect the bytes or CAN frames of one port to the links of the boards behind it.
 
 Pure: chunks and instants in; events, and payloads to write, out.
 """
@@ -26,14 +26,14 @@ from tactiled.boards.float_board import FloatLink
 from tactiled.transports.base import Medium
 
 FLOAT_MODEL = "anyskin"
-"""What calibrations call boards that send floats."""
+"""Model name, in calibrations, of boards that send floats."""
 
 JUDGE_FIRST, JUDGE_SLOWEST = 0.25, 2.0
-"""s between looks at bytes of which no decoder makes a frame; the time doubles while nothing is
-found, as a look takes some milliseconds."""
+"""s between surveys of bytes that no decoder understands; the time doubles while nothing is found,
+because a survey takes some milliseconds."""
 
 PATIENCE = 30.0
-"""s for which the frames of a layout that was found are awaited; the slowest board sends ten."""
+"""s to wait for frames of a layout that was found; the slowest board sends ten."""
 
 REPEAT_DIAGNOSIS = 30.0
 """s between repetitions of a diagnosis that still holds."""
@@ -48,14 +48,14 @@ Payload = bytes | tuple[CanFrame, ...]
 
 @dataclass(frozen=True, slots=True)
 class LineEvent:
-    """Something that happened to the board ``node``, or (None) to the port as a whole."""
+    """An event of the board ``node``, or, if None, of the whole port."""
 
     node: int | None
     event: Event
 
 
 class Line(Protocol):
-    """What the daemon sees of a port, whatever the medium."""
+    """The interface of a port for the daemon, whatever the medium."""
 
     @property
     def links(self) -> dict[int, Link]:
@@ -63,28 +63,29 @@ class Line(Protocol):
 
     @property
     def rejects(self) -> dict[str, int]:
-        """What the decoders refused, by reason."""
+        """Counts of what the decoders refused, by reason."""
 
     def connect(self, now: Instant, usb_serial: str = "", byte_time: float = 0.0) -> None:
-        """The port is open. ``byte_time``: s that each byte takes on the wire, 0 over USB."""
+        """Start: the port is open. ``byte_time``: s per byte on the wire, 0 over USB."""
 
     def disconnect(self) -> list[LineEvent]:
-        """The port is closed or gone; commands that waited are given up."""
+        """Stop: the port is closed or gone. Gives up waiting commands."""
 
     def receive(self, chunk: Chunk) -> list[LineEvent]:
-        """Take what one read returned."""
+        """Process a chunk."""
 
     def tick(self, now: Instant) -> list[LineEvent]:
-        """Do what time demands."""
+        """Do what is due."""
 
     def outgoing(self) -> list[Payload]:
-        """What to write now, taken out."""
+        """Remove and return the payloads to write."""
 
 
 class SerialLine:
-    """A serial line: one board, whose kind is found out unless ``kind`` says it.
+    """A serial line with one board, whose kind is detected unless ``kind`` gives it.
 
-    ``kind``: one of `KINDS`, or a layout. ``arrays``: magnetometers of each board of a controller.
+    ``kind``: one of `KINDS`, or a layout. ``arrays``: magnetometers of each array of a controller
+    that does not report it.
     """
 
     def __init__(
@@ -102,9 +103,9 @@ class SerialLine:
         self._own = SerialDecoder()
         self._floats: Unframed | None = AnySkinDecoder()
         self._survey = Survey(self._declared)
-        self._settled = False  # whether the unframed decoder has given a frame since the opening
-        self._former: Counter[str] = Counter()  # counts of unframed decoders that were given up
-        self._layout: Layout | None = None  # what the unframed decoder reads; None: usual floats
+        self._settled = False  # whether the unframed decoder has found a frame since the opening
+        self._former: Counter[str] = Counter()  # counts of unframed decoders that were replaced
+        self._layout: Layout | None = None  # read by the unframed decoder; None: the usual floats
         self._finding: Finding | None = None
         self._judge_due, self._judge_wait = Instant(0), JUDGE_FIRST
         self._patient_until = Instant(0)
@@ -125,14 +126,14 @@ class SerialLine:
 
     @property
     def rejects(self) -> dict[str, int]:
-        """Refusals of the decoder in use (of ours while the kind is not known)."""
+        """Refusals of the decoder in use; of our protocol's while the kind is unknown."""
         counts = Counter(self._own.counters)
         if isinstance(self._link, FloatLink):
             counts = self._former + Counter({} if self._floats is None else self._floats.counters)
         return {reason: n for reason, n in counts.items() if reason != "accepted"}
 
     def connect(self, now: Instant, usb_serial: str = "", byte_time: float = 0.0) -> None:
-        """The port is open; see `Line.connect`."""
+        """Start; see `Line.connect`."""
         self._up = True
         self._byte_ns = byte_time * NS_PER_S
         self._float.serial_number = usb_serial
@@ -150,13 +151,13 @@ class SerialLine:
         self._float.connect()
 
     def disconnect(self) -> list[LineEvent]:
-        """The port is closed or gone; commands that waited are given up."""
+        """Stop; see `Line.disconnect`."""
         self._up = False
         self._float.disconnect()
         return [LineEvent(0, event) for event in self._board.disconnect()]
 
     def receive(self, chunk: Chunk) -> list[LineEvent]:
-        """Take bytes; TypeError for CAN frames."""
+        """Process bytes; TypeError for CAN frames."""
         data = chunk.payload
         if not isinstance(data, bytes):
             raise TypeError("a serial line takes bytes")
@@ -177,14 +178,14 @@ class SerialLine:
         return [LineEvent(0, event) for event in events]
 
     def tick(self, now: Instant) -> list[LineEvent]:
-        """Drive the link; say what is wrong while no board is found."""
+        """Drive the link; while no board is found, diagnose why."""
         if not self._up:
             return []
         link = self._link or self._board
         was_served = self._served
         out = [LineEvent(0, event) for event in link.tick(now)]
         if was_served:
-            # Should it go out of service, what is wrong is judged from here on.
+            # If the board goes out of service, the diagnosis uses only bytes from now on.
             self._diagnosis.begin(now)
         elif self._about_to_read and now < self._patient_until:
             pass
@@ -200,21 +201,21 @@ class SerialLine:
         return out
 
     def outgoing(self) -> list[Payload]:
-        """Frames to write now."""
+        """Remove and return the frames to write."""
         return [encode_serial(message) for message in self._board.outgoing()]
 
     @property
     def _served(self) -> bool:
-        """Whether a board has been found since the port was opened."""
+        """Whether a board has been found and is in service."""
         return self._link is not None and self._link.state in (State.CONFIGURING, State.STREAMING)
 
     @property
     def _about_to_read(self) -> bool:
-        """Whether it is known how the board writes, and its next frames are awaited."""
+        """Whether a layout has been found whose frames are awaited."""
         return self._finding is not None and self._finding.layout is not None
 
     def _decode(self, data: bytes, now: Instant) -> list[Received]:
-        """Messages by whichever decoder fits; the first to find one is kept."""
+        """Decode with every decoder that may fit; the first to find a message is kept."""
         if isinstance(self._link, BoardLink):
             return self._own.feed(data)
         if self._link is None and self._kind in ("auto", "tactile"):
@@ -239,7 +240,7 @@ class SerialLine:
         return found
 
     def _look(self, data: bytes, now: Instant) -> None:
-        """Find out how the board writes, where it is plain: two looks must say the same."""
+        """Survey the bytes for a layout; it is adopted when two surveys agree."""
         self._survey.feed(data)
         if now < self._judge_due:
             return
@@ -254,14 +255,14 @@ class SerialLine:
         self._judge_due = after(now, self._judge_wait)
 
     def _adopt(self, layout: Layout) -> None:
-        """Read frames of ``layout`` from now on, once it is known what stands round its numbers."""
+        """Read frames of ``layout`` from now on, if its framing is known."""
         if layout == self._layout:
-            return  # give it time
+            return  # in use already; its frames will come
         self._layout = layout
         usual = layout == replace(USUAL, chips=layout.chips, framing=layout.framing)
         usual &= layout.framing in (None, USUAL.framing)
         if usual and self._declared is None and isinstance(self._floats, AnySkinDecoder):
-            return  # it will come to see it
+            return  # the present decoder reads this layout
         if self._floats is not None:
             self._former.update(self._floats.counters)
         if layout.kind is Kind.TEXT:
@@ -276,7 +277,7 @@ class SerialLine:
 
 
 USUAL = Layout(Kind.FLOATS, 1, "txyz", framing=Framing(end=b"\r\n"))
-"""What `AnySkinDecoder` reads: it knows that layout best."""
+"""The layout that `AnySkinDecoder` reads, better than the general decoder."""
 
 
 def board_kind(text: str) -> Layout | None:
@@ -289,31 +290,31 @@ def board_kind(text: str) -> Layout | None:
 
 
 def kind_text(text: str) -> str:
-    """``text`` if it is a kind of board, see `board_kind`; ValueError."""
+    """Return ``text`` if it is a valid kind of board, see `board_kind`; else ValueError."""
     board_kind(text)
     return text
 
 
-# A CAN bus as a line: boards found by a broadcast question, one link each. Pure.
+# A CAN bus as a line: boards are found by a broadcast Identify, and have one link each. Pure.
 
 
 DISCOVER_EVERY = 0.2
-"""s between broadcast questions until boards are known. Boards plugged in later show themselves by
-their status, once a second."""
+"""s between broadcast questions until the boards are known. Boards plugged in later are noticed by
+their status message, once a second."""
 
 GATHER = 0.5
-"""s from the first board's word until the boards of a bus are taken as known: two questions more,
-should an answer have been lost. Their names depend on how many they are."""
+"""s from the first board's message until the boards of a bus count as known: two more questions, in
+case an answer was lost. Their names depend on their number."""
 
 EARLY = 4096
-"""Messages kept while boards are gathered: sixteen of them at 493 Hz for half a second."""
+"""Most messages kept while boards are gathered: sixteen boards at 493 Hz for half a second."""
 
 MAX_NODES = 16
-"""Boards used on one bus; more would not leave 25 Hz of samples each on CAN 2.0B."""
+"""Most boards used on one bus; with more, CAN 2.0B has no room for 25 Hz of samples each."""
 
 
 class CanLine:
-    """A CAN bus: any number of boards, each found by its answer to a broadcast question."""
+    """A CAN bus with up to `MAX_NODES` boards, each found by its answer to a broadcast question."""
 
     def __init__(
         self,
@@ -337,12 +338,12 @@ class CanLine:
         self._up = False
         self._frames = self._errors = 0
         self._since = self._discover_due = self._diagnose_from = Instant(0)
-        self._known_at: Instant | None = None  # when the boards met until then are enough
+        self._known_at: Instant | None = None  # when gathering boards ends
         self._known = False
         self._early: deque[tuple[int, Message, Instant]] = deque(maxlen=EARLY)
         self._questions: list[Payload] = []
         self.strangers = 0
-        """Messages of boards beyond `MAX_NODES` or not asked for."""
+        """Messages of boards beyond `MAX_NODES` or not wanted."""
 
     @property
     def links(self) -> dict[int, Link]:
@@ -356,7 +357,7 @@ class CanLine:
         return counts | {"strangers": self.strangers}
 
     def connect(self, now: Instant, usb_serial: str = "", byte_time: float = 0.0) -> None:  # noqa: ARG002 - properties of a serial line
-        """The bus is open."""
+        """Start; see `Line.connect`."""
         self._up = True
         self._decoder.reset()
         self._frames = self._errors = 0
@@ -366,7 +367,7 @@ class CanLine:
                 link.connect(now)
 
     def disconnect(self) -> list[LineEvent]:
-        """The bus is closed or gone; see `Line.disconnect`."""
+        """Stop; see `Line.disconnect`."""
         self._up = False
         self._questions.clear()
         return [
@@ -376,7 +377,7 @@ class CanLine:
         ]
 
     def receive(self, chunk: Chunk) -> list[LineEvent]:
-        """Take frames; TypeError for bytes."""
+        """Process frames; TypeError for bytes."""
         if isinstance(chunk.payload, bytes):
             raise TypeError("a CAN bus brings frames, not bytes")
         self._frames += len(chunk.payload)
@@ -395,12 +396,12 @@ class CanLine:
             if self._known and not out and not self._early:
                 heard += self._hear(node, message, chunk.received)
             else:
-                # Whoever listens must first be told of the board, which it is when this returns.
+                # The caller must first learn of the board, from the events that this returns.
                 self._early.append((node, message, chunk.received))
         return heard + out
 
     def tick(self, now: Instant) -> list[LineEvent]:
-        """Look for boards, drive their links."""
+        """Look for boards and drive their links."""
         if not self._up:
             return []
         if not self._known and now >= self._discover_due:
@@ -420,7 +421,7 @@ class CanLine:
         return out
 
     def outgoing(self) -> list[Payload]:
-        """Transfers to write now."""
+        """Remove and return the transfers to write."""
         out, self._questions = self._questions, []
         for node, link in self._links.items():
             out += [self._encoders[node].encode(message) for message in link.outgoing()]
@@ -446,7 +447,7 @@ class CanLine:
         return []
 
     def _take_up(self, now: Instant) -> list[LineEvent]:
-        """Put the boards met so far into service; what they said meanwhile is heard next."""
+        """Put the boards found so far into service; their kept messages are processed next."""
         self._known = True
         for link in self._links.values():
             link.connect(now)
@@ -474,7 +475,7 @@ class CanLine:
         )
 
 
-# The line of a port by its medium, and the names of the boards behind it.
+# Make the line of a port, and name the boards behind it.
 
 
 def make_line(
@@ -490,9 +491,9 @@ def make_line(
     listen_only: bool,
     arrays: tuple[int, ...] | None = None,
 ) -> Line:
-    """The line of ``port``; ``nodes``: boards wanted on a CAN bus, None for all.
+    """Make the line of ``port``. ``nodes``: boards wanted on a CAN bus; None: all.
 
-    ``arrays``: magnetometers of each board of a controller that does not say it.
+    ``arrays``: magnetometers of each array of a controller that does not report it.
     """
     if medium is Medium.CAN:
         return CanLine(port, admit, fd, rate, nodes, listen_only)
@@ -502,7 +503,8 @@ def make_line(
 def bus_names(
     stem: str, given: dict[int, str], nodes: tuple[int, ...], late: bool
 ) -> dict[int, str]:
-    """Names of boards on a CAN bus: as given by node; the stem for a lone board, else stem-node."""
+    """Names of boards on a CAN bus: as given by node; else the stem for a single board, else
+    stem-node."""
     if given:
         return {node: given[node] for node in nodes if node in given}
     if len(nodes) == 1 and not late:

@@ -1,9 +1,9 @@
-"""How far the published forces may be from the true ones: 95 % bounds in N.
+"""95 % bounds of the errors of published forces, in N.
 
-What is added up: noise of the chips, what is not known of the ambient field (which grows while it
-is held, `Estimate.sigma`), what chips differ by in a uniform field, temperature since the rest
-field was taken, forces too small to be seen, and the scale of the calibration. The first five are
-there without any force and decide whether features are valid; the last grows with the force.
+They add up: noise of the chips, uncertainty of the ambient field (which grows while a fit is held,
+`Estimate.sigma`), differences between chips in a uniform field, warming since the rest field was
+taken, forces too small to be detected, and the scale of the calibration. The first five do not
+depend on the force and decide whether features are valid; the last grows with the force.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ from tactiled.sensing.forces import ForceModel
 from tactiled.sensing.layout import Layout
 
 QUANTILE_95 = 1.96
-"""Normal errors are within this many sigma in 95 % of cycles."""
+"""Normally distributed errors are within this many sigma in 95 % of cycles."""
 MEASURED_SCALE = 0.06
-"""Share of a force that a calibration of the very board leaves unknown (95 %): hysteresis of up to
-6 %, curvature of the dipole law of 7 % at twice the calibrated load."""
+"""Relative error of a force with the board's own calibration (95 %): hysteresis of up to 6 %,
+curvature of the dipole law of 7 % at twice the calibrated load."""
 NOMINAL_SCALE = 1.0
-"""The same of nominal figures, which are right to a factor of two."""
+"""The same for nominal figures, which are accurate to within a factor of two."""
 PULL_N = 0.3
-"""N by which crosstalk and hysteresis may seem to pull at a taxel."""
+"""N of apparent pull at a taxel that crosstalk and hysteresis explain."""
 FRICTION = 1.0
-"""Shear over normal force that rubber bears at most."""
+"""Largest shear over normal force that rubber bears."""
 SLIP_N = 0.5
-"""N of shear that are no matter: a neighbour's contact shears a taxel that bears little itself."""
+"""N of shear that are tolerated: a neighbour's contact shears a taxel that bears little itself."""
 UNEVEN_UT = 1.5
 """µT rms by which chips differ in a uniform field: 3 % sensitivity in 50 µT."""
 KNOWN_DRIFT_UT_PER_K = 0.3
-"""µT/K rms that a measured temperature drift leaves (0.1 of the chips' own)."""
+"""µT/K rms that remain after correction with a measured drift (0.1 of the chips' own)."""
 UNKNOWN_DRIFT_UT_PER_K = 1.5
-"""µT/K rms of a chip's offset that nobody has measured (datasheet: ± 150 µT over 60 K at most)."""
+"""µT/K rms drift of an unmeasured chip's offset (datasheet: ± 150 µT over 60 K at most)."""
 UNKNOWN_DRIFT_SHARE_PER_K = 0.0003
-"""Share of the rest field, per K rms, by which magnets differ from their makers' −0.12 %/K."""
+"""Deviation of magnets from their makers' −0.12 %/K, as a share of the rest field per K, rms."""
 
 
 class Bounds:
-    """Bounds of one board's forces, from its calibration; nothing is remembered but settings."""
+    """Computes bounds of one board's forces; keeps no state besides settings."""
 
     def __init__(self, model: ForceModel, layout: Layout, nominal: bool) -> None:
         self._layout = layout
@@ -54,20 +54,20 @@ class Bounds:
         self._scale = NOMINAL_SCALE if nominal else MEASURED_SCALE
         self._nominal = nominal
         self._gain = np.linalg.norm(self._slopes[:, :, 0], axis=1)  # N/µT
-        self._still: FloatArray = np.zeros(layout.taxels)  # N², what does not change with the cycle
+        self._still: FloatArray = np.zeros(layout.taxels)  # N², the part equal in every cycle
         self._drift: FloatArray = np.zeros(layout.taxels)  # N/K rms
 
     @property
     def few(self) -> bool:
-        """Whether every array has so few taxels that their sum is as well known as one of them."""
+        """Whether all arrays have so few taxels that their sum is as well known as each taxel."""
         return self._few
 
     def set_noise(self, normal_sigma: FloatArray) -> None:
-        """Noise of each taxel's normal force, (N,) N rms."""
+        """Set the noise of each taxel's normal force, (N,) N rms."""
         self._still = normal_sigma**2 + (UNEVEN_UT * self._gain) ** 2
 
     def set_rest(self, rest_ut: FloatArray) -> None:
-        """The rest field in force, (N, 3) µT."""
+        """Set the rest field, (N, 3) µT, from which the drift follows."""
         per_kelvin = np.full(len(rest_ut), KNOWN_DRIFT_UT_PER_K)
         if self._nominal:
             share = UNKNOWN_DRIFT_SHARE_PER_K * np.linalg.norm(rest_ut, axis=1)
@@ -75,11 +75,11 @@ class Bounds:
         self._drift = per_kelvin * self._gain
 
     def drift_sigma(self, warmer_k: FloatArray) -> FloatArray:
-        """(N,) N rms that ``warmer_k`` (N,) K since the rest was taken may look like."""
+        """Apparent force of warming by ``warmer_k`` (N,) K since the rest was taken, (N,) N rms."""
         return np.abs(warmer_k) * self._drift
 
     def taxels(self, estimate: Estimate, drift: FloatArray) -> FloatArray:
-        """(N,) N, the additive bound of each taxel's normal force. ``drift``: `drift_sigma`."""
+        """Additive bound of each taxel's normal force, (N,) N. ``drift``: from `drift_sigma`."""
         a = self._array
         ambient = (self._slopes[:, :, 0] * estimate.sigma[a]) ** 2
         slope = (self._slopes[:, :, 1:] ** 2).sum(axis=(1, 2)) * estimate.slope_sigma[a] ** 2
@@ -87,7 +87,7 @@ class Bounds:
         return QUANTILE_95 * np.sqrt(variance)
 
     def together(self, taxels: list[int], estimate: Estimate, drift: FloatArray) -> float:
-        """N, the additive bound of the summed normal force of ``taxels``."""
+        """Additive bound of the summed normal force of ``taxels``, N."""
         if not taxels:
             return 0.0
         variance = float((self._still[taxels] + drift[taxels] ** 2).sum())
@@ -99,10 +99,10 @@ class Bounds:
         return QUANTILE_95 * math.sqrt(variance)
 
     def implausible(self, force: FloatArray) -> float:
-        """N that no contact exerts: pulls, and shear beyond friction; ``force`` (N, 3) N.
+        """Force that no contact exerts, N: pulls, and shear beyond friction. ``force``: (N, 3) N.
 
-        A magnet that passes looks like that. Only where the skin's own calibration tells what a
-        press looks like, and there is little else to tell it by.
+        A passing magnet looks like that. Used only on arrays of few taxels, which have no better
+        check, and only with the board's own calibration, which knows what a press looks like.
         """
         if self._nominal or not self._few:
             return 0.0
@@ -113,5 +113,5 @@ class Bounds:
         return max(pull, 0.0) + max(slip, 0.0)
 
     def scaled(self, force: float) -> float:
-        """N by which a force of ``force`` N may be off for its scale alone."""
+        """Error of a force of ``force`` N due to the scale of the calibration, N."""
         return self._scale * abs(force)

@@ -1,4 +1,4 @@
-"""Removal of the ambient field: what every method takes and gives, and the one that does none."""
+"""Removal of the ambient field: the interface of all methods, and the method that does nothing."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ Bool = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """What a method takes for the ambient field in one cycle.
+    """Estimate of the ambient field in one cycle.
 
-    ``theta``: (A, 3, 3) µT, [a, component in ``ee``, coefficient over `Layout.design`].
-    ``ambient``: the same for the outside. ``borrowed``: (A,) bool, where the array's own fit has
-    no support and the field was carried on by what the board's other arrays see. ``sigma``:
-    (A, 3) µT rms, how well the field at the array's centre is known, along ``ee``;
-    ``slope_sigma``: (A,) µT rms, the same of either slope. ``leap``: (A,) µT by which the field
-    has leapt on all taxels alike, more than the earth's can; 0 otherwise. ``loaded``: (A, n) bool,
-    taxels that are known to bear something although it may be little; only small arrays tell.
+    ``theta``: (A, 3, 3) µT, [array, component in ``ee``, coefficient over `Layout.design`].
+    ``ambient``: the same in published form. ``borrowed``: (A,) bool, arrays without a fit of their
+    own whose field was updated from the board's other arrays. ``sigma``: (A, 3) uncertainty of the
+    field at the array's centre, µT rms along ``ee``; ``slope_sigma``: (A,) of either slope, µT rms.
+    ``leap``: (A,) µT by which the field has leapt on all taxels alike, more than the earth's can;
+    else 0. ``loaded``: (A, n) bool, taxels known to bear a load, even a small one; only for small
+    arrays.
     """
 
     theta: FloatArray
@@ -39,25 +39,26 @@ class Estimate:
 
 
 class Compensator(Protocol):
-    """One method of compensation."""
+    """A method of compensation."""
 
     def update(
         self, field_ee: FloatArray, forces: FloatArray, healthy: Bool, captured: Instant
     ) -> Estimate:
-        """Estimate for one cycle.
+        """Estimate the ambient field of one cycle.
 
-        ``field_ee``: (A, 3, n) µT. ``forces``: (A, 3, n) N, ambient included. ``healthy``:
-        (A, n), False in the padding; what unhealthy taxels hold is finite and means nothing.
+        ``field_ee``: (A, 3, n) µT in ``ee``. ``forces``: (A, 3, n) N in taxel axes, including the
+        ambient field's. ``healthy``: (A, n), False in the padding; values of unhealthy taxels are
+        finite but meaningless.
         """
 
     def set_noise(self, noise_ut: FloatArray) -> None:
-        """Noise of one sample, (3,) µT rms in chip axes, as a tare measured it."""
+        """Set the noise of one sample, (3,) µT rms in chip axes, as measured by a tare."""
 
     def reset(self, rested: bool = False) -> None:
         """Forget every earlier fit.
 
-        ``rested``: the rest field has just been taken, ambient field and all, so that this is
-        zero now; otherwise the stream has begun anew, and nobody knows how the board has turned.
+        ``rested``: a tare has just been taken, which includes the ambient field, so that this is
+        zero now. Otherwise the stream has restarted, and the board may have turned meanwhile.
         """
 
 
@@ -78,29 +79,29 @@ class Off:
                 valid=np.ones(arrays, dtype=bool),
             ),
             borrowed=np.zeros(arrays, dtype=bool),
-            sigma=np.zeros((arrays, 3)),  # who turns compensation off says that nothing turns
+            sigma=np.zeros((arrays, 3)),  # compensation is off because the board does not turn
             slope_sigma=np.zeros(arrays),
             leap=np.zeros(arrays),
             loaded=np.zeros_like(layout.real),
         )
 
-    def update(  # the arguments of every `Compensator`
+    def update(  # unused arguments are those of `Compensator.update`
         self,
         field_ee: FloatArray,  # noqa: ARG002
         forces: FloatArray,  # noqa: ARG002
         healthy: Bool,  # noqa: ARG002
         captured: Instant,  # noqa: ARG002
     ) -> Estimate:
-        """The same estimate for every cycle."""
+        """Return the same estimate for every cycle."""
         return self._estimate
 
     def set_noise(self, noise_ut: FloatArray) -> None:
-        """Nothing depends on it."""
+        """Ignore the noise."""
 
     def reset(self, rested: bool = False) -> None:
-        """Nothing is remembered."""
+        """Nothing to forget."""
 
 
 def outside_plane(theta: FloatArray, layout: Layout) -> FloatArray:
-    """(A, 3, 3) of `Ambient.plane` ([a, component, value or slope per m]) from ``theta``."""
+    """Convert ``theta`` to `Ambient.plane`, (A, 3, 3): [array, component, value or slope per m]."""
     return theta * layout.plane_scale

@@ -1,13 +1,14 @@
 """Deterministic robust fit of the ambient field, all arrays and all components at once.
 
-A contact disturbs a taxel in all three components, the ambient field is a plane over the unrolled
-skin, nearly the same constant on every array when seen in ``ee`` axes. So: designed subsets
-propose planes, all taxels vote on them by their joint three-component distance, the winner (or
-the constant that the whole board agrees on, where that explains an array better) is refined by
-reweighted least squares, the last time on fields from which the neighbours' contacts were taken.
-Linear in the field wherever the choice of taxels is the same: a uniform field that is added comes
-out exactly, a plane to a fraction of the noise mostly, and at worst to about the noise.
-Shapes as in `Layout`.
+A contact disturbs a taxel in all three components, while the ambient field is a plane over the
+unrolled skin and, in ``ee`` axes, nearly the same constant on every array. Designed subsets of
+taxels propose planes. All taxels vote on them by their joint three-component distance. The winner
+(or the constant of the whole board, where that explains an array better) is refined by reweighted
+least squares, the last time on fields without the neighbours' contacts.
+
+The fit is linear in the field as long as the same taxels are chosen: a uniform field added to the
+readings is recovered exactly, a plane mostly to a fraction of the noise and at worst to about the
+noise. Shapes as in `Layout`.
 """
 
 from __future__ import annotations
@@ -26,33 +27,32 @@ from tactiled.sensing.compensation import Estimate, outside_plane
 from tactiled.sensing.forces import ForceModel
 from tactiled.sensing.layout import Layout
 
-# Designed subsets of an array's taxels, each of which proposes a surface for the ambient field.
+# Designed subsets of an array's taxels, each of which proposes a plane for the ambient field.
 #
-# No random draws: the subsets depend on the geometry alone, so equal inputs give equal fits.
+# Nothing is random: the subsets depend only on the geometry, so equal inputs give equal fits.
 
 
 PLANE_TAXELS = 9
-"""Arrays of fewer taxels get a constant instead of a plane: on five taxels a plane takes 46 % of
-the contact's energy with it, a constant 16 % (measured on AnySkin-like boards)."""
+"""Arrays of fewer taxels get a constant instead of a plane: on five taxels a plane absorbs 46 % of
+the contact's energy, a constant 16 % (measured on AnySkin-like boards)."""
 CONSTANTS = 24
-"""Most subsets that propose a constant, each from one compact group of taxels. A contact is
-compact, so where half of an array is free, whole groups are free."""
+"""Most subsets that propose a constant, each a compact group of taxels. A contact is compact, so
+when half of an array is free, whole groups are free."""
 TRIPLES = 40
-"""Subsets of three taxels that propose a plane. Where half of the taxels are free at random, one
-triple in ten is: all 40 are hit with probability 0.9^40 = 1.5 %, and the constants stand beside
-them."""
+"""Subsets of three taxels that propose a plane. When a random half of the taxels is free, so is one
+triple in ten: all 40 are disturbed with probability 0.9^40 = 1.5 %, and the constants remain."""
 GROUP = 4
-"""Taxels of a compact group: their mean has half of one sample's noise."""
+"""Taxels of a compact group; their mean has half of one sample's noise."""
 DENSE = 24
-"""Triples are drawn from at most this many taxels, evenly strided, so that designing them for
-the largest array of 128 takes no longer than for one of 24 (2,024 triples)."""
+"""Triples are formed from at most this many taxels, evenly strided, so that designing them for the
+largest array of 128 takes no longer than for 24 (2,024 triples)."""
 
 
 def design_candidates(design: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Operators from the field on n taxels to the coefficients that each subset proposes.
+    """Operators from the field on n taxels to the coefficients that each of k subsets proposes.
 
-    ``design``: (n, 3), `Layout.design` of one array, taxels first. Returns
-    (k, 3, n) and (k, n) which taxels each uses.
+    ``design``: (n, 3), `Layout.design` of one array, taxels first. Returns the operators (k, 3, n)
+    and which taxels each uses, (k, n) bool.
     """
     n = len(design)
     operators: list[FloatArray] = []
@@ -83,7 +83,7 @@ def _groups(design: FloatArray) -> list[tuple[int, ...]]:
     distance = np.linalg.norm(flat[:, None] - flat[None], axis=2)
     groups: dict[tuple[int, ...], None] = {}
     for i in range(n):
-        # nearest to a point just up and right of the taxel: the 2 × 2 block it is the corner of
+        # nearest to a point just up and right of the taxel: the 2 × 2 block with it as corner
         corner = flat[i] + 0.5 * np.sort(distance[i])[1] * np.array([1.0, 1.0])
         away = np.linalg.norm(flat - corner, axis=1)
         nearest = np.argsort(np.round(away, 9), kind="stable")[:GROUP]
@@ -105,9 +105,9 @@ def _triples(design: FloatArray) -> list[tuple[int, ...]]:
     chosen: list[tuple[int, ...]] = []
     members = np.array(every)
     uses = np.zeros(n)
-    free = spread > 0.05  # slimmer ones amplify noise more than twenty times
+    free = spread > 0.05  # narrower triples amplify noise more than twenty times
     for _ in range(min(TRIPLES, int(free.sum()))):
-        # the least used taxels first, among them the widest triple
+        # prefer rarely used taxels, then wide triples
         merit = np.where(free, np.sqrt(spread) - uses[members].sum(axis=1), -np.inf)
         best = int(np.argmax(np.round(merit, 9)))
         chosen.append(every[best])
@@ -119,46 +119,46 @@ def _triples(design: FloatArray) -> list[tuple[int, ...]]:
 Bool = NDArray[np.bool_]
 
 INLIER_SIGMAS = 4.0
-"""A taxel supports a fit within this many sigma, components together: noise leaves 0.1 % out."""
+"""A taxel supports a fit within this many sigma, components together; noise excludes 0.1 %."""
 FIRST_REACH = 6.0
 LAST_REACH = 5.0
-"""Sigma at which Tukey's weight falls to zero, in the first and the last refinement: wide while
-the start carries noise of its own (a proposal's few taxels, the cycle before), then just beyond
-the inliers."""
+"""Sigma at which Tukey's weight reaches zero, in the first and the last refinement: wide while the
+start is noisy itself (a proposal's few taxels, the cycle before), then just beyond the inliers."""
 MODEL_ERROR_UT = 1.5
 """µT rms by which chips differ in a uniform field: 3 % sensitivity in 50 µT."""
 MIN_SUPPORT = 0.5
-"""Least fraction of an array's healthy taxels that must agree on a plane by themselves. Of sixteen
-random presses of 1–3 N some plane has six or seven within its gate by chance."""
+"""Least fraction of an array's healthy taxels that must agree on a plane. With sixteen random
+presses of 1–3 N, some plane has six or seven taxels within its gate by chance."""
 LONE_SUPPORT = 0.65
-"""The same while nothing else tells, neither another array nor an earlier cycle."""
+"""The same when there is no other evidence, from another array or an earlier cycle."""
 CONFIRMED_SUPPORT = 0.3
 CONFIRMED_UT = 15.0
-"""The same for a plane within this many µT of where the rest of the board says it must be."""
+"""The same for a plane within this many µT of what the rest of the board indicates."""
 FOLLOW_SUPPORT = 0.65
-"""Support from which a plane has no rival on arrays of nine taxels and more."""
+"""Support above which a plane has no rival on arrays of nine taxels and more."""
 MIN_INLIERS = 3
 """Two taxels agree by chance."""
 MAX_RESIDUAL_RATIO = 1.5
-"""rms of the supporting taxels over the expected: contacts below the inlier gate raise it."""
+"""Most rms of the supporting taxels relative to the expected; contacts below the gate raise it."""
 BOARD_REACH_UT = 15.0
-"""µT by which the ambient field of an array may differ from the board's constant within the
-board's own vote: 150 µT/m over 10 cm."""
+"""µT by which the ambient field of an array may differ from the board's constant in the vote of the
+whole board: 150 µT/m over 10 cm."""
 BOARD_BONUS = 0.8
-"""The board's constant is preferred to an array's own proposal that is not clearly better."""
+"""Factor on its score with which the board's constant competes: an array's own proposal must be
+clearly better."""
 IMPOSTOR_UT = 50.0
-"""µT from what the board's arrays have in common, or saw in the cycle before, beyond which a plane
-is a uniform press (a third of a newton) and not the ambient field."""
+"""µT from the arrays' common field, or that of the cycle before, beyond which a plane is a uniform
+press (a third of a newton) and not the ambient field."""
 MAX_SLOPE_UT_PER_M = 1000.0
-"""Steeper planes are pressure that falls off evenly, as under a tilted wall: the field of the room
-is not that uneven until a magnet is closer than a hand's breadth."""
+"""Steeper planes are evenly varying pressure, as under a tilted wall: the ambient field is not that
+uneven unless a magnet is closer than a hand's breadth."""
 MAX_LEVERAGE = 1.0
-"""Variance of the plane at its worst taxel over that of one sample, beyond which the free taxels
-are too few or too much to one side to tell its slope; shrinkage sets in."""
+"""Variance of the plane at its worst taxel relative to one sample's, above which the free taxels
+are too few or too one-sided to determine its slope, and shrinkage sets in."""
 AMPLE_WEIGHT = 0.6
-"""Mean weight of an array's taxels above which no lie of the free ones has that leverage."""
+"""Mean weight of an array's taxels above which no choice of free ones has that leverage."""
 SLOPE_UT_PER_M = 100.0
-"""Spread of ambient gradients, the scale of that shrinkage: steel at arm's length makes 30."""
+"""Spread of ambient gradients, which scales that shrinkage: steel at arm's length makes 30."""
 
 _NONE = (math.nan, math.nan, math.nan)
 
@@ -167,10 +167,11 @@ _NONE = (math.nan, math.nan, math.nan)
 class Fit:
     """One fit of all arrays.
 
-    ``theta``: (A, 3, 3) µT, [a, component in ``ee``, coefficient]. ``support``, ``residual_ut``,
-    ``valid``: (A,) as in `Ambient`. ``common``: (3,) µT in ``ee`` that the arrays with a valid fit
-    share; NaN when there is none. ``whole``: every array is valid. ``leap``: (A,) µT, how far a
-    field that an array's taxels agree on is from where it must be; 0 where it is not beyond that.
+    ``theta``: (A, 3, 3) µT, [array, component in ``ee``, coefficient]. ``support``,
+    ``residual_ut``, ``valid``: (A,) as in `Ambient`. ``common``: (3,) µT in ``ee``, mean constant
+    of the arrays with a valid fit; NaN when there are none. ``whole``: every array is valid.
+    ``leap``: (A,) µT, distance of a field that an array's taxels agree on from where the ambient
+    field can be; 0 where it is within reach.
     """
 
     theta: FloatArray
@@ -184,14 +185,14 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """Where the board's ``constant`` (3,) µT in ``ee`` must be, to within ``reach`` µT."""
+    """The board's ``constant``, (3,) µT in ``ee``, is known to within ``reach`` µT."""
 
     constant: list[float]
     reach: float
 
 
 class Consensus:
-    """The fit; stateless between cycles but for the noise it was told."""
+    """Fits the ambient field; keeps no state between cycles except the noise."""
 
     def __init__(self, layout: Layout, model: ForceModel) -> None:
         self._layout, self._model = layout, model
@@ -205,7 +206,7 @@ class Consensus:
         operators_of = np.zeros((arrays, count, 3, n))
         self._uses = np.zeros((arrays, count, n))
         for a, (operators, uses) in enumerate(sets):
-            k = np.arange(count) % len(operators)  # arrays with fewer subsets repeat theirs
+            k = np.arange(count) % len(operators)  # arrays with fewer subsets repeat them
             operators_of[a, :, :, : layout.counts[a]] = operators[k]
             self._uses[a, :, : layout.counts[a]] = uses[k]
         # the vote only ranks proposals: single precision halves its time
@@ -228,22 +229,22 @@ class Consensus:
 
     @property
     def sample_sigma(self) -> float:
-        """µT rms by which one component of a free taxel is off a perfect plane."""
+        """Deviation of one component of a free taxel from a perfect plane, µT rms."""
         return math.sqrt(self._variance)
 
     def set_noise(self, noise_ut: FloatArray) -> None:
         """Noise of one sample, (3,) µT rms in chip axes."""
         self._variance = float((noise_ut**2).mean()) + MODEL_ERROR_UT**2
         self._gate = INLIER_SIGMAS**2 * self._variance
-        # mean of a taxel's squared distance when a quarter of them are at the gate
+        # sum of squared distances when a quarter of the taxels are at the gate
         self._doubtful = (0.25 * self._gate + 0.75 * 3.3 * self._variance) * self._layout.counts
 
     def fit(
         self, field_ee: FloatArray, forces: FloatArray, healthy: Bool, prior: Prior | None = None
     ) -> Fit:
-        """Fit of one cycle; see `Compensator.update` for the arguments.
+        """Fit one cycle; for the arguments see `Compensator.update`.
 
-        ``prior``: what the board saw before; None when it has seen nothing yet.
+        ``prior``: the ambient field by earlier cycles; None: unknown.
         """
         weight = healthy.astype(np.float64)
         theta, score = self._vote(field_ee, healthy)
@@ -265,10 +266,10 @@ class Consensus:
         healthy: Bool,
         prior: Prior | None,
     ) -> Fit | None:
-        """Fit of a cycle that continues the earlier fit ``theta``; None when a vote is needed.
+        """Fit a cycle by continuing the earlier fit ``theta``; None when a vote is needed.
 
-        Taken only where the vote could not come out otherwise: two planes share no more than
-        three taxels of an array, so one borne out by `FOLLOW_SUPPORT` of them has no rival.
+        Accepted only where a vote could have no other result: two planes share at most three
+        taxels of an array, so a plane with a support of `FOLLOW_SUPPORT` has no rival.
         """
         target = self._target(theta, field_ee, forces)
         weight = healthy.astype(np.float64)
@@ -284,7 +285,7 @@ class Consensus:
         healthy: Bool,
         prior: Prior | None,
     ) -> Fit:
-        """How far the present cycle bears out ``theta``, an earlier fit or another's."""
+        """Judge how well the cycle supports ``theta``, an earlier or another method's fit."""
         target = self._target(theta, field_ee, forces)
         return self._judge(theta, target, healthy, prior)
 
@@ -292,7 +293,7 @@ class Consensus:
         return int(np.count_nonzero(healthy)) == self._layout.taxels
 
     def _target(self, theta: FloatArray, field_ee: FloatArray, forces: FloatArray) -> FloatArray:
-        """Fields without neighbours' contacts, given about where the ambient field is."""
+        """Fields without neighbours' contacts, given the approximate ambient field ``theta``."""
         if not self._model.decouples:
             return field_ee
         target = self._model.decoupled_in_ee(field_ee, forces)
@@ -301,7 +302,7 @@ class Consensus:
 
     def _vote(self, field: FloatArray, healthy: Bool) -> tuple[FloatArray, FloatArray]:
         """Best proposal of each array, (A, 3, 3), and its score, (A,) µT²."""
-        # component first, so that every step below runs over contiguous numbers
+        # components first, so that every step below runs over contiguous memory
         single = field.swapaxes(0, 1).astype(np.float32, order="C")
         proposed = single[:, :, None] @ self._propose
         proposed = proposed.reshape(3, len(field), 3, self._count)
@@ -323,7 +324,7 @@ class Consensus:
     def _prefer_common(
         self, theta: FloatArray, score: FloatArray, field: FloatArray, weight: FloatArray
     ) -> None:
-        """Put the board's constant into ``theta`` for arrays that it explains about as well."""
+        """Set ``theta`` to the board's constant for arrays that it explains about as well."""
         flat = field.swapaxes(0, 1).reshape(3, -1)
         flat_weight = weight.reshape(-1)
         gate = self._gate + BOARD_REACH_UT**2
@@ -381,14 +382,14 @@ class Consensus:
     def _judge(
         self, theta: FloatArray, target: FloatArray, healthy: Bool, prior: Prior | None
     ) -> Fit:
-        """Whether the taxels bear out a fit."""
+        """Judge whether the taxels support a fit."""
         away = target - theta @ self._design
         squared = np.einsum("acn,acn->an", away, away)
         agree = np.empty((2, *squared.shape))
         np.less_equal(squared, self._gate, out=agree[0], casting="unsafe")
         agree[0] *= healthy
         np.multiply(squared, agree[0], out=agree[1])
-        # there are few arrays: plain numbers are faster from here on
+        # there are few arrays, so plain numbers are faster from here on
         inliers, sums = agree.sum(axis=2).tolist()
         sound = self._counts if self._all(healthy) else healthy.sum(axis=1).tolist()
         middle = theta[:, :, 0].tolist()
@@ -427,10 +428,10 @@ class Consensus:
 def _agreed(
     middle: list[list[float]], inliers: list[float], valid: list[bool], prior: Prior | None
 ) -> Prior | None:
-    """Where the ambient field must be near; None when nothing tells.
+    """Where the ambient field must be; None when unknown.
 
-    The constant that two arrays or more have in common: presses on arrays that face different
-    ways cannot agree in ``ee``. Else what the board saw before.
+    The constant that two or more arrays have in common, because presses on arrays that face
+    different ways cannot agree in ``ee``; else ``prior``.
     """
     most, agreed = 0.0, prior
     for middling, sound in zip(middle, valid, strict=True):
@@ -448,7 +449,7 @@ def _agreed(
 def _shared(
     middle: list[list[float]], inliers: list[float], valid: list[bool]
 ) -> list[float] | None:
-    """Mean of the valid arrays' constants, weighted by their supporting taxels; None without."""
+    """Mean of the valid arrays' constants, weighted by their inliers; None when none is valid."""
     weights = [k if ok else 0 for k, ok in zip(inliers, valid, strict=True)]
     total = sum(weights)
     if not total:
@@ -456,38 +457,37 @@ def _shared(
     return [sum(w * m[c] for w, m in zip(weights, middle, strict=True)) / total for c in range(3)]
 
 
-# What becomes of fits over time: the last good plane of each array, its age, and what is borrowed.
+# Fits over time: the last good plane of each array, its age, and planes borrowed from other arrays.
 #
-# A plane that the present cycle does not support is never passed off as a fit: it stays in force,
-# marked invalid, its age growing; where other arrays of the rigid board still see the ambient
-# field, its change since then is carried over.
+# A plane without support in the present cycle is never presented as a fit: it stays in use, marked
+# invalid, with growing age. Where other arrays of the rigid board still see the ambient field, its
+# change since then is added.
 
 
 OFFSET_MEMORY_S = 30.0
-"""s that an array's own offset from the board's constant is remembered while it borrows: chips
-warm up with a time constant of minutes."""
+"""s for which an array's own offset from the board's constant is used while it borrows: chips warm
+up with a time constant of minutes."""
 LENDING_ARRAY = 0.75
 LENDING_BOARD = 0.25
-"""Arrays without a fit follow the others if one of those has this support, or all of those together
-this fraction of the board's taxels: half of one array of many might be chance."""
+"""Arrays without a fit follow the others if one of these has this support, or all together have
+this fraction of the board's taxels: half of one array among many might be chance."""
 TURNING_UT_PER_S = 17.5
-"""How fast a board turning at 0.35 rad/s sees 50 µT change: what it saw last binds the less, the
-longer ago."""
+"""Rate of change of 50 µT for a board turning at 0.35 rad/s: with time the last field says less."""
 BORROWED_UT = 5.0
-"""µT rms by which the field of an array that borrows differs from what the others see: gradients
-of 30 µT/m over the finger."""
+"""µT rms by which the field of a borrowing array differs from that of the others: gradients of
+30 µT/m over the finger."""
 REVERSED_UT = 130.0
-"""Most that the earth's field can change at all: 65 µT turned round. Beyond it a uniform press on a
-lone array is never taken for the field, however long it lasts."""
+"""µT, largest possible change of the earth's field: 65 µT reversed. A uniform press beyond it on a
+lone array is never taken for the ambient field, however long it lasts."""
 
 
 class FieldTracker:
-    """Last good plane and its age of each array of one board."""
+    """Keeps the last good plane of each array of one board, and its age."""
 
     def __init__(self, layout: Layout, method: str, borrows: bool) -> None:
         self._layout = layout
         self._method = method
-        # What another array sees says nothing where nobody knows how they lie to one another.
+        # Arrays can only borrow from each other if their relative poses are known.
         self._borrows = borrows and layout.arrays > 1 and layout.posed
         self._zero_age = np.zeros(layout.arrays)
         self._none = np.zeros(layout.arrays, dtype=bool)
@@ -500,7 +500,7 @@ class FieldTracker:
         """Forget every plane."""
         arrays = self._layout.arrays
         self.theta: FloatArray = np.zeros((arrays, 3, 3))
-        self._sure = np.zeros(arrays)  # taxels that bear out the plane in force
+        self._sure = np.zeros(arrays)  # taxels that supported the plane in use
         self._common = np.full((arrays, 3), np.nan)
         self._fitted_at = np.zeros(arrays, dtype=np.int64)
         self._ever = np.zeros(arrays, dtype=bool)
@@ -508,14 +508,14 @@ class FieldTracker:
         self._newest: list[float] = []
 
     def prior(self, captured: Instant) -> Prior | None:
-        """Where the board's constant must be by what it saw last; None before it saw anything."""
+        """Range of the board's constant by its last fit; None before the first."""
         if self._seen is None:
             return None
         turned = TURNING_UT_PER_S * (captured - self._seen) / NS_PER_S
         return Prior(self._newest, min(IMPOSTOR_UT + turned, REVERSED_UT))
 
     def take(self, fit: Fit, captured: Instant, fresh: bool = True) -> Estimate:
-        """Estimate of a cycle from its fit; ``fresh`` False: only a check of the earlier planes."""
+        """Estimate of a cycle from its fit. ``fresh`` False: the fit only checks earlier planes."""
         if fresh and fit.whole:
             self.theta = fit.theta
             self._common[:] = fit.common
@@ -568,7 +568,7 @@ class FieldTracker:
         )
 
     def _lends(self, fit: Fit) -> bool:
-        """Whether the arrays with a valid fit are enough to speak for the board."""
+        """Whether the arrays with a valid fit suffice to lend their field to the others."""
         supporting = fit.support * self._layout.counts * fit.valid
         return bool(
             (fit.support[fit.valid] >= LENDING_ARRAY).any()
@@ -576,7 +576,7 @@ class FieldTracker:
         )
 
     def _borrow(self, fit: Fit, valid: Bool, age: FloatArray) -> tuple[FloatArray, Bool]:
-        """Planes in which the arrays without a fit of their own follow the rest of the board."""
+        """Planes in which arrays without a valid fit follow the rest of the board, and which do."""
         theta = self.theta.copy()
         for a in np.flatnonzero(~valid):
             if age[a] <= OFFSET_MEMORY_S:

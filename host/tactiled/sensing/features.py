@@ -15,15 +15,15 @@ from tactiled.sensing.settings import PipelineSettings
 
 
 NEIGHBOUR_REACH = 1.6
-"""Taxels are neighbours up to this many times the array's typical spacing: diagonals of a square
-grid are at 1.41, the second row at 2."""
+"""Taxels are neighbours up to this many times the array's typical spacing: in a square grid,
+diagonals are at 1.41 and the second row at 2."""
 
 
 class Adjacency:
-    """Which taxels touch which, within each array: a patch belongs to one array and one side.
+    """Neighbours of each taxel within its array: a patch belongs to one array and one side.
 
-    ``masks``: per taxel an int whose bits are its neighbours. ``neighbours``: per taxel itself
-    and its neighbours.
+    ``masks``: for each taxel, an int whose bits are its neighbours. ``neighbours``: for each taxel,
+    itself and its neighbours.
     """
 
     def __init__(self, geometry: SkinGeometry) -> None:
@@ -37,7 +37,7 @@ class Adjacency:
                 self.neighbours.append((part.start + i, *others.tolist()))
 
     def clusters(self, members: list[int]) -> list[list[int]]:
-        """Connected groups of the taxels ``members``, each ascending, ordered by first taxel."""
+        """Connected groups of the taxels ``members``; each ascending, ordered by first taxel."""
         left = 0
         for taxel in members:
             left |= 1 << taxel
@@ -59,7 +59,7 @@ class Adjacency:
         return out
 
     def rings(self, groups: list[list[int]], blind: list[int]) -> list[list[int]]:
-        """Taxels round each of ``groups`` that are in none and not ``blind``; each used once."""
+        """Taxels around each of ``groups``, without those in a group or ``blind``; each once."""
         taken = sum(1 << taxel for group in groups for taxel in group)
         taken |= sum(1 << taxel for taxel in blind)
         out = []
@@ -79,7 +79,7 @@ class Adjacency:
 
 
 def _near(array: ArrayGeometry) -> NDArray[np.bool_]:
-    """(n, n) bool, neighbours over the unrolled skin; grids need not be square."""
+    """(n, n) bool, neighbours on the unrolled skin; grids need not be square."""
     n = array.taxels
     if n == 1:
         return np.zeros((1, 1), dtype=bool)
@@ -101,13 +101,13 @@ def _near(array: ArrayGeometry) -> NDArray[np.bool_]:
 Bool = NDArray[np.bool_]
 
 BRIDGED_CYCLES = 1
-"""Cycles without a usable tip that a light contact survives: one lost frame is no lifted tip."""
+"""Cycles without a usable tip that do not end a light contact: one lost frame is not a release."""
 CERTAIN_RATIO = 4 / 3
-"""A taxel above this many times its threshold (6 sigma) is in contact at once; between 1 and this
-it must be there in two cycles running, or noise on 80 taxels at 100 Hz would touch every second."""
+"""A taxel above this many times its threshold (6 sigma) is in contact at once; between 1 and this,
+after two cycles in a row. Otherwise noise on 80 taxels at 100 Hz would touch every second."""
 
 SLIGHT_SIGMAS = 1.5
-"""Sigma of its noise above which a taxel that is known to be loaded is in contact."""
+"""Sigma of noise above which a taxel known to be loaded is in contact."""
 
 _ZERO3 = np.zeros(3)
 _ZERO6 = np.zeros(6)
@@ -116,14 +116,14 @@ _ZERO6.flags.writeable = False
 
 
 class FeatureExtractor:
-    """Features of a skin with N taxels; remembers which were in contact, and since when the tip.
+    """Computes features of a skin with N taxels; remembers which were in contact.
 
-    Forces are summed over taxels in contact and the ring of taxels round each patch, which bears a
-    tenth of a press of 4 N below the threshold of contact (its noise makes 0.1 N). Ring taxels that
-    read a pull beyond that threshold are left out: it is crosstalk, and on a board without
-    calibrated coupling it would take away half of the press (eFlesh recordings: correlation with
-    the load cell 0.998, with them 0.83). Idle taxels are left out too: the noise of eighty would
-    make half a newton.
+    Forces are summed over the taxels in contact and the ring of taxels around each patch, which
+    bears a tenth of a press of 4 N below the threshold of contact (its noise makes 0.1 N). Ring
+    taxels that read a pull beyond that threshold are left out: it is crosstalk, and without
+    calibrated coupling it would cancel half of the press (eFlesh recordings: correlation with the
+    load cell 0.998 without them, 0.83 with them). Idle taxels are left out as well: the noise of
+    eighty would make half a newton.
     """
 
     def __init__(self, geometry: SkinGeometry, settings: PipelineSettings) -> None:
@@ -131,7 +131,7 @@ class FeatureExtractor:
         position = np.concatenate([a.position for a in geometry.arrays])
         rotation = np.concatenate([a.rotation for a in geometry.arrays])
         self._position = position.tolist()
-        # (N, 6, 3): a taxel's force in its own axes to force and moment about the origin of ee
+        # (N, 6, 3): maps a taxel's force in its own axes to force and moment about the origin of ee
         turned = np.cross(position[:, :, None], rotation, axis=1)
         self._lever = np.concatenate([rotation, turned], axis=1)
         self._place = np.concatenate([np.ones((len(position), 1)), position], axis=1)
@@ -156,9 +156,9 @@ class FeatureExtractor:
         self.summed: list[int] = []
         """Taxels whose normal forces were summed in the last cycle."""
         self.tip_summed: list[int] = []
-        """Those of them at the tip."""
+        """Taxels of ``summed`` at the tip."""
         self.peak_taxel = 0
-        """The taxel of the peak force; the first where nothing is in contact."""
+        """Taxel of the peak force; 0 when nothing is in contact."""
 
     @property
     def contact(self) -> Bool:
@@ -167,11 +167,11 @@ class FeatureExtractor:
 
     @property
     def least_n(self) -> FloatArray:
-        """(N,) N that a taxel must read at least to be in contact."""
+        """Least normal force of a taxel in contact, (N,) N."""
         return self._on
 
     def set_noise(self, sigma_n: FloatArray) -> None:
-        """Noise of the normal forces, (N,) N rms: contact thresholds follow."""
+        """Set the contact thresholds from the noise of the normal forces, (N,) N rms."""
         self._on = np.maximum(self._minimum, self._sigmas * sigma_n)
         self._slight = SLIGHT_SIGMAS * sigma_n
         self._certain = self._on * CERTAIN_RATIO
@@ -198,8 +198,8 @@ class FeatureExtractor:
         """Features of one cycle.
 
         ``force``: (N, 3) N in taxel axes, NaN where a taxel is masked. ``masked``: how many are.
-        ``tip_usable``: whether what the tip feels counts towards its time in light contact.
-        ``loaded``: (N,) taxels known to bear something, in contact from a smaller force on.
+        ``tip_usable``: whether the tip's force counts towards its time in light contact.
+        ``loaded``: (N,) taxels known to bear a load; they are in contact from a smaller force on.
         """
         normal = -force[:, 2]
         above = normal > self._on
@@ -220,7 +220,7 @@ class FeatureExtractor:
             )
         taxels = members.tolist()
         groups = self._adjacency.clusters(taxels)
-        # masked ones are blind, and ones that are pulled bear nothing: that is crosstalk
+        # left out of the rings: masked taxels, and pulled ones, which is crosstalk
         blind = (~(normal > -self._on)).nonzero()[0].tolist()
         rings = self._adjacency.rings(groups, blind)
         involved = taxels + [taxel for ring in rings for taxel in ring]
@@ -238,7 +238,7 @@ class FeatureExtractor:
         table[:, 6:] = self._place[involved] * normal[involved, None]
         sums = bearing @ table
         total = sums.sum(axis=0)
-        # Places are weighted over the core alone: noise in the ring would have a long lever.
+        # Positions are weighted over the core alone: noise in the ring would have a long lever.
         weights = core @ table[:, 6:]
         centroids = weights[:, 1:] / weights[:, :1]
         patches = []
@@ -277,8 +277,9 @@ class FeatureExtractor:
         )
 
     def _peak_position(self, peak: int, row: dict[int, int], presses: list[float]) -> FloatArray:
-        """Centroid of the normal forces on the peak taxel and its neighbours in contact."""
-        touching = len(presses)  # rows from there on belong to the rings
+        """Centroid, (3,) m in ``ee``, of the normal forces on the peak taxel and its neighbours in
+        contact."""
+        touching = len(presses)  # rows from this one on belong to the rings
         around = [t for t in self._adjacency.neighbours[peak] if row.get(t, touching) < touching]
         weights = [presses[row[taxel]] for taxel in around]
         share = 1.0 / sum(weights)
@@ -288,7 +289,7 @@ class FeatureExtractor:
         )
 
     def _tip_time(self, tip_force: float, usable: bool, captured: Instant) -> float:
-        """Seconds that the tip has been in light contact without a break, bridging a lost cycle."""
+        """Seconds of uninterrupted light contact of the tip, bridging a lost cycle."""
         if not usable:
             self._unusable += 1
             if self._unusable > BRIDGED_CYCLES:

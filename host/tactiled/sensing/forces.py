@@ -1,7 +1,7 @@
-"""Chip readings to fields and fields to forces, by the calibration, for all arrays at once.
+"""Turn chip readings into fields and fields into forces, by the calibration, all arrays at once.
 
-Shapes as in `Layout`: vectors (A, 3, n). A plane is ``theta`` (A, 3, 3), [a, component in ``ee``,
-coefficient over `Layout.design`], in µT.
+Shapes as in `Layout`: vectors are (A, 3, n). A plane ``theta`` is (A, 3, 3) µT: [array, component
+in ``ee``, coefficient over `Layout.design`].
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from tactile_core.types import Instant, seconds_between
 from tactiled.sensing.layout import Layout
 
 MAX_OWN_CONDITION = 1e4
-"""A taxel whose own 3 × 3 block is worse conditioned does not feel three components of force; its
-array is then compensated without undoing crosstalk."""
+"""Condition number of a taxel's own 3 × 3 block above which it does not resolve three components
+of force; its array is then compensated without undoing crosstalk."""
 
 MAGNET_DRIFT_PER_K = -0.0012
 """Reversible loss of remanence of sintered NdFeB, −0.12 %/K (makers' datasheets)."""
@@ -30,9 +30,9 @@ MAGNET_DRIFT_PER_K = -0.0012
 class ForceModel:
     """The calibration of a board as batched matrices.
 
-    Force is linear in the field, so what a plane adds to every force is a fixed matrix times the
-    plane's nine coefficients. ``press_direction``: (A, 3, n), unit vectors in ``ee`` along which
-    a press changes a taxel's field.
+    Force is linear in the field, so a plane adds to every force a fixed matrix times the plane's
+    nine coefficients. ``press_direction``: (A, 3, n) unit vectors in ``ee`` along which a press
+    changes a taxel's field.
     """
 
     def __init__(self, calibration: BoardCalibration, layout: Layout) -> None:
@@ -60,7 +60,7 @@ class ForceModel:
         self._derive(blocks)
 
     def _derive(self, blocks: FloatArray) -> None:
-        """Precompute what depends on geometry and matrix alone."""
+        """Precompute everything that depends only on geometry and matrix."""
         layout = self.layout
         arrays, n = layout.arrays, layout.width
         own = np.einsum("acidi->aicd", blocks)
@@ -96,9 +96,10 @@ class ForceModel:
         self._plane_leak = leak.reshape(arrays, 3 * n, 9)
 
     def rested_at(self, temperature_c: FloatArray) -> None:
-        """The rest field was taken at ``temperature_c`` (A, n) °C.
+        """Note that the rest field was taken at ``temperature_c`` (A, n) °C.
 
-        Of a board nobody has measured the makers' drift of its magnets is taken off from there on.
+        For a board without a calibration, the datasheet drift of its magnets is removed relative
+        to that.
         """
         self._rested_at = temperature_c.copy()
         if self._nominal:
@@ -108,16 +109,17 @@ class ForceModel:
 
     @property
     def rested_c(self) -> FloatArray:
-        """(A, n) °C at which the rest field in force was taken."""
+        """(A, n) °C at which the rest field in use was taken."""
         return self._rested_at
 
     def warmer(self, temperature_c: FloatArray) -> FloatArray:
-        """(A, n) K since the rest field was taken."""
+        """(A, n) K of warming since the rest field was taken."""
         return np.asarray(temperature_c - self._rested_at)
 
     def taxel_field(self, raw: FloatArray, temperature_c: FloatArray) -> FloatArray:
-        """µT in taxel axes, rest and drift taken off; ``raw`` µT in chip axes, ``temperature_c``
-        (A, n).
+        """Field in taxel axes, µT, with rest field and thermal drift removed.
+
+        ``raw``: (A, 3, n) µT in chip axes. ``temperature_c``: (A, n) °C.
         """
         if self._turned:
             x, y = raw[:, 0], raw[:, 1]
@@ -132,25 +134,25 @@ class ForceModel:
         return field
 
     def chip_rest(self) -> FloatArray:
-        """(A, 3, n) µT in chip axes that the untouched chips read."""
+        """Rest field in chip axes, (A, 3, n) µT."""
         out = self.rest.copy()
         out[:, 0] = self._cos * self.rest[:, 0] + self._sin * self.rest[:, 1]
         out[:, 1] = self._cos * self.rest[:, 1] - self._sin * self.rest[:, 0]
         return out
 
     def forces(self, field: FloatArray) -> FloatArray:
-        """N in taxel axes that ``field`` in taxel axes stands for, ambient and all."""
+        """Forces in taxel axes, N, from ``field`` in taxel axes, including the ambient field's."""
         forces: FloatArray = (self._matrix @ field.reshape(len(field), -1, 1)).reshape(field.shape)
         return forces
 
     def field_in_ee(self, field: FloatArray) -> FloatArray:
-        """µT in ``ee`` axes, where a uniform ambient field is the same at every taxel."""
+        """Field in ``ee`` axes, µT, in which a uniform ambient field is equal at every taxel."""
         return np.asarray((self.layout.rotation * field[:, None]).sum(axis=2))
 
     def decoupled_in_ee(self, field_ee: FloatArray, forces: FloatArray) -> FloatArray:
-        """µT in ``ee`` axes without what neighbours' contacts add, from all of the `forces`.
+        """Field in ``ee`` axes, µT, without the crosstalk of neighbours' contacts, from `forces`.
 
-        A uniform field comes out changed too; `plane_leak` says by how much.
+        This also changes a uniform field, by `plane_leak`.
         """
         undone: FloatArray = (self._undo * forces[:, None]).sum(axis=2)
         if not self._decouples.all():
@@ -158,29 +160,29 @@ class ForceModel:
         return undone
 
     def plane_leak(self, theta: FloatArray) -> FloatArray:
-        """µT in ``ee`` axes by which `decoupled_in_ee` changes the plane ``theta``."""
+        """Change of the plane ``theta`` by `decoupled_in_ee`, µT in ``ee`` axes."""
         return self._of_plane(self._plane_leak, theta)
 
     def plane_forces(self, theta: FloatArray) -> FloatArray:
-        """N in taxel axes that the plane ``theta`` adds to `forces`."""
+        """Contribution of the plane ``theta`` to `forces`, N in taxel axes."""
         return self._of_plane(self._plane_force, theta)
 
     def plane_field(self, theta: FloatArray) -> FloatArray:
-        """µT of the plane ``theta`` in taxel axes."""
+        """Field of the plane ``theta`` in taxel axes, µT."""
         in_ee = theta @ self.layout.design
         field: FloatArray = (self.layout.rotation * in_ee[:, :, None]).sum(axis=1)
         return field
 
     def normal_slopes(self) -> FloatArray:
-        """(A, n, 3, 3) N/µT, what the normal forces lose to a plane: [a, taxel, component in
-        ``ee``, coefficient over `Layout.design`].
+        """Contribution of a plane to the normal forces, (A, n, 3, 3) N/µT: [array, taxel,
+        component in ``ee``, coefficient over `Layout.design`].
         """
         arrays, n = self.layout.arrays, self.layout.width
         rows = self._plane_force.reshape(arrays, 3, n, 3, 3)[:, 2]
         return np.ascontiguousarray(rows)
 
     def normal_sigma(self, noise_ut: FloatArray) -> FloatArray:
-        """(A, n) N rms of the normal force, from independent noise ``noise_ut`` (3,) µT rms."""
+        """Noise of the normal forces, (A, n) N rms, from independent noise (3,) µT rms."""
         arrays, n = self.layout.arrays, self.layout.width
         rows = self._matrix.reshape(arrays, 3, n, 3, n)[:, 2]
         sigma: FloatArray = np.sqrt(np.einsum("aicj,c->ai", rows**2, noise_ut**2))
@@ -193,21 +195,20 @@ class ForceModel:
         return vectors
 
 
-# Runs a `NetModel`: frame by frame as the daemon does, or over a whole recording at once.
+# Evaluate a `NetModel`, frame by frame as the daemon does, or over a whole recording at once.
 #
-# Both go through the same two functions: `History.step` for what remembers, `expand` for what does
-# not. Time enters as the seconds between frames, so that a model fitted at 14 Hz runs at any rate.
+# Both use the same two functions: `History.step` for terms with memory, `expand` for those without.
+# Time enters as the seconds between frames, so that a model fitted at 14 Hz runs at any rate.
 
 
 STILL_TAU_S = 1.0
-"""s of the mean that a still field stays close to."""
+"""s, time constant of the mean that a still field stays close to."""
 MAX_STEP_S = 60.0
-"""s: after a longer gap in the stream nothing is known of what happened in it, so the rest is not
-moved by that frame."""
+"""s; the frame after a longer gap does not move the rest field: what happened in it is unknown."""
 
 
 class RestFollower:
-    """The rest field of one board as it drifts; (3n,) µT, over the tared rest."""
+    """Tracks the drift of one board's rest field; ``rest``: (3n,) µT relative to the tare."""
 
     def __init__(self, tracker: RestTracker | None, channels: int) -> None:
         self._tracker = tracker
@@ -216,7 +217,7 @@ class RestFollower:
         self._begun = False
 
     def step(self, field: FloatArray, elapsed: float) -> FloatArray:
-        """Change from rest of ``field`` (3n,) µT, ``elapsed`` s after the last."""
+        """Change of ``field`` from rest, both (3n,) µT, ``elapsed`` s after the last frame."""
         tracker = self._tracker
         if tracker is None:
             return field
@@ -238,7 +239,7 @@ class RestFollower:
 
 
 class History:
-    """Leaky integrators and play operators of the first components; all start at rest, zero."""
+    """Leaky integrators and play operators of the first components; all start at zero."""
 
     def __init__(self, features: FeatureMap) -> None:
         self._taus = -1.0 / features.taus_s[:, None]
@@ -248,7 +249,8 @@ class History:
         self._play = np.zeros((len(features.radii), features.lagged))
 
     def step(self, components: FloatArray, elapsed: float) -> FloatArray:
-        """(lagged * (T + P),): component minus integrator, then component minus play."""
+        """Advance by ``elapsed`` s; returns (lagged * (T + P),): component minus integrator, then
+        component minus play."""
         now = components[: self._count]
         leaky, play = self._leaky, self._play
         leaky += (now - leaky) * -np.expm1(self._taus * elapsed)
@@ -257,7 +259,7 @@ class History:
 
 
 def expand(features: FeatureMap, components: FloatArray, history: FloatArray) -> FloatArray:
-    """(..., F) features of (..., k) components and (..., h) history terms."""
+    """Features (..., F) of components (..., k) and history terms (..., h)."""
     parts, first = [components], components[..., :1]
     indices = _indices(features.curved, features.degree)
     if len(indices):
@@ -277,9 +279,9 @@ def expand(features: FeatureMap, components: FloatArray, history: FloatArray) ->
     return np.concatenate(parts, axis=-1)
 
 
-@lru_cache(maxsize=64)  # few models are in use; asked for in every frame
+@lru_cache(maxsize=64)  # called in every frame, for few models
 def _indices(components: int, degree: int) -> NDArray[np.intp]:
-    """(M, degree) factors of each of `monomials`; -1, the padding, is the factor one."""
+    """Factors of each of `monomials`, (M, degree); the padding -1 stands for the factor one."""
     found = monomials(components, degree)
     out = np.full((len(found), degree), -1, np.intp)
     for row, factors in zip(out, found, strict=True):
@@ -288,7 +290,7 @@ def _indices(components: int, degree: int) -> NDArray[np.intp]:
 
 
 def readout(model: NetModel, features: FloatArray) -> FloatArray:
-    """(..., targets) of (..., F) features."""
+    """Predictions (..., targets) from features (..., F)."""
     value = (features - model.mean) / model.scale
     for layer in model.layers:
         value = _apply(layer, value)
@@ -306,20 +308,21 @@ def _apply(layer: Layer, value: FloatArray) -> FloatArray:
 
 
 class NetEstimator:
-    """One model in service on one board; memory and time of a frame are constant."""
+    """One model running on one board; memory, and time per frame, are constant."""
 
     def __init__(self, model: NetModel) -> None:
         self.model = model
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: a tare has just said what rest is."""
+        """Forget everything: a tare has just set the rest field."""
         features = self.model.features
         self._rest = RestFollower(features.tracker, features.channels)
         self._history = History(features)
 
     def step(self, field: FloatArray, elapsed: float) -> FloatArray:
-        """(targets,) for ``field`` (3n,) µT over the tared rest, ``elapsed`` s after the last."""
+        """Predictions (targets,) for ``field`` (3n,) µT relative to the tare, ``elapsed`` s after
+        the last frame."""
         change = self._rest.step(field, elapsed)
         components: FloatArray = change @ self.model.features.projection
         history = self._history.step(components, elapsed)
@@ -327,7 +330,7 @@ class NetEstimator:
 
 
 def batch_features(features: FeatureMap, time_s: FloatArray, field: FloatArray) -> FloatArray:
-    """(m, F) features of a whole recording: ``time_s`` (m,) s, ``field`` (m, 3n) µT over rest."""
+    """Features (m, F) of a whole recording: ``time_s`` (m,) s, ``field`` (m, 3n) µT over rest."""
     rest = RestFollower(features.tracker, field.shape[1])
     history = History(features)
     change, past = np.empty_like(field), []
@@ -338,20 +341,19 @@ def batch_features(features: FeatureMap, time_s: FloatArray, field: FloatArray) 
     return expand(features, change @ features.projection, np.array(past))
 
 
-# Fitted models in the pipeline: what the contact as a whole is, shared among its taxels.
+# Fitted models in the pipeline: the total force of the contact, distributed over its taxels.
 #
-# The matrices of the arrays say which taxels bear how much of a contact, the models say how much
-# there is. Where the models predict a component of the force, the taxels' components are scaled so
-# that they add up to it.
+# The matrices of the arrays give each taxel's share of a contact, the models give the total. Where
+# the models predict a component of force, the taxels' components are scaled to add up to it.
 
 
 Bool = NDArray[np.bool_]
 
-_LEAST_SHEAR_N = 1e-9  # below it a shear has no direction
+_LEAST_SHEAR_N = 1e-9  # below this a shear has no direction
 
 
 class NetStage:
-    """The models of one board, frame by frame; nothing to do where it has none."""
+    """Runs the fitted models of one board, if it has any, frame by frame."""
 
     def __init__(self, nets: Sequence[NetModel], layout: Layout) -> None:
         self._layout = layout
@@ -360,21 +362,22 @@ class NetStage:
 
     @property
     def fitted(self) -> bool:
-        """Whether there is any model."""
+        """Whether the board has any model."""
         return bool(self._estimators)
 
     def reset(self) -> None:
-        """A tare has said what rest is: forget what was before."""
+        """Forget the history: a tare has set the rest field."""
         for estimator in self._estimators:
             estimator.reset()
         self._last = None
 
     def pause(self) -> None:
-        """The stream began anew: the next frame follows none, the rest stays as followed."""
+        """Note a restart of the stream: the next frame has no predecessor; the rest is kept."""
         self._last = None
 
     def update(self, field: FloatArray, captured: Instant) -> dict[str, float]:
-        """Prediction by target; ``field`` (A, 3, n) µT over rest, ambient and all, all healthy."""
+        """Predictions by target. ``field``: (A, 3, n) µT over rest, including the ambient field;
+        all taxels healthy."""
         elapsed = 0.0 if self._last is None else max(0.0, seconds_between(self._last, captured))
         self._last = captured
         flat = self._layout.flat_vectors(field).ravel()
@@ -392,7 +395,7 @@ class NetStage:
         if "normal" in net:
             forces[:, 2] = -net["normal"] * part
         if "shear" in net:
-            # a rig that measures one axis gives the size; the matrices give the direction
+            # the model was fitted on one axis and gives the size; the matrices give the direction
             along = forces[:, :2].sum(axis=(0, 2))
             size = float(np.hypot(along[0], along[1]))
             if size > _LEAST_SHEAR_N:

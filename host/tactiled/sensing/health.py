@@ -1,10 +1,10 @@
-"""Which taxels may be trusted in a cycle, why the others may not, and what can be put right.
+"""Health of the taxels in each cycle: which are faulty and why, and what can be repaired.
 
-A chip tells by its readings that it is not well: by values that no chip sends (not a number, out
-of range, an impossible temperature), by values that only a failed read gives (the same count on
-every axis, far from what it read before), by the end of its range, by a jump that nothing near a
-magnet makes, by the bits of another chip or of an earlier frame, or by too little noise. A 16-bit
-wrap is undone where continuity proves it.
+A faulty chip is recognised by its readings: values that no chip sends (not a number, out of range,
+an impossible temperature), values that only a failed read gives (the same count on every axis, far
+from the last reading), the end of the range, a jump that no contact makes, the bits of another
+chip or of an earlier frame, or too little noise. A 16-bit wrap is undone where continuity proves
+it.
 """
 
 from __future__ import annotations
@@ -25,32 +25,32 @@ from tactiled.sensing.layout import Layout
 from tactiled.sensing.reasons import BITS, Fault
 from tactiled.sensing.scale import Scale, Scales
 
-# How much each chip's reading varies: a dead chip is given away by having too little noise.
+# Activity: a dead chip has too little noise.
 #
 # Over blocks of a quarter of a second the smallest and largest reading of every component are kept.
-# A live chip spans three to five sigma of its noise in a block; one that is dead but for a last bit
-# that toggles spans a count.
+# In a block a live chip spans three to five sigma of its noise; a dead chip whose last bit toggles
+# spans one count.
 
 
 Bool = NDArray[np.bool_]
 
 BLOCK_S = 0.25
 BLOCK_CYCLES = 16
-"""A block lasts at least this long and has at least so many cycles."""
+"""A block has at least this length and this many cycles."""
 LEARNT_BLOCKS = 4
-"""Blocks of its own after which a chip's least span is known."""
+"""Blocks in which a chip was alive, after which its least span is known."""
 DEAD_RATIO = 12.0
-"""A span this many times smaller than a live one is dead. Noise alone varies the span of sixteen
-samples by a factor of two."""
+"""A chip whose span is this many times smaller than a live one's is dead. Noise alone varies the
+span of sixteen samples by a factor of two."""
 MUTE_RATIO = 16.0
-"""The same where the other chips have gone just as still: a motion that ends does that too."""
+"""The same when the other chips are as still, which the end of a motion causes too."""
 STEPS = 6.0
-"""Counts that a live axis spans at least, if one that repeats a value is to be called stuck: noise
-below half a count makes axes of coarse chips repeat for seconds."""
+"""Least span of a live axis, in counts, for a constant one to count as stuck: noise below half a
+count makes axes of coarse chips repeat a value for seconds."""
 
 
 class Activity:
-    """Spans of a board's chips; memory of two readings and a few numbers a taxel."""
+    """Spans of a board's chips; keeps two readings and a few numbers per taxel."""
 
     def __init__(self, shape: tuple[int, int, int], real: Bool) -> None:
         self._real = real
@@ -60,10 +60,10 @@ class Activity:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all that was seen."""
+        """Forget everything."""
         arrays, _, width = self._shape
         self.least = np.full(self._shape, np.inf)
-        """(A, 3, n) µT, smallest span of a block in which the chip was alive."""
+        """Smallest span in a block in which the chip was alive, (A, 3, n) µT."""
         self.dead: Bool = np.zeros((arrays, width), bool)
         self.stuck: Bool = np.zeros((arrays, width), bool)
         self._blocks = np.zeros((arrays, width), np.int64)
@@ -73,7 +73,7 @@ class Activity:
         self._cycles = 0
 
     def add(self, raw: FloatArray, captured: Instant) -> bool:
-        """Take finite (A, 3, n) µT of one cycle; True when it ended a block, see `judge`."""
+        """Add finite readings of one cycle, (A, 3, n) µT; True when a block ends: call `judge`."""
         np.minimum(self._low, raw, out=self._low)
         np.maximum(self._high, raw, out=self._high)
         self._cycles += 1
@@ -82,14 +82,14 @@ class Activity:
         return self._cycles >= BLOCK_CYCLES and captured - self._start >= BLOCK_S * NS_PER_S
 
     def forgive(self, moved: Bool) -> None:
-        """Chips of (A, n) ``moved`` by more than the last bits: they are alive."""
+        """Mark the chips ``moved`` (A, n) as alive: they changed by more than their last bits."""
         self.dead &= ~moved
         self.stuck &= ~moved
 
     def judge(self, steps: FloatArray) -> None:
-        """End a block: find who is ``dead`` or has an axis ``stuck``.
+        """End a block: find chips that are ``dead`` or have an axis ``stuck``.
 
-        ``steps``: (A, 3, 1) µT a count, NaN where it is not known.
+        ``steps``: (A, 3, 1) µT per count, NaN where unknown.
         """
         span = self._high - self._low
         self._low = np.full(self._shape, np.inf)
@@ -98,13 +98,13 @@ class Activity:
         own = np.where((self._blocks >= LEARNT_BLOCKS)[:, None], self.least, np.inf)
         shown = np.where(self._real[:, None], span, np.inf)
         usual = np.take_along_axis(np.sort(shown, axis=2), self._middle, axis=2)
-        # Quieter than it ever was, and than the others are just now; or, where many have died at
-        # once, so quiet that no more than a bit toggles.
+        # Quieter than ever before and than the others now; or, in case many die at once, so quiet
+        # that at most one bit toggles.
         mute = (span * DEAD_RATIO <= own).all(axis=1)
         beside = (span * DEAD_RATIO <= usual).all(axis=1) & (usual > 0).all(axis=1)
         known = np.isfinite(own).all(axis=1)
         bit = (span <= 1.01 * steps).all(axis=1) | (span * MUTE_RATIO <= own).all(axis=1)
-        still = (span == 0).all(axis=1)  # that is frozen, which the monitor times by itself
+        still = (span == 0).all(axis=1)  # frozen, which `HealthMonitor` times itself
         dead = np.where(known, mute & (beside | bit), beside) & self._real & ~still
         axis = (span == 0) & np.isfinite(own) & (own >= STEPS * steps)
         self.stuck = axis.any(axis=1) & ~still & self._real
@@ -114,20 +114,20 @@ class Activity:
         self.least = np.where(alive[:, None], np.minimum(self.least, span), self.least)
 
 
-# Readings that came before, and chips that say the same: what noise never does.
+# Repeated frames, and chips with equal readings: noise never produces them.
 
 
 KEPT = 128
-"""Frames that a frame is compared with. A recording that is played in a loop is longer."""
+"""Earlier frames that a frame is compared with; a recording played in a loop is longer."""
 NOISY_FRAMES = 32
-"""Different frames that must have come first: a stream without noise repeats itself by right."""
+"""Different frames needed before a copy counts: a stream without noise may repeat itself."""
 
 TWIN_CYCLES = 4
-"""Cycles with new readings in which two chips agree to the bit before they count as one."""
+"""Cycles with new readings in which two chips must agree bit for bit before that is a fault."""
 
 
 class Copies:
-    """Frames of one array; knows one that is the very copy of an earlier one."""
+    """Recognises frames of one array that are exact copies of earlier ones."""
 
     def __init__(self) -> None:
         self.reset()
@@ -143,10 +143,10 @@ class Copies:
         self._verdict = False
 
     def add(self, frame: bytes) -> bool:
-        """Whether ``frame`` came before, other than just before.
+        """Whether ``frame`` is a copy of an earlier one, not counting the last.
 
-        A motion that goes back through the very same frames, as only one without noise can, is
-        not a copy.
+        A motion that runs back through the same frames, which needs a stream without noise, is not
+        a copy.
         """
         digest = hash(frame)
         if digest == self._last:
@@ -173,10 +173,10 @@ class Copies:
 
 
 class Twins:
-    """Chips whose three components are the same bits, cycle after cycle.
+    """Finds chips with equal bits in all three components, cycle after cycle.
 
-    ``rest_ut``: (A, 3, n) µT in chip axes that the calibration says of the untouched chips; those
-    that read the same at rest may read the same. None: unknown.
+    ``rest_ut``: rest field by the calibration, (A, 3, n) µT in chip axes; chips that read the same
+    at rest may read the same. None: unknown.
     """
 
     def __init__(self, real: Bool, rest_ut: FloatArray | None) -> None:
@@ -187,19 +187,19 @@ class Twins:
         self.reset()
 
     def reset(self) -> None:
-        """Forget who was the same."""
+        """Forget which chips were equal."""
         self._run: NDArray[np.int64] | None = None
 
     def check(
         self, raw: FloatArray, trusted: FloatArray, unchanged: Bool, near: FloatArray
     ) -> Bool | None:
-        """(A, n) taxels that are found to send another chip's bits; None: none is.
+        """(A, n) taxels found to send another chip's bits; None when there are none.
 
-        ``raw``: (A, 3, n) µT. A chip that left what it last read, ``trusted``, by more than
-        ``near`` (3, 1) µT is found at once, others after `TWIN_CYCLES` readings; those that are
-        ``unchanged`` (A, n) do not count as readings.
+        ``raw``: (A, 3, n) µT. A chip that differs from its last good reading, ``trusted``, by more
+        than ``near`` (3, 1) µT is found at once, others after `TWIN_CYCLES` readings; ``unchanged``
+        (A, n) ones do not count as readings.
         """
-        # not by a matrix product: its sums may be rounded differently from taxel to taxel
+        # not a matrix product, whose sums may be rounded differently from taxel to taxel
         key = raw[:, 0] + raw[:, 1] * np.pi + raw[:, 2] * np.e
         flat: list[float] = key.ravel().tolist() if self._whole else key[self._real].tolist()
         if len(set(flat)) == len(flat):
@@ -222,7 +222,7 @@ class Twins:
         return guilty.reshape(unchanged.shape) if guilty.any() else None
 
     def _pairs(self, key: FloatArray) -> list[list[int]]:
-        """Flat indices of taxels with the same key."""
+        """Pairs of flat indices of taxels with the same key."""
         values = key[self._places]
         order = np.argsort(values, kind="stable")
         same = np.flatnonzero(np.diff(values[order]) == 0)
@@ -231,7 +231,7 @@ class Twins:
         return out
 
     def _differ(self, i: int, j: int, near: FloatArray) -> bool:
-        """Whether two taxels at rest read different fields, however their chips are turned."""
+        """Whether two taxels have different rest fields, however their chips are turned about z."""
         if self._rest is None:
             return True
         one, other = self._rest[i], self._rest[j]
@@ -241,42 +241,42 @@ class Twins:
 
 
 def _columns(vectors: FloatArray) -> FloatArray:
-    """(A, 3, n) as (A n, 3)."""
+    """Reshape (A, 3, n) to (A n, 3)."""
     return vectors.swapaxes(1, 2).reshape(-1, 3)
 
 
-# Jumps from one reading to the next: 16-bit wraps, undone where that is certain, and faults.
+# Jumps from one reading to the next: 16-bit wraps, which are undone where certain, and faults.
 
 
 WRAP_RATIO = 1 / 6
-"""Share of the counts' range that may be left of a jump of a whole range: a wrap for certain."""
+"""Share of the range of counts by which a certain wrap may differ from a jump of a whole range."""
 SETTLED_S = 0.5
 SETTLED_CYCLES = 5
-"""A chip that jumped and then goes on from there so long has a new level; its rest is unknown."""
+"""A chip that jumped and stays there this long has a new level; its rest field is unknown."""
 REST_UT = 1000.0
-"""A reading that comes back to within this of the rest field after a jump is at rest, but for the
-creep of the rubber: 89 to 178 µT after 3.9 mT in eFlesh recordings."""
+"""µT; a reading that returns to within this of the rest field after a jump is at rest, apart from
+the creep of the rubber: 89 to 178 µT after 3.9 mT in eFlesh recordings."""
 
 ALONE_UT = 1500.0
-"""Jump of one chip that another must feel on a board of a few chips: the one that feels it most
-moves by 28 % and more in eFlesh recordings."""
+"""µT; on an array of few chips, a contact by which one chip jumps more must show on another: the
+second largest change is 28 % or more in eFlesh recordings."""
 ALONE_RATIO = 0.02
-"""Share of it, besides noise, that counts as not moved: a dipole 10 mm away feels 0.8 to 3.5 % at
-the usual gaps, and rubber passes on more."""
+"""Share of it, besides noise, up to which another chip has not moved: a dipole 10 mm away changes
+by 0.8 to 3.5 % at the usual gaps, and rubber transmits more."""
 ALONE_CHIPS = (3, 8)
-"""Numbers of chips of an array that all feel every contact."""
+"""Fewest and most chips of arrays whose chips all respond to every contact."""
 ALONE_CYCLES = 2
-"""Readings in which such a chip is not believed; one that stays where it went has been hit at the
-very edge of the skin."""
+"""Readings for which such a chip is not trusted; if it stays there, it was hit at the very edge of
+the skin."""
 ALONE_S = 0.05
-"""Seconds between readings beyond which nobody knows how fast it went."""
+"""s between readings above which the speed of a jump is unknown."""
 
 
 class Jumps:
-    """What each chip of a board jumped by, and how many ranges it is beyond its own.
+    """Jumps and wraps of each chip of a board.
 
-    After `check`: ``settled`` (A, n) bool, chips that have just been given another level, and
-    ``restored``, such chips that read again what they did at rest.
+    After `check`: ``settled`` (A, n) bool, chips that have just settled at a new level, and
+    ``restored``, such chips that read their rest field again.
     """
 
     def __init__(self, real: Bool, counts: NDArray[np.int64], scales: Scales) -> None:
@@ -287,9 +287,9 @@ class Jumps:
         self.never: Bool = np.zeros(real.shape, bool)
         self._none = np.zeros(real.shape, np.int64)
         self.rest: FloatArray | None = None
-        """(A, 3, n) µT in chip axes that the untouched chips read; None: unknown."""
+        """Rest field, (A, 3, n) µT in chip axes; None: unknown."""
         self.near: FloatArray = np.zeros((3, 1))
-        """µT that noise alone may make."""
+        """Largest step that noise alone may make, (3, 1) µT."""
         self.reset()
 
     def reset(self) -> None:
@@ -298,7 +298,7 @@ class Jumps:
         self.turns = np.zeros((shape[0], 3, shape[1]))
         self.wrapped = False
         self.offset = self.turns
-        """(A, 3, n) µT to add to what comes, where ``wrapped``."""
+        """Correction to add to readings while ``wrapped``, (A, 3, n) µT."""
         self._jumping: Bool = self.never
         self._since = np.zeros(shape, np.int64)
         self._cycles = np.zeros(shape, np.int64)
@@ -309,17 +309,17 @@ class Jumps:
 
     @property
     def least(self) -> float:
-        """µT below which no step is a jump."""
+        """µT; smaller steps are never jumps."""
         largest = float(self._scales.jump.min())
         return min(largest, ALONE_UT) if self._any_small else largest
 
     def accept_rest(self, rest_ut: FloatArray) -> None:
-        """A tare has found what the untouched chips read."""
+        """Set the rest field, (A, 3, n) µT in chip axes, after a tare."""
         self.rest = rest_ut
         self._displaced = self.never
 
     def forget_wraps(self, array: int) -> None:
-        """The counts of ``array`` have another size."""
+        """Forget the wraps of ``array``: its µT per count have changed."""
         turns = self.turns.copy()
         turns[array] = 0.0
         self._turn(turns)
@@ -336,9 +336,10 @@ class Jumps:
     ) -> tuple[Bool, Bool]:
         """Undo wraps in ``raw`` (A, 3, n) µT, in place.
 
-        ``trusted``: what each chip read when it was last believed, ``last``: what it read in the
-        cycle of ``previous``. ``open_``: (A, n) chips with no other fault; ``before``: those that
-        had none then. Returns (A, n) chips that jumped, and that wrapped by who knows how much.
+        ``trusted``: last good reading of each chip; ``last``: its reading in the cycle of
+        ``previous``. ``open_``: (A, n) chips with no other fault; ``before``: those without a fault
+        in the previous cycle. Returns (A, n) chips that jumped, and chips that wrapped by an
+        unknown amount.
         """
         self.settled = self.restored = self.never
         away = raw - trusted
@@ -349,7 +350,7 @@ class Jumps:
                 return self.never, self.never
         base = away
         if self._lonely is not self._none:
-            # a chip that is not believed yet goes on from where it was last, or goes back
+            # a chip not trusted yet either continues from its last reading or returns
             step = raw - np.where(np.isnan(last), trusted, last)
             nearer = (self._lonely > 0) & ~self._jumping
             nearer &= np.abs(step).max(axis=1) < np.abs(away).max(axis=1)
@@ -380,7 +381,7 @@ class Jumps:
         return jumped | alone, jumped & wrapped
 
     def _settle(self, jumped: Bool, step: FloatArray, captured: Instant) -> Bool:
-        """Those of ``jumped`` that have not gone on from there for long enough."""
+        """``jumped`` without the chips that have stayed at the new level for long enough."""
         on = jumped & self._jumping & (step <= self._scales.jump).all(axis=1)
         fresh = jumped & ~on
         self._since[fresh] = captured
@@ -395,7 +396,7 @@ class Jumps:
         return jumped
 
     def _undo(self, raw: FloatArray, turns: FloatArray) -> None:
-        """Take ``turns`` (A, 3, n) whole ranges off ``raw``, now and from now on."""
+        """Subtract ``turns`` (A, 3, n) whole ranges from ``raw``, now and in later cycles."""
         if np.count_nonzero(turns):
             raw -= np.where(turns == 0, 0.0, turns * self._scales.span)
             self._turn(self.turns - turns)
@@ -406,14 +407,14 @@ class Jumps:
         self.offset = np.where(turns == 0, 0.0, turns * self._scales.span)
 
     def _at_rest(self, raw: FloatArray) -> Bool:
-        """(A, n) taxels that read about what they do untouched, where that is known."""
+        """(A, n) taxels that read about their rest field, where that is known."""
         if self.rest is None:
             return self.never
         return np.asarray((np.abs(raw - self.rest) <= REST_UT).all(axis=1))
 
     def _find_again(self, raw: FloatArray) -> None:
-        """A chip whose wraps were lost count of, and that reads its rest but for whole ranges, is
-        at rest: correct it in ``raw``, in place.
+        """Correct in ``raw``, in place, chips that differ from their rest field by whole ranges:
+        their wraps were miscounted, and they are at rest.
         """
         if self.rest is None:
             return
@@ -427,7 +428,8 @@ class Jumps:
     def _alone(
         self, distance: FloatArray, step: FloatArray, open_: Bool, before: Bool, elapsed_ns: int
     ) -> Bool:
-        """(A, n): a chip of a small array jumped, no other moved, and it is not yet certain."""
+        """(A, n) chips of small arrays that jumped while no other chip moved, and are not yet
+        confirmed."""
         if not self._any_small or not 0 <= elapsed_ns <= ALONE_S * NS_PER_S:
             self._lonely = self._none
             return self.never
@@ -449,31 +451,31 @@ class Jumps:
         return np.asarray(out)
 
 
-# The chips' thermometers: what they cannot say, and when they have stopped.
+# The chips' thermometers: impossible, jumping and stuck temperatures.
 
 
 LIMITS_C = (-45.0, 130.0)
-"""A magnetometer outside its datasheet's −40 to 125 °C (and some tolerance) did not answer."""
+"""The datasheet's −40 to 125 °C with some tolerance. Beyond, the magnetometer did not answer."""
 _MIDDLE_C = sum(LIMITS_C) / 2
 _HALF_RANGE_C = (LIMITS_C[1] - LIMITS_C[0]) / 2
 STEP_C = 15.0
-"""K from one reading to the next that no chip warms by, at the rates that boards have."""
+"""K; no chip warms by this from one reading to the next, at the rates of boards."""
 THERMOMETER_SETTLED_S = 1.0
-"""A temperature that goes on from where it jumped for so long is taken: a firmware that does not
-read it any more, say."""
+"""s after which a temperature that stays where it jumped is accepted; the firmware may, for
+instance, have stopped reading it."""
 MOVED_C = 5.0
-"""K that the other chips must have gone since a chip's thermometer last changed before it counts
-as stuck: all are warmed by the same room, board and hand."""
+"""K by which the other chips must have warmed since a chip's thermometer last changed before it
+counts as stuck: all are warmed by the same room, board and hand."""
 FEWEST = 3
-"""Chips of an array whose thermometers can be compared."""
+"""Fewest chips of an array whose thermometers can be compared."""
 ROOM_C = 25.0
-"""°C taken where a chip has never told one."""
+"""°C assumed for a chip that has never sent one."""
 
 
 class Thermometers:
-    """Memory of each chip's last good temperature.
+    """Checks the chips' temperatures.
 
-    ``stuck``: (A, n) bool, None where none is. ``uneasy``: one has jumped just now.
+    ``stuck``: (A, n) bool; None when none is. ``uneasy``: one has just jumped.
     """
 
     def __init__(self, real: Bool) -> None:
@@ -484,7 +486,7 @@ class Thermometers:
         """Forget every temperature."""
         shape = self._real.shape
         self.last: FloatArray = np.full(shape, np.nan)
-        """(A, n) °C of the last cycle."""
+        """Temperatures of the last cycle, (A, n) °C."""
         self._good = np.full(shape, np.nan)
         self._since = np.zeros(shape, np.int64)
         self._changed_at = np.full(shape, np.nan)
@@ -493,22 +495,22 @@ class Thermometers:
         self.uneasy = False
 
     def plain(self, temperature_c: FloatArray) -> bool:
-        """Whether (A, n) °C need no closer look: near those of the cycle before."""
+        """Whether temperatures (A, n) °C are near those of the cycle before, so need no check."""
         return float(np.abs(temperature_c - self.last).max()) < STEP_C
 
     def accept(self, temperature_c: FloatArray) -> None:
-        """Take (A, n) °C that need no closer look."""
+        """Take temperatures (A, n) °C that need no check."""
         self._good = temperature_c
 
     def check(self, temperature_c: FloatArray, read: Bool, captured: Instant) -> tuple[Bool, Bool]:
-        """(A, n) temperatures that are impossible, and that jumped; the former are replaced.
+        """Find impossible and jumped temperatures, (A, n) each; impossible ones are replaced.
 
-        ``read``: (A, n) chips that were read; what others show is not kept.
+        ``read``: (A, n) chips that were read; temperatures of others are not kept.
         """
         impossible: Bool = ~(np.abs(temperature_c - _MIDDLE_C) <= _HALF_RANGE_C)
         if np.count_nonzero(impossible):
             np.copyto(temperature_c, np.nan_to_num(self._good, nan=ROOM_C), where=impossible)
-        # a buffer that no reading has ever filled shows naught
+        # zero: the board's buffer has never been filled with a reading
         jumped: Bool = (np.abs(temperature_c - self._good) > STEP_C) & (self._good != 0.0)
         if np.count_nonzero(jumped):
             on = jumped & (np.abs(temperature_c - self.last) <= STEP_C)
@@ -519,7 +521,8 @@ class Thermometers:
         return impossible, jumped
 
     def judge(self, alive: Bool) -> None:
-        """Find those that stand still while their array goes on; ``alive``: chips with noise."""
+        """Find thermometers stuck while the others of their array change. ``alive``: (A, n) chips
+        with noise."""
         self.stuck = None
         now = self._good
         if self._real.shape[1] < FEWEST:
@@ -533,14 +536,14 @@ class Thermometers:
             self.stuck = stuck
 
 
-# Whether what is left of an array says enough once some of its taxels are masked.
+# Whether an array's features are still valid when some of its taxels are masked.
 #
-# A masked taxel under a contact hides it, one beside a contact hides part of it. On an array of
-# sixteen and more that matters where the contact is: where the taxel was in contact when it went,
-# or has a neighbour that is. On a board of a few chips every contact is felt by all (the one that
-# feels it most but one by 28 % and more in eFlesh recordings), and each bears a large share of it:
-# there anything that is felt anywhere makes the array's forces unknown, and so does a chip that
-# went because its field left its range.
+# A masked taxel under a contact hides it; one beside a contact hides part of it. On arrays of
+# sixteen taxels and more this matters only near the contact: when the taxel was in contact before
+# it was masked, or has a neighbour that is. On a board of few chips every contact reaches all of
+# them (the second largest change is 28 % or more in eFlesh recordings), and each bears a large
+# share. There, any force anywhere makes the array's forces unknown, and so does a chip that was
+# masked because its field left its range.
 
 
 UInt8 = NDArray[np.uint8]
@@ -548,11 +551,11 @@ UInt8 = NDArray[np.uint8]
 _LEFT_RANGE = np.array(
     [Fault.SATURATED, Fault.RAIL, Fault.WRAPPED, Fault.JUMPED, Fault.BEYOND_RANGE], np.uint8
 )
-"""Faults that a strong field may be behind."""
+"""Faults that a strong field may cause."""
 
 
 class Masking:
-    """Remembers which taxels went while in contact. N taxels, one array after another."""
+    """Decides whether masked taxels hide a contact. N taxels, ordered array by array."""
 
     def __init__(self, geometry: SkinGeometry) -> None:
         self._names = tuple(a.name for a in geometry.arrays)
@@ -562,7 +565,7 @@ class Masking:
         self.reset()
 
     def reset(self) -> None:
-        """A tare or a new beginning: nothing is in contact."""
+        """Forget contacts, after a tare or a restart."""
         taxels = self._slices[-1].stop
         self._sick = False
         self._masked = np.zeros(taxels, bool)
@@ -571,7 +574,7 @@ class Masking:
         """(N,) taxels in contact in the last cycle; for the owner to set."""
 
     def well(self, touched: Bool) -> None:
-        """No taxel was masked in a cycle in which (N,) taxels were in contact."""
+        """Take a cycle without masked taxels. ``touched``: (N,) taxels in contact."""
         self.touched = touched
         if self._sick:
             self._sick = False
@@ -579,9 +582,9 @@ class Masking:
             self._hidden = self._masked
 
     def judge(self, fault: UInt8, felt: Bool) -> tuple[list[Reason], bool]:
-        """Reasons for which the forces of one cycle are incomplete, and whether too much so.
+        """Why the forces of one cycle are incomplete, and whether they are still good enough.
 
-        ``fault``: (N,) of `Fault`. ``felt``: (N,) healthy taxels that something presses or pulls.
+        ``fault``: (N,) of `Fault`. ``felt``: (N,) healthy taxels that bear a force.
         """
         self._sick = True
         masked = fault != 0
@@ -592,7 +595,7 @@ class Masking:
         for name, part, small in zip(self._names, self._slices, self._small, strict=True):
             gone = np.flatnonzero(masked[part])
             if not 0 < len(gone) < part.stop - part.start:
-                continue  # of an array that is gone altogether others tell
+                continue  # an array that is missing altogether is reported elsewhere
             if small:
                 bad = self._hidden[part] | np.isin(fault[part], _LEFT_RANGE)
                 if felt[part].any():
@@ -611,32 +614,33 @@ class Masking:
 
 
 FROZEN_CYCLES = 3
-"""Unchanged readings in a row before a taxel can be frozen, so that at low rates two equal
-readings by chance do not condemn it (three 12-bit noisy components repeat once in 10^3)."""
+"""Unchanged readings in a row before a taxel can count as frozen, so that at low rates two equal
+readings by chance do not mask it (three 12-bit noisy components repeat once in 10^3)."""
 FROZEN_BITS = 30.0
-"""Bits that a run of repeated readings must be improbable by, as often as the board's chips repeat
-themselves otherwise: coarse and quiet ones do so one time in three."""
+"""Improbability in bits of a run of repeated readings that counts as frozen, given how often the
+board's chips repeat readings otherwise: coarse and quiet ones do so one time in three."""
 MOST_REPEATED = 0.5
-"""Share of repeated readings taken at most."""
+"""Upper limit of that share of repeated readings."""
 LONG_RUN = 8
-"""Repetitions of a run that count at most: a chip that was frozen says nothing of noise."""
+"""Most repetitions of one run that count towards that share: a frozen chip does not show noise."""
 REMEMBERED = 1e5
-"""Readings after which earlier ones count half."""
+"""Readings after which the weight of earlier ones is halved."""
 NEAR_SIGMAS = 7.0
-"""A reading within so many sigma of the one before may be noise."""
+"""Steps within this many sigma may be noise."""
 NOISE_UT = (4.4, 4.4, 6.7)
 """µT rms of one sample until it has been measured."""
 Z_PER_XY = (1.595, 1.635)
-"""Scale of z by that of x and y at any gain of an MLX90393; 1 of chips with one scale."""
+"""Ratio of the scale of z to that of x and y at any gain of an MLX90393; it is 1 for chips with a
+single scale."""
 TINY_UT = 20.0
-"""µT, two counts of the coarsest scale: what minus one is at most."""
+"""µT, two counts of the coarsest scale: a count of minus one is less."""
 ALIKE_CYCLES = 4
-"""Times that zero or minus one on every axis must be repeated by a chip that never read anything
-else: at naught field, noise of a count gives it once in twenty readings."""
+"""Repeats of zero or minus one on every axis that make a failed read of a chip that never read
+anything else: at zero field, noise of a count gives it once in twenty readings."""
 REVIVED_S = 1.0
-"""A chip that could not be read for so long comes back as one whose rest may have changed."""
+"""s; after a longer failure the rest field of a chip may have changed."""
 COPY_BITS = 30.0
-"""Least information in a frame, bits, for a copy of one among `copies.KEPT` to be no chance."""
+"""Least information of a frame, in bits, for a copy among `KEPT` frames not to be chance."""
 
 _WELL = (
     Fault.NONE,
@@ -648,17 +652,17 @@ _WELL = (
     Fault.TEMPERATURE_JUMP,
     Fault.TEMPERATURE_STUCK,
 )
-"""Faults that say nothing against the chip: it comes back as the same."""
+"""Faults after which the chip's rest field is still good."""
 _SICK: Bool = np.array([fault not in _WELL for fault in Fault])
 
 
 class HealthMonitor:
-    """Per-taxel health of a board, in constant memory.
+    """Health of a board's taxels, in constant memory.
 
-    After `update`: ``fault``: (A, n) uint8 of `Fault`. ``revived``: (A, n) bool, taxels that are
-    well again in this cycle after they were gone for `REVIVED_S` or went to another level: what
-    was their rest need not be. ``restored``: those that had gone to another level and now read
-    again what they did at rest.
+    After `update`: ``fault``: (A, n) uint8 of `Fault`. ``revived``: (A, n) bool, taxels that have
+    recovered in this cycle after `REVIVED_S` or at another level, so that their rest field may
+    have changed. ``restored``: taxels that were at another level and now read their rest field
+    again.
     """
 
     def __init__(
@@ -668,7 +672,7 @@ class HealthMonitor:
         range_limit_ut: float,
         rest_ut: FloatArray | None = None,
     ) -> None:
-        """``rest_ut``: (A, 3, n) µT in chip axes that an untouched chip reads; None: unknown."""
+        """``rest_ut``: rest field, (A, 3, n) µT in chip axes; None: unknown."""
         shape = (layout.arrays, layout.width)
         self._frozen_after = None if frozen_after_s is None else round(frozen_after_s * NS_PER_S)
         self._limit = range_limit_ut
@@ -692,7 +696,7 @@ class HealthMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was read before; sizes of counts stay until they fit no more."""
+        """Forget all readings; scales (µT per count) stay until they no longer fit."""
         shape = self._real.shape
         self._last = np.full((shape[0], 3, shape[1]), np.nan)
         self._trusted = self._last.copy() if self._rest is None else self._rest.copy()
@@ -706,7 +710,7 @@ class HealthMonitor:
         self._gone_since = np.zeros(shape, np.int64)
         self._mute = False
         self._rich: Bool = self._same
-        self._ailing = True  # the first cycle is looked at closely
+        self._ailing = True  # so that the first cycle gets the full check
         self.fault = self._clear
         self._jumps.reset()
         self._activity.reset()
@@ -716,17 +720,17 @@ class HealthMonitor:
             copies.reset()
 
     def set_noise(self, noise_ut: FloatArray) -> None:
-        """Noise of one sample, (3,) µT rms in chip axes."""
+        """Set the noise of one sample, (3,) µT rms in chip axes."""
         self._near = self._jumps.near = NEAR_SIGMAS * noise_ut[:, None]
         self._quiet = float(self._near.min())
 
     def set_rest(self, rest_ut: FloatArray) -> None:
-        """A tare has found what the untouched chips read: (A, 3, n) µT in chip axes."""
+        """Set the rest field, (A, 3, n) µT in chip axes, after a tare."""
         self._rest = rest_ut
         self._jumps.accept_rest(rest_ut)
 
     def told(self, array: int, scale: Scale) -> None:
-        """The board says what a count of ``array`` is: µT of x and y, of z."""
+        """Set the scale of ``array`` as the board reports it: µT per count of x and y, and of z."""
         if self.scales.told(array, scale):
             self._jumps.forget_wraps(array)
 
@@ -738,12 +742,12 @@ class HealthMonitor:
         present: Bool,
         captured: Instant,
     ) -> UInt8:
-        """(A, n) uint8 of `TaxelHealth` for one cycle.
+        """Check one cycle; returns (A, n) uint8 of `TaxelHealth`.
 
-        ``raw``: (A, 3, n) µT in chip axes. ``temperature_c``: (A, n). ``status``: (A, n), what the
-        board said. ``present``: (A,) whether the array's block came at all. In both of the first,
-        wraps are undone and what is not a plausible number is replaced, in place, by what the chip
-        read before.
+        ``raw``: (A, 3, n) µT in chip axes. ``temperature_c``: (A, n) °C. ``status``: (A, n), flags
+        from the board. ``present``: (A,) whether the array's block came. In ``raw`` wraps are
+        undone, and in ``raw`` and ``temperature_c`` implausible values are replaced by the chip's
+        last good ones, in place.
         """
         self.revived = self.restored = self._jumps.settled = self._never
         scales, jumps, activity = self.scales, self._jumps, self._activity
@@ -831,12 +835,12 @@ class HealthMonitor:
             health[frozen] |= np.uint8(TaxelHealth.FROZEN)
         return health
 
-    # What is looked at in every cycle
+    # Checks in every cycle
 
     def _repair(self, raw: FloatArray) -> tuple[Bool, Bool] | None:
-        """Put what was read before in place of what no chip can read, in ``raw``.
+        """Replace impossible values in ``raw`` by the last readings.
 
-        (A, n) taxels that are not a number and that are beyond the range; None: there are none.
+        Returns (A, n) taxels that are not a number, and taxels beyond the range; None: neither.
         """
         if float(np.abs(raw).max()) <= self._limit:
             return None
@@ -846,20 +850,20 @@ class HealthMonitor:
         return strange, beyond
 
     def _is_motion(self, raw: FloatArray, moved: FloatArray) -> bool:
-        """Whether steps beyond the noise are a contact's: small, and x and y not alike, as they
-        are in failed reads.
+        """Whether steps beyond the noise may be a contact: small, and x and y differ, which they
+        do not in failed reads.
         """
         if float(moved.max()) > self._jumps.least:
             return False
         return not np.count_nonzero((raw[:, 0] == raw[:, 1]) & (moved >= self._quiet))
 
     def _copied(self, raw: FloatArray, moved: FloatArray, present: Bool) -> Bool | None:
-        """(A,) arrays whose frame is a copy of an earlier one; None: none is."""
+        """(A,) arrays whose frame is a copy of an earlier one; None when there are none."""
         out: Bool | None = None
         for a, copies in enumerate(self._copies):
             if not present[a] or not copies.add(raw[a].tobytes()):
                 continue
-            # one that is just like the last may be chance, unless there is much noise
+            # a copy close to the last frame may be chance, unless there is much noise
             if self._rich[a] or float(moved[a].max()) > self._quiet:
                 out = np.zeros(len(present), bool) if out is None else out
                 out[a] = True
@@ -868,7 +872,7 @@ class HealthMonitor:
     def _unchanging(
         self, unchanged: Bool, present: Bool, whole: bool, captured: Instant
     ) -> Bool | None:
-        """(A, n) taxels that have repeated one reading for too long; None: none has."""
+        """(A, n) taxels that have repeated one reading for too long; None when there are none."""
         self._readings += self._taxels
         if whole and not np.count_nonzero(unchanged):
             self._since.fill(captured)
@@ -879,7 +883,7 @@ class HealthMonitor:
             return None
         self._repeating = True
         self._repeats[present] += 1
-        changed = ~unchanged & present[:, None]  # an array that did not come did neither
+        changed = ~unchanged & present[:, None]  # missing arrays count as neither
         self._repeated += float(np.minimum(self._repeats[changed], LONG_RUN).sum())
         self._repeats[changed] = 0
         self._since[changed] = captured
@@ -890,12 +894,12 @@ class HealthMonitor:
         frozen &= present[:, None]
         return frozen if np.count_nonzero(frozen) else None
 
-    # What is looked at where something caught the eye
+    # Further checks, of cycles in which something is suspicious
 
     def _mark_flagged(
         self, fault: UInt8, status: UInt8, present: Bool, broken: tuple[Bool, Bool] | None
     ) -> None:
-        """What did not come, is not a number, or is flagged by the board."""
+        """Mark taxels that are missing, not a number, beyond the range or flagged by the board."""
         fault[~present] = Fault.MISSING
         if broken is not None:
             _mark(fault, broken[0], Fault.NOT_FINITE)
@@ -906,9 +910,9 @@ class HealthMonitor:
             _mark(fault, status > 0, Fault.STALE)
 
     def _mark_failed(self, fault: UInt8, raw: FloatArray, sent: FloatArray) -> None:
-        """Failed reads: the same count on every axis; zero, minus one, or what an offset makes.
+        """Mark failed reads: the same count on every axis (zero, minus one, or with an offset).
 
-        Only where the chip read something else before: noise is not that alike.
+        Only where the chip read something else before, which noise does not explain.
         """
         x, y, z = sent[:, 0], sent[:, 1], sent[:, 2]
         alike = x == y
@@ -923,7 +927,7 @@ class HealthMonitor:
         usual = (ratio == 1) | ((ratio >= Z_PER_XY[0]) & (ratio <= Z_PER_XY[1]))
         zero = alike & (x == 0) & (z == 0)
         same = alike & ~zero & np.where(known, exact, usual)
-        # from the start on: a chip without any field reads naught by chance, but not for long
+        # from the start: a chip in zero field reads zero by chance, but not for long
         lasts = self._repeats >= ALIKE_CYCLES
         _mark(fault, zero & (far | lasts), Fault.ZEROS)
         _mark(fault, same & (far | (lasts & (np.abs(z) < TINY_UT))), Fault.ONES)
@@ -937,10 +941,10 @@ class HealthMonitor:
         if np.count_nonzero(jumped):
             _mark(fault, jumped, Fault.TEMPERATURE_JUMP)
 
-    # What lasts
+    # Lasting faults
 
     def _recover(self, fault: UInt8, captured: Instant) -> None:
-        """Note since when taxels are gone, and which are back."""
+        """Note since when taxels have been faulty, and which have recovered."""
         settled = self._jumps.settled
         back = self._gone & (fault == 0)
         if np.count_nonzero(back):
@@ -955,7 +959,7 @@ class HealthMonitor:
         self._ailing = bool(np.count_nonzero(fault)) or self._thermometers.uneasy
 
     def _end_block(self, raw: FloatArray, fault: UInt8) -> None:
-        """What is looked at four times a second."""
+        """The checks made four times a second."""
         activity, steps = self._activity, self.scales.steps
         activity.judge(steps)
         self._thermometers.judge(activity.least.min(axis=1) > 0)
@@ -976,5 +980,5 @@ class HealthMonitor:
 
 
 def _mark(fault: UInt8, where: Bool, what: Fault) -> None:
-    """Note ``what`` for taxels of which nothing worse is known."""
+    """Set the fault ``what`` for taxels without a fault so far."""
     fault[where & (fault == 0)] = what

@@ -1,4 +1,4 @@
-"""Where each taxel stands in the rectangular arrays the sensing core computes with.
+"""Index of each taxel in the rectangular arrays that the sensing core computes with.
 
 Vectors of all taxels are (A, 3, n): A arrays, component, n taxels of the largest array, so that
 one component of one array is contiguous; scalars are (A, n). The padding of smaller arrays holds
@@ -18,13 +18,13 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 class Layout:
-    """Shapes and places of a board's taxels.
+    """Shapes and positions of a board's taxels.
 
-    ``posed``: whether the arrays' poses relative to one another are known.
+    ``posed``: whether the arrays' poses relative to each other are known.
     ``real``: (A, n) bool, False in the padding. ``counts``: (A,) taxels of each array.
-    ``design``: (A, 3, n), 1 and both coordinates on the unrolled skin about the array's centre,
+    ``design``: (A, 3, n): 1 and both coordinates on the unrolled skin about the array's centre,
     divided by ``scale`` (A,) m so that fits are well conditioned; zero in the padding.
-    ``rotation``: (A, 3, 3, n), [a, :, :, i] turns the axes of taxel i to ``ee``.
+    ``rotation``: (A, 3, 3, n); [a, :, :, i] rotates vectors from the axes of taxel i to ``ee``.
     """
 
     def __init__(self, geometry: SkinGeometry) -> None:
@@ -40,7 +40,7 @@ class Layout:
         self.design = np.zeros((self.arrays, 3, self.width))
         self.rotation = np.zeros((self.arrays, 3, 3, self.width))
         self.scale = np.ones(self.arrays)
-        self.plane_scale = np.ones((self.arrays, 1, 3))  # to slopes per m
+        self.plane_scale = np.ones((self.arrays, 1, 3))  # converts coefficients to slopes per m
         for a, array in enumerate(arrays):
             flat = array.surface - array.surface.mean(axis=0)
             spread = float(np.sqrt((flat**2).mean()))
@@ -51,17 +51,17 @@ class Layout:
             self.rotation[a, :, :, : array.taxels] = array.rotation.transpose(1, 2, 0)
 
     def flat(self, padded: NDArray[Scalar]) -> NDArray[Scalar]:
-        """(A, n) → (N,), all taxels one array after another; may be a view."""
+        """Convert (A, n) to (N,), taxels ordered array by array; may be a view."""
         joined = padded.reshape(-1)
         return joined if self._uniform else joined[self._where]
 
     def flat_vectors(self, padded: NDArray[Scalar]) -> NDArray[Scalar]:
-        """(A, 3, n) → (N, 3), all taxels one array after another; always a copy."""
+        """Convert (A, 3, n) to (N, 3), taxels ordered array by array; always a copy."""
         joined = padded.swapaxes(1, 2).reshape(-1, 3)
         return joined if self._uniform else joined[self._where]
 
     def padded(self, flat: NDArray[Scalar]) -> NDArray[Scalar]:
-        """(N,) → (A, n), zero in the padding."""
+        """Convert (N,) to (A, n), with zero in the padding."""
         out = np.zeros(self.arrays * self.width, flat.dtype)
         out[self._where] = flat
         return out.reshape(self.arrays, self.width)

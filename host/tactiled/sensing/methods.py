@@ -1,4 +1,4 @@
-"""The methods of compensation, by name, and which arrays each is for."""
+"""The methods of compensation: which one each array gets."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ Bool = NDArray[np.bool_]
 
 
 MIN_FREE = 0.5
-"""Share of a small array's healthy taxels that must be free for its ambient field to be seen."""
+"""Share of a small array's healthy taxels that must be free for a valid ambient field."""
 CONTACT_UT = 1.2
-"""µT rms of a press's slight beginnings that may have been taken for the ambient field."""
+"""µT rms of the slight onset of a press that may have been taken for the ambient field."""
 COVERED_UT = 7.0
-"""The same while the field turns and every chip bears something, or a contact just changes: which
-is which is not known at once."""
+"""The same while the field turns and every chip is loaded or a contact is changing: the two cannot
+be told apart at once."""
 UNKNOWN_UT = 60.0
-"""µT rms a component, where the ambient field is not known at all: the earth's, turned."""
+"""µT rms per component of an unknown ambient field: the earth's, turned."""
 LONGEST_GAP_S = 5.0
-"""s: after a longer gap the field of the room may be anything that the earth's can."""
+"""s; longer gaps count as this long, which already allows any field of the earth."""
 
 
 class ConsensusCompensator:
-    """Our method; see `Compensator`. A fit in every cycle, or one a period and checks between."""
+    """The default method: a fit in every cycle, or one per period with checks between."""
 
     def __init__(self, layout: Layout, consensus: Consensus, period_s: float) -> None:
         self._consensus = consensus
         self._period = round(period_s * NS_PER_S)
         self._tracker = FieldTracker(layout, "consensus", borrows=True)
         self._fitted: Instant | None = None
-        self._sound = False  # the last fit was valid on every array: it can be followed
+        self._sound = False  # whether the last fit was valid on every array, to continue from
 
     def set_noise(self, noise_ut: FloatArray) -> None:
-        """Noise of one sample, (3,) µT rms in chip axes."""
+        """Set the noise of one sample, (3,) µT rms in chip axes."""
         self._consensus.set_noise(noise_ut)
         self._tracker.sample_sigma = self._consensus.sample_sigma
 
@@ -56,7 +56,7 @@ class ConsensusCompensator:
     def update(
         self, field_ee: FloatArray, forces: FloatArray, healthy: Bool, captured: Instant
     ) -> Estimate:
-        """Estimate for one cycle."""
+        """Estimate the ambient field of one cycle; see `Compensator.update`."""
         if self._fitted is None or captured - self._fitted >= self._period:
             prior = self._tracker.prior(captured)
             fit = None
@@ -73,9 +73,9 @@ class ConsensusCompensator:
 
 
 class SmallArrays:
-    """Arrays of fewer than `PLANE_TAXELS` taxels, each by itself; see `SmallArray`.
+    """Compensates each array of fewer than `PLANE_TAXELS` taxels on its own; see `SmallArray`.
 
-    ``rest``: the method of the board's other arrays; None where it has none.
+    ``rest``: the method for the board's other arrays; None when there are none.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class SmallArrays:
         self.reset()
 
     def set_noise(self, noise_ut: FloatArray) -> None:
-        """Noise of one sample, (3,) µT rms in chip axes."""
+        """Set the noise of one sample, (3,) µT rms in chip axes."""
         if self._rest is not None:
             self._rest.set_noise(noise_ut)
         for a, array in self._arrays.items():
@@ -95,7 +95,7 @@ class SmallArrays:
             array.set_noise(np.sqrt(turn**2 @ noise_ut**2))
 
     def reset(self, rested: bool = False) -> None:
-        """Nothing touches; after a tare the ambient field is zero, else it is unknown."""
+        """Start without contact; the ambient field is zero after a tare, else unknown."""
         arrays = self._layout.arrays
         self._theta = np.zeros((arrays, 3, 3))
         self._last: Instant | None = None
@@ -108,7 +108,7 @@ class SmallArrays:
     def update(
         self, field_ee: FloatArray, forces: FloatArray, healthy: Bool, captured: Instant
     ) -> Estimate:
-        """Estimate for one cycle."""
+        """Estimate the ambient field of one cycle; see `Compensator.update`."""
         layout, model = self._layout, self._model
         elapsed = 0.0 if self._last is None else (captured - self._last) / NS_PER_S
         elapsed = min(max(elapsed, 1e-4), LONGEST_GAP_S)
@@ -156,7 +156,7 @@ class SmallArrays:
 
 
 def make_compensator(settings: PipelineSettings, layout: Layout, model: ForceModel) -> Compensator:
-    """Compensator that ``settings`` ask for."""
+    """Make the compensator that ``settings`` name."""
     if settings.method == "off":
         return Off(layout)
     if settings.method == "consensus" and (layout.counts < PLANE_TAXELS).any():

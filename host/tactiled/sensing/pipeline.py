@@ -33,24 +33,24 @@ from tactiled.sensing.rest import (
 )
 from tactiled.sensing.settings import PipelineSettings
 
-# Blocks of the arrays of one board put together into sampling cycles, by sequence number.
+# Grouping: the blocks of a board's arrays are joined into sampling cycles by sequence number.
 
 
 HALF = 1 << 31
-"""Sequence numbers are 32 bits and wrap: a step of less than half the circle is forwards."""
+"""Sequence numbers are 32 bits and wrap: a step of less than half the range is forward."""
 LATE_RUN = 8
-"""Late blocks in a row, none of them repeated, after which the board must have begun anew: links
-reorder a block or two, a restarted board never stops being late."""
+"""Late blocks in a row, none of them repeated, after which the board must have restarted: links
+reorder a block or two, while a restarted board stays late."""
 
 
 @dataclass(slots=True)
 class CycleCounters:
-    """What became of every block and cycle since the pipeline was made.
+    """Counts of blocks and cycles since the pipeline was made.
 
-    ``cycles`` came out, ``incomplete_cycles`` of them with ``missing_blocks`` arrays absent;
-    ``lost_cycles`` never came at all (gaps in the sequence). Blocks that were not used:
-    ``duplicate_blocks``, ``late_blocks`` (their cycle was already out), ``unknown_array``,
-    ``wrong_shape``. ``restarts``: the sequence went back for good.
+    ``cycles``: cycles made, ``incomplete_cycles`` of them without all arrays; ``missing_blocks``:
+    how many arrays they lacked. ``lost_cycles``: gaps in the sequence. Blocks not used:
+    ``duplicate_blocks``, ``late_blocks`` (their cycle was already made), ``unknown_array``,
+    ``wrong_shape``. ``restarts``: times the sequence started over.
     """
 
     cycles: int = 0
@@ -66,7 +66,7 @@ class CycleCounters:
 
 @dataclass(slots=True)
 class Group:
-    """Blocks of one cycle; ``blocks`` has a place for every array of the board."""
+    """Blocks of one cycle; ``blocks`` has an entry for every array, None while missing."""
 
     sequence: int
     blocks: list[SampleBlock | None]
@@ -74,7 +74,7 @@ class Group:
 
 
 class Grouper:
-    """Holds the blocks of the one cycle that is under way; nothing else is ever kept."""
+    """Holds the blocks of the cycle under way, and nothing else."""
 
     def __init__(self, taxels: tuple[int, ...]) -> None:
         self._taxels = taxels
@@ -84,7 +84,7 @@ class Grouper:
         self.counters = CycleCounters()
 
     def feed(self, block: SampleBlock) -> list[Group]:
-        """Cycles that this block completes or, by being of a later one, ends: at most two."""
+        """Cycles that this block completes or ends by belonging to a later one: at most two."""
         count = self.counters
         if not 0 <= block.array < len(self._taxels):
             count.unknown_array += 1
@@ -120,11 +120,11 @@ class Grouper:
         return out
 
     def flush(self) -> list[Group]:
-        """The cycle under way, as it stands; for the end of a stream."""
+        """The cycle under way, even if incomplete; for the end of a stream."""
         return [] if self._open is None else [self._close(self._open)]
 
     def reset(self) -> None:
-        """Forget the sequence and the cycle under way: the board begins anew."""
+        """Forget the sequence and the cycle under way: the board has restarted."""
         self._open = None
         self._last = None
         self._late_run = 0
@@ -140,7 +140,7 @@ class Grouper:
         return group
 
     def _late(self, block: SampleBlock) -> list[Group]:
-        """Count a block that came too late; a run of them is a board that begins anew."""
+        """Count a block that came too late; a run of them means that the board has restarted."""
         if block.sequence == self._last and self._open is None:
             self.counters.duplicate_blocks += 1
             return []
@@ -162,12 +162,12 @@ def _fits(block: SampleBlock, taxels: int) -> bool:
 
 
 def _step(earlier: int, later: int) -> int:
-    """Signed steps from one 32-bit sequence number to another."""
+    """Signed number of steps from one 32-bit sequence number to another."""
     return (later - earlier + HALF) % (1 << 32) - HALF
 
 
 def gather_temperature(group: Group) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Temperatures of a cycle, °C, one an array or one a taxel as they came; NaN where missing."""
+    """Temperatures of a cycle, °C: per array or per taxel, as sent; NaN for a missing array."""
     parts = [
         np.array([np.nan]) if b is None else np.asarray(b.temperature_c, np.float64)
         for b in group.blocks
@@ -181,9 +181,10 @@ Bool = NDArray[np.bool_]
 
 
 class BoardPipeline:
-    """Pure and deterministic: the same blocks give the same cycles to the bit.
+    """Turns sample blocks of one board into cycles.
 
-    Memory and time of a cycle do not depend on how many came before.
+    Pure and deterministic: the same blocks give the same cycles bit for bit. Memory, and time per
+    cycle, are constant.
     """
 
     def __init__(
@@ -210,7 +211,7 @@ class BoardPipeline:
         self._names = tuple(a.name for a in geometry.arrays)
         self._reference_c = [a.reference_c for a in calibration.arrays]
         self._tip_arrays = [i for i, a in enumerate(geometry.arrays) if a.side.name == "TIP"]
-        # how long a small array's field may be held is a matter of its bound alone
+        # for small arrays the bound alone limits how long a fit may be held
         self._hold = np.where(layout.counts < PLANE_TAXELS, np.inf, settings.hold_s).tolist()
         self._bounds = Bounds(self._model, layout, calibration.nominal)
         self._watch = RestWatch(layout, self._model, [a.name for a in geometry.arrays])
@@ -249,12 +250,12 @@ class BoardPipeline:
 
     @property
     def counters(self) -> CycleCounters:
-        """What became of every block and cycle so far."""
+        """Counts of blocks and cycles so far."""
         return self._grouper.counters
 
     @property
     def health(self) -> NDArray[np.uint8]:
-        """(N,) uint8 of `TaxelHealth` in the last cycle; all missing before the first."""
+        """(N,) uint8 of `TaxelHealth` in the last cycle; all MISSING before the first."""
         return self._health
 
     @property
@@ -264,12 +265,12 @@ class BoardPipeline:
 
     @property
     def tare_report(self) -> TareReport | None:
-        """What the last tare that ended did; None before the first."""
+        """Report of the last tare that ended; None before the first."""
         return self._rest.report
 
     @property
     def rest_state(self) -> RestState:
-        """What is known of the rest field."""
+        """State of the rest field."""
         return self._rest.state
 
     @property
@@ -280,22 +281,21 @@ class BoardPipeline:
     def tare(self, force: bool = False) -> None:
         """Begin a tare: the mean field of the next cycles becomes the rest field.
 
-        It ends by itself within ten times ``tare_s``; `tare_report` then says what it did. It is
-        refused, and nothing changed, when the field moves or a taxel bears more than
-        ``tare_limit_n``; less than that cannot be told from the drift that taring is there for.
-        ``force``: it is not refused.
+        It ends within ten times ``tare_s``; `tare_report` then holds its result. It is refused,
+        and nothing changes, when the field moves or a taxel bears more than ``tare_limit_n``; less
+        than that cannot be told from the drift that taring corrects. ``force``: never refuse.
         """
         self._rest.begin(self._noise, force)
 
     def forget_rest(self, reason: Reason) -> None:
-        """Another board or skin may be there: its rest field is unknown until it was tared."""
+        """Drop the rest field and tare anew: the board or skin may have been exchanged."""
         self._forgotten = reason
         self.reset()
         self._rest.forget()
         self._rest.begin(self._noise)
 
     def rest_to_record(self) -> RecordedRest | None:
-        """The rest field in force and what is known with it; None before the first tare."""
+        """The rest field in use, for the log; None before the first tare."""
         rest = self._rest
         if not rest.known:
             return None
@@ -309,7 +309,7 @@ class BoardPipeline:
         )
 
     def restore_rest(self, state: RecordedRest) -> None:
-        """Go on from a rest field that was in force before; ValueError when it does not fit."""
+        """Use a recorded rest field; ValueError when it does not fit."""
         rest_ut, unrested = np.array(state.rest_ut), np.array(state.unrested, dtype=bool)
         noise = np.array(state.noise_ut)
         if rest_ut.shape != self._rest.rest_ut.shape or noise.shape != self._noise.shape:
@@ -326,7 +326,7 @@ class BoardPipeline:
         self._apply_noise(noise)
 
     def reset(self) -> None:
-        """The board began anew: forget sequence, contacts and fits, keep the rest field."""
+        """Forget sequence, contacts and fits, but keep the rest field: the board has restarted."""
         self._grouper.reset()
         self._monitor.reset()
         self._compensator.reset()
@@ -340,7 +340,7 @@ class BoardPipeline:
             self._rest.begin(self._noise)
 
     def feed(self, block: SampleBlock) -> list[Cycle]:
-        """Cycles that ``block`` ends: none, one, or two when it also ends an incomplete one."""
+        """Process a block; returns the cycles that it ends: up to two, one of them incomplete."""
         return [
             self._cycle(group)
             for part in block.split(self._sizes)
@@ -348,7 +348,7 @@ class BoardPipeline:
         ]
 
     def flush(self) -> list[Cycle]:
-        """The cycle under way, as it stands; for the end of a stream."""
+        """The cycle under way, even if incomplete; for the end of a stream."""
         return [self._cycle(group) for group in self._grouper.flush()]
 
     def _cycle(self, group: Group) -> Cycle:
@@ -360,9 +360,9 @@ class BoardPipeline:
         fault = self._monitor.fault
         rest = self._rest
         monitor = self._monitor
-        if monitor.revived is not monitor.restored:  # both are one and the same mask, all False
+        if monitor.revived is not monitor.restored:  # usually both are the same all-False mask
             rest.unrested = (rest.unrested | monitor.revived) & ~monitor.restored
-        known = rest.known  # before: a first tare takes effect from the next cycle on
+        known = rest.known  # read before taring: a first tare takes effect from the next cycle
         field = model.taxel_field(raw, temperature)
         if rest.taring and not (self._watch.off and rest.suspicion is not None):
             whole = bool(present.all())
@@ -383,7 +383,7 @@ class BoardPipeline:
         healthy = layout.real
         if sick:
             healthy = layout.real & (health == 0)
-            # what an unhealthy taxel reads must not leak into its neighbours' forces
+            # an unhealthy taxel's reading must not leak into its neighbours' forces
             np.copyto(field, model.plane_field(self._theta), where=~healthy[:, None])
         forces = model.forces(field)
         if known:
@@ -412,7 +412,7 @@ class BoardPipeline:
         if not all(block.clock_usable for block in blocks):
             reasons, valid = (why.CLOCK_UNUSABLE, *reasons), False
         if sick and known:
-            normal = np.abs(force[:, 2])  # NaN where masked: not felt
+            normal = np.abs(force[:, 2])  # NaN where masked, so never above a threshold
             more, enough = self._masking.judge(layout.flat(fault), normal > self._features.least_n)
             reasons, valid = (*reasons, *more), valid and enough
         tip_usable = valid or (known and self._tip_usable(estimate, present))
@@ -456,10 +456,13 @@ class BoardPipeline:
         )
 
     def _collect(self, group: Group) -> tuple[FloatArray, FloatArray, NDArray[np.uint8], Bool]:
-        """Blocks of a cycle in padded arrays; missing ones are zero and marked by ``present``."""
+        """Copy the blocks of a cycle into padded arrays; `False` in ``present``: array missing.
+
+        Returns raw (A, 3, n) µT in chip axes, temperature (A, n) °C, status (A, n), present (A,).
+        """
         shape = (self._layout.arrays, self._layout.width)
         raw = np.zeros((shape[0], 3, shape[1]))
-        temperature = np.full(shape, 25.0)  # in the padding, so that it is never out of range
+        temperature = np.full(shape, 25.0)  # so that the padding is never out of range
         status = np.zeros(shape, np.uint8)
         present = np.ones(shape[0], dtype=bool)
         for a, block in enumerate(group.blocks):
@@ -468,7 +471,7 @@ class BoardPipeline:
                 continue
             n = len(block.status)
             raw[a, :, :n] = block.field_ut.T
-            # Boards that send none are taken to be as warm as at their calibration.
+            # Boards without thermometers are assumed to be as warm as at their calibration.
             told = block.temperature_c if block.thermometer else self._reference_c[a]
             temperature[a, :n] = told
             status[a, :n] = block.status
@@ -479,7 +482,7 @@ class BoardPipeline:
     def _reasons(
         self, estimate: Estimate, healthy: Bool, present: Bool, known: bool
     ) -> tuple[tuple[Reason, ...], bool]:
-        """Why features are degraded, and whether they are valid all the same."""
+        """Why features are degraded, and whether they are still valid."""
         reasons: list[Reason] = []
         valid = True
         if not known:
@@ -531,7 +534,7 @@ class BoardPipeline:
         captured: Instant,
         sequence: int,
     ) -> None:
-        """Take one cycle into the tare under way; its end begins contacts and fits anew."""
+        """Add one cycle to the tare under way; at its end, contacts and fits are reset."""
         healthy = self._layout.real & (health == 0)
         usable = np.where(healthy[:, None], field, 0.0)
         before = self._model.rest.copy()
@@ -556,7 +559,7 @@ class BoardPipeline:
         self._apply_noise(report.noise_ut)
 
     def _settle_rest(self, temperature: FloatArray) -> None:
-        """A rest field has just come into force."""
+        """Note that a rest field has just been set, at this temperature, (A, n) °C."""
         self._model.rested_at(temperature)
         self._bounds.set_rest(self._layout.flat_vectors(self._model.rest))
 
@@ -568,18 +571,18 @@ class BoardPipeline:
         healthy: Bool,
         captured: Instant,
     ) -> None:
-        """See whether the rest field is still what it was."""
+        """Check whether the rest field is still right."""
         reason = self._watch.judge(field, forces, estimate, healthy, captured)
         if self._rest.rough:
-            return  # it is known to be wrong as it is
+            return  # a rough rest field is wrong anyway
         if reason is not None:
             self._rest.suspect(reason, self._noise)
         elif self._rest.suspicion is not None and self._watch.restored(forces, estimate, healthy):
             self._rest.trust()
 
     def _feel_warmth(self, temperature: FloatArray, healthy: Bool) -> None:
-        """What the warming since the tare may look like, from the taxels' own thermometers."""
-        # a masked chip's thermometer says nothing
+        """Estimate the drift since the tare from the taxels' own thermometers."""
+        # the thermometer of a masked chip cannot be trusted
         warmer = self._layout.flat(np.where(healthy, self._model.warmer(temperature), 0.0))
         if float(np.abs(warmer - self._warmer).max()) > WARMING_STEP_K:
             self._warmer = warmer.copy()
@@ -587,13 +590,16 @@ class BoardPipeline:
             self._set_thresholds()
 
     def _set_thresholds(self) -> None:
-        """Contact begins where neither noise nor warming explains it."""
+        """Set the contact thresholds above both noise and thermal drift."""
         self._features.set_noise(np.hypot(self._sigma, WARMING_SIGMAS * self._drift))
 
     def _bound(
         self, features: Features, estimate: Estimate, force: FloatArray, known: bool
     ) -> tuple[Features, FloatArray]:
-        """Features with their bounds, not valid where those are too wide; bounds of the taxels."""
+        """Add bounds to the features, which are not valid where these are too wide.
+
+        Returns them with the bounds of the taxels' normal forces, (N,) N.
+        """
         if not known:
             return features, np.full(len(force), np.nan)
         bounds, extractor = self._bounds, self._features
@@ -608,7 +614,8 @@ class BoardPipeline:
         if peak > limit or (bounds.few and normal > limit):
             valid = False
             reasons = (*reasons, self._doubt(max(peak, normal)))
-        # contacts too slight to be seen are no matter for what acts on half a newton
+        # added after the check of validity: contacts too slight to be detected do not matter to a
+        # strategy that acts on half a newton
         if not extractor.summed:
             peak = math.hypot(peak, unseen)
         else:
@@ -626,19 +633,19 @@ class BoardPipeline:
         return features, normal_bound
 
     def _doubt(self, bound: float) -> Reason:
-        """What most of the uncertainty comes from."""
+        """The reason for the largest part of the uncertainty."""
         warmest = float(self._warmer[np.argmax(np.abs(self._warmer))])
         if QUANTILE_95 * float(self._drift.max()) > 0.5 * self.settings.bound_limit_n:
             return why.too_warm(warmest)
         return why.uncertain(self._names[self._features_array()], bound)
 
     def _features_array(self) -> int:
-        """The array of the peak force."""
+        """Index of the array with the peak force."""
         ends = np.cumsum(self._layout.counts)
         return int(np.searchsorted(ends, self._features.peak_taxel, side="right"))
 
     def _rest_late(self, field: FloatArray, late: Bool, untouched: bool, captured: Instant) -> None:
-        """Let chips that came late have a rest field once nothing touches the skin."""
+        """Give chips that came late a rest field once nothing touches the skin."""
         if not (untouched and late.any()):
             self._late.forget()
             return
@@ -650,7 +657,8 @@ class BoardPipeline:
             self._bounds.set_rest(self._layout.flat_vectors(self._model.rest))
 
     def _apply_noise(self, noise: FloatArray) -> None:
-        """Noise of one sample, (3,) µT in chip axes, sets the thresholds of contact and fit."""
+        """Set the thresholds of contact and fit from the noise of one sample, (3,) µT rms in chip
+        axes."""
         self._noise = np.maximum(noise, MIN_NOISE_UT)
         self._monitor.set_noise(self._noise)
         self._sigma = self._layout.flat(self._model.normal_sigma(self._noise))
@@ -661,7 +669,7 @@ class BoardPipeline:
     def _follow_rest(
         self, field: FloatArray, estimate: Estimate, healthy: Bool, captured: Instant
     ) -> None:
-        """Let the rest of untouched taxels follow what compensation left over."""
+        """Let the rest field of untouched taxels track what compensation leaves."""
         period = self.settings.rest_tracking_s
         if period is None or self._last_captured is None:
             return
@@ -670,7 +678,7 @@ class BoardPipeline:
         self._rest.follow(field - self._model.plane_field(estimate.theta), free, share)
 
     def _due(self, captured: Instant) -> bool:
-        """Whether this cycle's features are to be sent, at ``feature_rate_hz``."""
+        """Whether to send this cycle's features, by ``feature_rate_hz``."""
         rate = self.settings.feature_rate_hz
         if rate is None:
             return True
@@ -685,11 +693,11 @@ class BoardPipeline:
 
 
 BESIDE = 0.5
-"""Share of what is too slight to be seen by itself that may be there beside a contact that is."""
+"""Share of the detection threshold that undetected force beside a detected contact may have."""
 WARMING_STEP_K = 0.5
-"""K of warming after which bounds and thresholds are worked out anew."""
+"""K of warming after which bounds and thresholds are computed anew."""
 WARMING_SIGMAS = 0.5
-"""Weight of an unknown drift in a taxel's noise: a contact then begins at 2.25 sigma of it."""
+"""Weight of the unknown drift in a taxel's noise: contact then begins at 2.25 sigma of it."""
 MIN_NOISE_UT = 0.3
-"""µT below which noise is not believed: an int16 of the finest scale alone makes 0.04, but chips
-differ by 3 % in a field of tens of µT and that looks like noise to a fit."""
+"""µT, least noise assumed: an int16 of the finest scale alone makes 0.04, but chips differ by 3 %
+in a field of tens of µT, which looks like noise to a fit."""

@@ -1,7 +1,7 @@
-"""Compensation as in the paper: a RANSAC plane per component and array, at a period.
+"""Compensation as in the paper: a RANSAC plane per component and array, once per period.
 
-scikit-learn draws and fits one surface at a time, some milliseconds each, so the surfaces of one
-period are fitted in the cycles of that period one after another instead of all in one cycle.
+scikit-learn fits one surface at a time, which takes some milliseconds, so the surfaces of a period
+are spread over its cycles instead of being fitted all in one.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from tactiled.sensing.layout import Layout
 Bool = NDArray[np.bool_]
 
 MIN_TAXELS = 4
-"""Healthy taxels below which there is nothing to draw three from and check on another."""
+"""Fewest healthy taxels: three for a plane and another to check it."""
 
 
 class RansacCompensator:
-    """The paper's method; see `Compensator`. Whether the planes in force are borne out is checked
-    in every cycle, by the same measure as for consensus.
+    """The paper's method. In every cycle the support of the planes in use is checked, by the same
+    measure as for consensus.
     """
 
     def __init__(
         self, layout: Layout, checker: Consensus, period_s: float, rng: np.random.Generator
     ) -> None:
         from tactiled.sensing.ransac_plane import (
-            fit_plane,  # scikit-learn: 1.1 s, only when asked for
+            fit_plane,  # imports scikit-learn, 1.1 s, so only when the method is used
         )
 
         self._fit_plane = fit_plane
@@ -44,7 +44,7 @@ class RansacCompensator:
         self.reset()
 
     def set_noise(self, noise_ut: FloatArray) -> None:
-        """Noise of one sample, (3,) µT rms in chip axes."""
+        """Set the noise of one sample, (3,) µT rms in chip axes."""
         self._checker.set_noise(noise_ut)
         self._tracker.sample_sigma = self._checker.sample_sigma
 
@@ -59,11 +59,11 @@ class RansacCompensator:
     def update(
         self, field_ee: FloatArray, forces: FloatArray, healthy: Bool, captured: Instant
     ) -> Estimate:
-        """Estimate for one cycle."""
+        """Estimate the ambient field of one cycle; see `Compensator.update`."""
         surfaces = 3 * self._layout.arrays
         due = 0
         if self._begun is None:
-            self._begun, due = captured, surfaces  # all at once: there is nothing to go by yet
+            self._begun, due = captured, surfaces  # all at once: there are no planes yet
         elif self._done == surfaces:
             if captured - self._begun >= self._period:
                 self._begun, self._done, due = captured, 0, 1
@@ -77,7 +77,7 @@ class RansacCompensator:
         return self._tracker.take(held, captured, fresh=False)
 
     def _fit_surfaces(self, upto: int, field: FloatArray, healthy: Bool) -> bool:
-        """Fit surfaces until ``upto`` of them are done; True when that ends the period's round."""
+        """Fit surfaces until ``upto`` of them are done; True when that completes the period."""
         surfaces = 3 * self._layout.arrays
         if self._done >= upto:
             return False

@@ -1,4 +1,4 @@
-"""scikit-learn's RANSAC for one surface. Importing this module costs 1.1 s: only when asked for."""
+"""scikit-learn's RANSAC for one surface. Importing this takes 1.1 s: do so only when needed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAX_TRIALS = 100
 
 
 class Plane(RegressorMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn has no types
-    """Least-squares plane; what `LinearRegression` gives, without its checks: ten times faster."""
+    """Least-squares plane as by `LinearRegression`; without its checks it is ten times faster."""
 
     def fit(self, surface: FloatArray, values: FloatArray) -> Plane:
         """Fit ``values`` (k,) at ``surface`` (k, 2)."""
@@ -27,7 +27,7 @@ class Plane(RegressorMixin, BaseEstimator):  # type: ignore[misc]  # scikit-lear
         return self
 
     def predict(self, surface: FloatArray) -> FloatArray:
-        """(k,) heights of the plane at ``surface`` (k, 2)."""
+        """Heights of the plane, (k,), at ``surface`` (k, 2)."""
         heights: FloatArray = self.intercept_ + surface @ self.coef_
         return heights
 
@@ -37,8 +37,8 @@ def fit_plane(
 ) -> FloatArray | None:
     """RANSAC plane through ``values`` (n,) at ``surface`` (n, 2): (3,) height at 0 and slopes.
 
-    None when there is no consensus. ``plain``: with `LinearRegression`, scikit-learn's default,
-    in place of `Plane`.
+    None when there is no consensus. ``plain``: use scikit-learn's default, `LinearRegression`,
+    instead of `Plane`.
     """
     regressor = RANSACRegressor(
         LinearRegression() if plain else Plane(),
@@ -48,7 +48,7 @@ def fit_plane(
     )
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a score of two samples, trials in vain: no matter
+            warnings.simplefilter("ignore")  # scores of two samples and failed trials are expected
             regressor.fit(surface, values)
     except ValueError:  # "RANSAC could not find a valid consensus set"
         return None

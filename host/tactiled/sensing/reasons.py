@@ -1,7 +1,7 @@
-"""Every reason for which features are degraded or not valid: a stable code, words and remedy.
+"""Reasons why features are degraded or not valid: a stable code, and a text with the remedy.
 
-Programs act on codes, people read texts; `docs/faults` lists them. A code never changes its
-meaning. Those that concern one array end in ``:name``.
+Codes are for programs, texts for people; docs/faults.md lists them. A code never changes its
+meaning. Codes that concern one array end in ``:name``.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from tactiled.blocks import Reason, TaxelHealth
 
-# What can be wrong with a chip's reading: codes, the health bits that go with them, and words.
+# Faults of a chip's reading: codes, texts and health bits.
 
 
 UInt8 = NDArray[np.uint8]
 
 
 class Fault(IntEnum):
-    """Why a taxel is masked, in more detail than `TaxelHealth`; what is first found counts."""
+    """Why a taxel is masked, in more detail than `TaxelHealth`; the first fault found counts."""
 
     NONE = 0
     MISSING = 1
@@ -47,7 +47,7 @@ class Fault(IntEnum):
 
     @property
     def text(self) -> str:
-        """What the chip does, after its name."""
+        """What the chip does; follows its name in messages."""
         return _WORDS[self][0]
 
     @property
@@ -134,22 +134,22 @@ MODEL_PAUSED = Reason(
 
 
 def array_missing(array: str) -> Reason:
-    """An array's samples did not come in this cycle."""
+    """An array's samples are missing from this cycle."""
     return Reason(f"array_missing:{array}", f"array {array} missing: check its cable")
 
 
 def taxels_masked(array: str, share: float) -> Reason:
-    """More of an array's taxels are masked than features can do without."""
+    """Too many of an array's taxels are masked."""
     return Reason(f"taxels_masked:{array}", f"taxels masked: {array} {share:.0%}")
 
 
 def compensation_borrowed(array: str) -> Reason:
-    """The array's ambient field is carried on by what the board's other arrays see."""
+    """The array's ambient field is updated from the board's other arrays."""
     return Reason(f"compensation_borrowed:{array}", f"compensation borrowed: {array}")
 
 
 def compensation_held(array: str) -> Reason:
-    """The array's last good fit is still in force."""
+    """The array's last good fit is still in use."""
     return Reason(f"compensation_held:{array}", f"compensation held: {array}")
 
 
@@ -161,7 +161,7 @@ def compensation_invalid(array: str) -> Reason:
 
 
 def uncertain(array: str, bound_n: float) -> Reason:
-    """The bound of the forces has passed the limit of the settings."""
+    """The bound of the forces exceeds the limit of the settings."""
     return Reason(
         f"uncertain:{array}",
         f"forces of {array} uncertain by {bound_n:.1f} N: the ambient field is not seen under "
@@ -170,14 +170,14 @@ def uncertain(array: str, bound_n: float) -> Reason:
 
 
 def too_warm(kelvin: float) -> Reason:
-    """The temperature has changed more than an unknown drift allows."""
+    """The temperature has changed by more than an unknown drift allows."""
     return Reason(
         "temperature_moved", f"temperature moved by {kelvin:+.0f} K since the tare: tare again"
     )
 
 
 def field_jump(size_ut: float) -> Reason:
-    """The field of all taxels has leapt at once, by more than the earth's can change."""
+    """The field of all taxels has jumped at once, by more than the earth's can change."""
     return Reason(
         "field_jump",
         f"field changed on all taxels at once by {_field(size_ut)}: magnet near, or skin changed; "
@@ -215,12 +215,12 @@ def _field(size_ut: float) -> str:
 
 
 def chip_masked(array: str, chip: int, fault: Fault) -> Reason:
-    """A chip of a board of few is masked; its neighbours feel nothing."""
+    """A chip of a small array is masked, and its neighbours bear no force."""
     return Reason(f"chip_masked:{array}", f"chip {chip} of {array} {fault.text}")
 
 
 def masked_contact(array: str, taxels: list[int]) -> Reason:
-    """A contact at or beside masked taxels: what they bear is not known."""
+    """There is a contact at or beside masked taxels, whose force is unknown."""
     which = ", ".join(str(taxel) for taxel in taxels[:3]) + (", …" if len(taxels) > 3 else "")
     several = "s" if len(taxels) > 1 else ""
     return Reason(

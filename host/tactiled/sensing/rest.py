@@ -1,4 +1,4 @@
-"""The rest field while a pipeline runs: whether it is known, how it is tared, how it drifts."""
+"""The rest field while a pipeline runs: taring, tracking its drift, and checking it."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ from tactiled.sensing.forces import ForceModel
 from tactiled.sensing.layout import Layout
 from tactiled.sensing.settings import PipelineSettings
 
-# Taring: what the untouched, unmoving skin reads becomes its rest field.
+# Taring: the reading of the untouched, still skin becomes its rest field.
 
 
 Bool = NDArray[np.bool_]
 
 MIN_CYCLES = 8
-"""Fewest cycles of a tare: the mean then has a third of one sample's noise, and the spread of the
-samples says what that noise is."""
+"""Fewest cycles of a tare: enough for the mean to have a third of one sample's noise, and to
+measure that noise."""
 MAX_WAIT_RATIO = 10.0
-"""A tare that has not got its cycles after this many times its length is refused,"""
+"""A tare still short of cycles after this many times its length is refused, ..."""
 MAX_WAIT_CYCLES = 4 * MIN_CYCLES
-"""but not before so many came, whole or not: a slow board takes longer for them."""
+"""... but not before this many came, complete or not: a slow board takes longer."""
 STILL_SIGMAS = 6.0
-"""First and second half may differ by this many standard errors before the skin counts as moving:
-with 240 channels chance alone gives 4."""
+"""Standard errors by which first and second half may differ before the skin counts as moving: with
+240 channels chance alone gives 4."""
 STILL_FLOOR_UT = 2.0
-"""µT that the halves may differ in any case: two LSB and slow temperature drift."""
+"""µT by which the halves may always differ: two LSB and slow thermal drift."""
 NOISY_RATIO = 4.0
-"""Spread of a channel beyond this many times the expected noise is motion, not noise."""
+"""A channel that varies by more than this many times the expected noise is moving."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TareReport:
-    """What a tare did, or why it was refused.
+    """Result of a tare, or why it was refused.
 
-    ``shift_ut``: largest change of a rest field, µT. ``noise_ut``: (3,) µT rms measured.
+    ``shift_ut``: largest change of the rest field, µT. ``noise_ut``: (3,) measured noise, µT rms.
     """
 
     accepted: bool
@@ -58,7 +58,7 @@ class TareReport:
 
 
 class Tare:
-    """Sums of the cycles of one tare; constant memory. ``expected``: (3,) µT rms of one sample."""
+    """Running sums of one tare; constant memory. ``expected``: (3,) noise of one sample, µT rms."""
 
     def __init__(self, shape: tuple[int, ...], seconds: float, noise_ut: FloatArray) -> None:
         self._seconds = seconds
@@ -66,13 +66,13 @@ class Tare:
         self._start: Instant | None = None
         self._sums = np.zeros((2, *shape))
         self._squares = np.zeros(shape)
-        self._pivot = np.zeros(shape)  # the first cycle: sums of differences keep their digits
+        self._pivot = np.zeros(shape)  # the first cycle: sums of differences from it stay precise
         self._counts = [0, 0]
         self._offered = 0
         self._healthy = np.ones((shape[0], shape[2]), dtype=bool)
 
     def again(self) -> Tare:
-        """A fresh tare of the same kind."""
+        """A new tare with the same settings."""
         return Tare(self._squares.shape, self._seconds, self.expected)
 
     @property
@@ -82,17 +82,17 @@ class Tare:
 
     @property
     def mean(self) -> FloatArray:
-        """(A, 3, n) µT, mean of the cycles taken, at least one."""
+        """Mean of the cycles taken, of which there must be one; (A, 3, n) µT."""
         mean: FloatArray = self._pivot + self._sums.sum(axis=0) / self.cycles
         return mean
 
     @property
     def healthy(self) -> Bool:
-        """(A, n) taxels that were healthy in every cycle taken."""
+        """(A, n) whether a taxel was healthy in every cycle taken."""
         return self._healthy
 
     def add(self, field: FloatArray, healthy: Bool, whole: bool, captured: Instant) -> bool:
-        """Take one cycle, unless an array was missing from it; True when the tare is over."""
+        """Add one cycle, unless an array is missing from it; True when the tare is over."""
         if self._start is None:
             self._start = captured
         elapsed = seconds_between(self._start, captured)
@@ -111,7 +111,7 @@ class Tare:
         return enough or waited
 
     def trouble(self) -> str | None:
-        """Why the cycles taken cannot be a rest field; None when they can."""
+        """Why the cycles taken do not give a rest field; None when they do."""
         if min(self._counts) < MIN_CYCLES // 2:
             return f"only {self.cycles} whole cycles came"
         if not self._healthy.any():
@@ -128,7 +128,7 @@ class Tare:
         return None
 
     def noise(self) -> FloatArray:
-        """(3,) µT rms of one sample in x, y, z: median over taxels healthy throughout."""
+        """Noise of one sample in x, y, z, (3,) µT rms: median over taxels healthy throughout."""
         noise: FloatArray = np.median(self._spread().swapaxes(1, 2)[self._healthy], axis=0)
         return noise
 
@@ -139,15 +139,15 @@ class Tare:
         return spread
 
 
-# The rest field as a log keeps it, so that a later file of the log can be run by itself.
+# The rest field as stored in a log, so that a later file of the log can be reprocessed alone.
 
 
 class RecordedRest(msgspec.Struct, frozen=True):
-    """What taring has found. ``rest_ut``: µT, by array, axis and taxel (padded to the widest).
+    """A rest field in a log. ``rest_ut``: µT by array, axis and taxel, padded to the widest array.
 
-    ``unrested``: taxels without a rest field; ``noise_ut``: of one sample, three axes; ``rough``:
-    it was taken while the skin moved. ``bare``: taxels that have lost their magnet. ``rested_c``:
-    °C at which it was taken, by array and taxel; empty where that is not known.
+    ``unrested``: taxels without a rest field. ``noise_ut``: noise of one sample by axis, µT rms.
+    ``rough``: taken while the skin moved. ``bare``: taxels that have lost their magnet.
+    ``rested_c``: temperature at which it was taken, °C by array and taxel; empty when unknown.
     """
 
     rest_ut: list[list[list[float]]]
@@ -158,47 +158,47 @@ class RecordedRest(msgspec.Struct, frozen=True):
     rested_c: list[list[float]] = []
 
 
-# Whether the rest field is still what it was: changes that no contact makes.
+# Checks of the rest field: changes that no contact can make.
 #
-# Each cycle is held against the signatures of a skin that was lifted or exchanged, a magnet that
-# was lost, a chip whose gain was changed, and a field that leapt on all taxels at once. What is
-# found makes the rest field *suspect*; where the field comes back to what it was, the suspicion is
-# dropped.
+# Each cycle is compared with the signatures of a skin that was lifted or exchanged, a lost magnet,
+# a changed gain, and a jump of the field on all taxels at once. A match makes the rest field
+# *suspect*; when the field returns to what it was, the suspicion is dropped.
 
 
 BARE_UT = 130.0
-"""µT, most that a chip without a magnet reads: the earth's 65, and as much of what is near."""
+"""µT, most that a chip without a magnet reads: the earth's 65, and as much from nearby magnets."""
 MAGNET_UT = 400.0
 """µT of rest field above which there is a magnet over a chip."""
 BARE_SHARE = 0.6
-"""Share of the chips that must be bare for the skin to be off."""
+"""Share of the chips that must be without magnet for the skin to count as off."""
 LOST_AFTER_S = 0.3
-"""s that a single chip must be bare: a press may carry its field through zero."""
+"""s that a single chip must read no magnet: a press may carry its field through zero."""
 AT_ONCE = 0.6
-"""Share of its rest field by which a chip must change within `SCRAMBLE_S`: its magnet is gone."""
+"""Share of its rest field by which a chip that loses its magnet changes within `SCRAMBLE_S`."""
 GONE_SHARE = 0.3
-"""Share of its rest field that a chip without its magnet reads at most: its neighbours' magnets add
-a tenth."""
+"""Most of its rest field, as a share, that a chip reads without its magnet: its neighbours' magnets
+add a tenth."""
 EARTH_UT = 150.0
-"""µT beyond which the ambient field has not been turned: the earth's 65 turned round, and noise."""
+"""µT; no turn of the arm changes the ambient field by more: the earth's 65 reversed, and noise."""
 GAIN_STEP = 0.12
-"""Least relative change of all fields together that is a change of gain: the finest step of an
-MLX90393 is 20 %."""
+"""Smallest common relative change of all fields that counts as a change of gain: the finest step of
+an MLX90393 is 20 %."""
 GAIN_MISFIT = 0.1
-"""Share of such a change that may be left over."""
+"""Share of such a change that may remain unexplained."""
 SCRAMBLE_UT = 100.0
-"""µT by which every chip of a small array must change at once for its skin to have moved."""
+"""µT by which every chip of a small array changes at once when its skin has moved."""
 SCRAMBLE_S = 0.06
-"""s within which that is at once."""
+"""s that count as at once."""
 SCRAMBLE_PULL = 0.4
-"""Share of the greatest press that a taxel must then be pulled by: a contact presses."""
+"""Pull on some taxel, as a share of the largest press, that then shows it: a contact presses."""
 SCRAMBLE_N = 0.5
+"""N that this pull must exceed."""
 BACK_N = 0.3
-"""N per taxel within which a field that comes back is what it was."""
+"""N per taxel within which a field counts as back at rest."""
 
 
 class RestWatch:
-    """The signatures, for one board; memory of one cycle and a few numbers."""
+    """Checks the rest field of one board; remembers one cycle and a few numbers."""
 
     def __init__(self, layout: Layout, model: ForceModel, names: Sequence[str]) -> None:
         self._layout, self._model, self._names = layout, model, names
@@ -207,15 +207,15 @@ class RestWatch:
         self._bare_since = np.full(layout.real.shape, -1, np.int64)
         self._gone = np.zeros_like(layout.real)
         self.off = False
-        """Whether there is no skin on the board now: nothing to take a rest field of."""
+        """Whether the board has no skin now, so that it must not be tared."""
 
     def reset(self) -> None:
-        """The stream or the rest field began anew."""
+        """Forget the last cycles: the stream has restarted or the rest field has changed."""
         self._last = None
         self._bare_since[:] = -1
 
     def regained(self, field: FloatArray, bare: Bool) -> Reason | None:
-        """A magnet over one of the taxels ``bare`` (A, n) that had none: the skin was changed."""
+        """A reason when a taxel of ``bare`` (A, n) has a magnet again: the skin was changed."""
         reading = np.linalg.norm(field + self._model.rest, axis=1)
         least = np.maximum(MAGNET_UT, 2.0 * np.linalg.norm(self._model.rest, axis=1))
         if not (bare & (reading > least)).any():
@@ -230,10 +230,10 @@ class RestWatch:
         healthy: Bool,
         captured: Instant,
     ) -> Reason | None:
-        """What speaks against the rest field in this cycle; None when nothing does.
+        """Why the rest field is suspect in this cycle; None when it is not.
 
-        ``field``: (A, 3, n) µT in taxel axes over rest, ambient and all. ``forces``: (A, 3, n) N
-        after compensation. ``healthy``: (A, n).
+        ``field``: (A, 3, n) µT in taxel axes over rest, including the ambient field. ``forces``:
+        (A, 3, n) N after compensation. ``healthy``: (A, n).
         """
         last, self._last = self._last, (captured, field.copy())
         self.off = False
@@ -245,7 +245,7 @@ class RestWatch:
         )
 
     def restored(self, forces: FloatArray, estimate: Estimate, healthy: Bool) -> bool:
-        """Whether the skin reads again what it read at rest: nothing bears a force."""
+        """Whether the skin reads its rest field again: no taxel bears a force."""
         if estimate.leap.any() or (np.abs(estimate.theta[:, :, 0]) > EARTH_UT).any():
             return False
         free = (np.abs(forces).max(axis=1) < BACK_N) & healthy
@@ -293,7 +293,7 @@ class RestWatch:
         captured: Instant,
         last: tuple[Instant, FloatArray] | None,
     ) -> Bool:
-        """(A, n) chips that have lost most of their field at once, as no press makes it."""
+        """(A, n) chips that have lost most of their field at once, which no press does."""
         if last is None or seconds_between(last[0], captured) > SCRAMBLE_S:
             return np.zeros_like(chips)
         step = np.linalg.norm(field - last[1], axis=1)
@@ -301,14 +301,14 @@ class RestWatch:
         return np.asarray(chips & low & (strong > 2 * MAGNET_UT) & (step > AT_ONCE * strong))
 
     def lost(self, before: FloatArray) -> Bool:
-        """(A, n) taxels whose magnet is gone, by the rest field ``before`` (A, 3, n) and now."""
+        """(A, n) taxels whose magnet is gone, from the rest fields ``before`` (A, 3, n) and now."""
         magnet = (before**2).sum(axis=1) > MAGNET_UT**2
         low = (self._model.rest**2).sum(axis=1) < BARE_UT**2
         gone, self._gone = self._gone, np.zeros_like(self._gone)
         return np.asarray(magnet & (low | gone))
 
     def covered(self) -> Bool:
-        """(A, n) taxels whose rest field in force has a magnet's size."""
+        """(A, n) taxels whose present rest field is as large as a magnet's."""
         return np.asarray((self._model.rest**2).sum(axis=1) > 4 * MAGNET_UT**2)
 
     def _leapt(self, estimate: Estimate) -> Reason | None:
@@ -358,11 +358,11 @@ class RestWatch:
         return None
 
 
-# The rest field of chips that came late: taken by itself once the skin is untouched and still.
+# Chips that came late get their rest field once the skin is untouched and still.
 
 
 class LateRest:
-    """Averages over ``seconds`` what chips without a rest field read."""
+    """Averages the readings of chips without a rest field over ``seconds``."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
@@ -370,17 +370,17 @@ class LateRest:
         self._wanted: Bool | None = None
 
     def forget(self) -> None:
-        """Something moved, or all have their rest."""
+        """Drop the average: something moved, or no chip lacks its rest field."""
         self._tare = self._wanted = None
 
     def advance(
         self, left_over: FloatArray, wanted: Bool, noise_ut: FloatArray, captured: Instant
     ) -> FloatArray | None:
-        """Take one untouched cycle; (A, 3, n) µT to add to the rest field when it is known.
+        """Add one untouched cycle; returns (A, 3, n) µT to add to the rest field, or None yet.
 
-        ``left_over``: (A, 3, n) µT over the present rest field, ambient field taken off.
-        ``wanted``: (A, n) healthy taxels without a rest; begins anew when it changes.
-        ``noise_ut``: (3,) µT rms of one sample.
+        ``left_over``: (A, 3, n) µT over the present rest field, ambient field removed.
+        ``wanted``: (A, n) healthy taxels without a rest field; a change restarts the average.
+        ``noise_ut``: (3,) noise of one sample, µT rms.
         """
         if self._tare is None or self._wanted is None or (self._wanted != wanted).any():
             self._tare = Tare(left_over.shape, self._seconds, noise_ut)
@@ -394,33 +394,33 @@ class LateRest:
 
 
 ROUGH_ATTEMPTS = 3
-"""Refused tares after which a board whose rest was never known gets a rough one all the same: a
-skin that is never left alone shall show something, marked as what it is."""
+"""Refused tares after which a board without a rest field gets a rough one all the same, so that a
+skin that is always touched shows something, marked as rough."""
 
 
 SUSPECT_TARE_S = 1.0
-"""s that a suspect skin must be still, at least, before its rest field is taken anew."""
+"""s, least length of the tare of a suspect skin."""
 
 
 UNRECOVERED_SHARE = 0.06
-"""Share of an array's recent peak that a released skin may still read: 89 to 178 µT of 3.9 mT were
-seen on eFlesh boards."""
+"""Share of an array's recent peak that a released skin may still read: measured on eFlesh boards,
+89 to 178 µT of 3.9 mT."""
 PEAK_MEMORY_S = 60.0
-"""s, time constant with which that peak is forgotten."""
+"""s, time constant with which that peak decays."""
 RECOVERY_S = 2.0
-"""s, time constant with which the rest field then follows."""
+"""s, time constant with which the rest field then tracks."""
 STILL_TAU_S = 0.7
-"""s of the mean that a still skin stays close to."""
+"""s, time constant of the mean that a still skin stays close to."""
 STILL_UT = 4.0
-"""µT rms within which it does, the chips' noise apart."""
+"""µT rms by which a still skin may deviate from it, besides the chips' noise."""
 
 
 class Recovery:
-    """Lets the rest field of small arrays follow a skin that has been pressed and let go.
+    """Lets the rest field of small arrays track a skin that was pressed and released.
 
-    Rubber comes back to within some per cent of its peak at once and takes minutes for the rest;
-    on a few chips that reads as a contact of newtons. A still skin that reads no more than that
-    share of what it has just borne is taken to be at rest.
+    Rubber returns to within a few per cent of its peak at once and takes minutes for the rest; on
+    a few chips that reads as a contact of newtons. A still skin that reads no more than that share
+    of its recent peak is taken to be at rest.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -429,16 +429,16 @@ class Recovery:
         self.reset(layout)
 
     def reset(self, layout: Layout) -> None:
-        """Nothing has been pressed."""
+        """Forget the peaks."""
         self._peak = np.zeros(layout.arrays)
         self._mean = np.zeros((layout.arrays, 3, layout.width))
 
     def step(
         self, left_over: FloatArray, healthy: Bool, noise_ut: float, elapsed: float
     ) -> FloatArray | None:
-        """Change of the rest field, (A, 3, n) µT, in one cycle; None when there is none.
+        """Change of the rest field in one cycle, (A, 3, n) µT, or None.
 
-        ``left_over``: (A, 3, n) µT in taxel axes, what compensation leaves. ``noise_ut``: µT rms.
+        ``left_over``: (A, 3, n) µT in taxel axes after compensation. ``noise_ut``: µT rms.
         """
         if not self._any:
             return None
@@ -458,7 +458,7 @@ class Recovery:
 
 
 class RestState(Enum):
-    """What is known of the rest field: nothing, it is being taken, it stands, it is in doubt."""
+    """State of the rest field."""
 
     UNKNOWN = "unknown"
     TARING = "taring"
@@ -467,12 +467,11 @@ class RestState(Enum):
 
 
 class RestField:
-    """Owner of `ForceModel.rest`, in which a tare's result is put.
+    """Owns `ForceModel.rest` and sets it from tares.
 
-    ``known``: there is a rest field at all. ``rough``: it was taken while the skin moved, features
-    on it are not valid. ``suspicion``: why it may not be what it was, features on it are not valid
-    either; it is then taken anew by itself, once the skin is still. ``unrested``: (A, n) bool,
-    taxels without one.
+    ``known``: there is a rest field. ``rough``: it was taken while the skin moved, so features are
+    not valid. ``suspicion``: why it may be wrong; features are then not valid, and it is taken
+    anew once the skin is still. ``unrested``: (A, n) bool, taxels without one.
     """
 
     def __init__(
@@ -487,7 +486,7 @@ class RestField:
         self._tare: Tare | None = None
         self._forced = False
         self.bare: Bool = np.zeros_like(layout.real)
-        """(A, n) taxels without a magnet, which feel nothing."""
+        """(A, n) taxels without a magnet, which measure no force."""
         self._recovery = Recovery(layout)
         self._peak = 0.0
         self._refused = 0
@@ -499,12 +498,12 @@ class RestField:
 
     @property
     def _first(self) -> bool:
-        """Whether there is no rest field that could tell a contact."""
+        """Whether there is no good rest field, so that a contact cannot be told."""
         return not self.known or self.rough or self.suspicion is not None
 
     @property
     def state(self) -> RestState:
-        """What is known of the rest field."""
+        """State of the rest field."""
         if self.suspicion is not None:
             return RestState.SUSPECT
         if self.taring:
@@ -512,9 +511,9 @@ class RestField:
         return RestState.KNOWN if self.known and not self.rough else RestState.UNKNOWN
 
     def begin(self, noise_ut: FloatArray, force: bool = False) -> None:
-        """Begin a tare; ``noise_ut`` (3,) µT rms is what one sample is expected to vary by.
+        """Begin a tare. ``noise_ut``: expected noise of one sample, (3,) µT rms.
 
-        ``force``: whatever the skin reads becomes its rest field, moving or under load.
+        ``force``: take the reading as the rest field even when moving or under load.
         """
         seconds = self._settings.tare_s
         if self.suspicion is not None and not force:
@@ -525,19 +524,19 @@ class RestField:
         self._forced = force
 
     def suspect(self, reason: Reason, noise_ut: FloatArray) -> None:
-        """The rest field may not be what it was: take it anew once the skin is still."""
+        """Mark the rest field as suspect; it is taken anew once the skin is still."""
         if self.suspicion is None:
             self.suspicion = reason
             if self._tare is None:
                 self.begin(noise_ut)
 
     def trust(self) -> None:
-        """The skin reads again what it read before: the suspicion was of something that passed."""
+        """Drop the suspicion: the skin reads its rest field again."""
         self.suspicion = None
         self._tare = None
 
     def forget(self) -> None:
-        """Nothing is known of the rest field: another skin may be on, or another board."""
+        """Drop the rest field: the skin or the board may have been exchanged."""
         self.known, self.rough, self.suspicion = False, False, None
         self.unrested = self._layout.real.copy()
 
@@ -545,7 +544,7 @@ class RestField:
         return Tare((self._layout.arrays, 3, self._layout.width), seconds, noise_ut)
 
     def restore(self, rest_ut: FloatArray, unrested: Bool, rough: bool) -> None:
-        """Go on from a rest field that was in force before: (A, 3, n) µT, and (A, n) bool."""
+        """Use a recorded rest field, (A, 3, n) µT; ``unrested``: (A, n) bool."""
         self._model.rest[:] = rest_ut
         self.unrested[:] = unrested
         self.known, self.rough = True, rough
@@ -553,20 +552,20 @@ class RestField:
 
     @property
     def rest_ut(self) -> FloatArray:
-        """(A, 3, n) µT: the rest field in force."""
+        """The rest field in use, (A, 3, n) µT in taxel axes."""
         return self._model.rest
 
     def note_peak(self, newton: float) -> None:
-        """Largest force of a taxel in this cycle, N: a tare under way must not take it for rest."""
+        """Note the largest force of a taxel in this cycle, N, to refuse a tare under load."""
         self._peak = max(self._peak, newton)
 
     def advance(
         self, field: FloatArray, healthy: Bool, whole: bool, captured: Instant, sequence: int
     ) -> FloatArray | None:
-        """Take one cycle into the tare under way.
+        """Add one cycle to the tare under way.
 
-        ``field``: (A, 3, n) µT over the rest field in force. Returns by how much the rest field
-        has moved when this cycle ends the tare and its result is in force; else None.
+        ``field``: (A, 3, n) µT over the rest field in use. Returns the change of the rest field,
+        (A, 3, n) µT, when this cycle ends the tare and it is accepted; else None.
         """
         tare = self._tare
         if tare is None or not tare.add(field, healthy, whole, captured):
@@ -595,13 +594,13 @@ class RestField:
     def recover(
         self, left_over: FloatArray, healthy: Bool, noise_ut: float, elapsed: float
     ) -> None:
-        """Follow a skin that has been let go; see `Recovery.step`."""
+        """Track a skin that was released; see `Recovery.step`."""
         change = self._recovery.step(left_over, healthy, noise_ut, elapsed)
         if change is not None:
             self._model.rest += change
 
     def follow(self, left_over: FloatArray, free: Bool, share: float) -> None:
-        """Move the rest of ``free`` (A, n) taxels by a share of what compensation left over."""
+        """Move the rest field of ``free`` (A, n) taxels by a share of what compensation left."""
         self._model.rest += np.where(free[:, None], share * left_over, 0.0)
 
     def _accept(self, tare: Tare, sequence: int, trouble: str | None = None) -> FloatArray:

@@ -1,7 +1,7 @@
-"""How large a count of a chip is: told by the board, or found in the values that it sends.
+"""Scale of a chip's counts: reported by the board, or found in the values that it sends.
 
-A chip hands over 16-bit counts. Boards that send floats multiply them by the chip's scale, so
-that all their values lie on a grid; its step tells where the counts end and how they wrap.
+A chip delivers 16-bit counts. Boards that send floats multiply them by the chip's scale, so that
+all their values lie on a grid, whose step shows where the counts end and how they wrap.
 """
 
 from __future__ import annotations
@@ -13,43 +13,43 @@ from tactile_core.arrays import FloatArray
 
 Bool = NDArray[np.bool_]
 Scale = tuple[float, float]
-"""µT a count of x and y, and of z."""
+"""µT per count of x and y, and of z."""
 
 COUNTS = 65536
-"""Values of a count."""
+"""Number of values of a 16-bit count."""
 
 KNOWN_UT = (0.150, 0.200, 0.250, 0.300, 0.375, 0.451, 0.601, 0.751)
 KNOWN_Z_UT = (0.242, 0.323, 0.403, 0.484, 0.605, 0.727, 0.968, 1.210)
-"""µT a count of an MLX90393 (datasheet, HALLCONF 0xC) from gain 7 to 0, finest resolution."""
+"""µT per count of an MLX90393 (datasheet, HALLCONF 0xC) from gain 7 to 0, finest resolution."""
 RESOLUTIONS = (1.0, 2.0, 4.0, 8.0)
 SNAP = 1.5e-3
-"""Relative distance at which a step that was found is taken for one of the datasheet."""
+"""Relative distance within which a step counts as one of the datasheet's."""
 
 SAMPLES = 48
-"""Cycles looked at; noise of a third of a step then shows neighbouring counts for certain."""
+"""Cycles analysed; with noise of a third of a step they contain neighbouring counts for certain."""
 MOST_SKIPPED = 8192
-"""Cycles at most between two looks at values that show no grid."""
+"""Most cycles between two analyses of values that show no grid."""
 DISTINCT = 10
-"""Least number of different values: chance puts ten on a grid once in 10^6, and values that lie on
-none hardly ever repeat, so that there are hundreds."""
+"""Fewest different values: by chance ten lie on a grid once in 10^6, and values without a grid
+hardly ever repeat, so that there are hundreds."""
 FINEST_UT = 0.02
-"""Steps below are rounding of floats, or values that were computed: not a grid."""
+"""Smaller steps are rounding of floats or computed values, not a grid."""
 ON_GRID = 0.12
 """Distance from the grid in steps that rounding of float32 explains."""
 MISFITS = 2
-"""Looks in a row at which readings do not fit the grid before it is given up."""
+"""Checks in a row in which readings do not fit the grid before it is dropped."""
 
 JUMP_UT = np.array([6500.0, 6500.0, 10_500.0])[:, None]
-"""µT from one reading to the next that a contact, a skin taken off or a magnet does not make
-where the counts' range is not known: two thirds of the least range, 9.83 and 15.86 mT."""
+"""µT from one reading to the next that no contact, removed skin or magnet causes, when the range of
+the counts is unknown: two thirds of the smallest range, 9.83 and 15.86 mT."""
 JUMP_LIMIT_UT = 20_000.0
-"""The same where the range is known and larger: twice the field of the usual magnet at rest."""
+"""The same when the range is known and larger: twice the field of the usual magnet at rest."""
 AMBIGUOUS_RATIO = 1 / 3
-"""Share of the range beyond which a jump may as well be a wrap."""
+"""Share of the range above which a jump may also be a wrap."""
 
 
 class ScaleFinder:
-    """Finds the step of x and y, and of z, of one array from `SAMPLES` cycles of its values."""
+    """Finds the scale of one array from `SAMPLES` cycles of its values."""
 
     def __init__(self) -> None:
         self._kept: list[FloatArray] = []
@@ -57,9 +57,9 @@ class ScaleFinder:
         self._failures = 0
 
     def add(self, raw: FloatArray) -> tuple[float, float] | None:
-        """Take (3, n) µT in chip axes; the steps (xy, z) in µT when they have been found.
+        """Add a reading, (3, n) µT in chip axes; returns the scale once it is found.
 
-        Begins anew by itself, ever less often, where what was kept shows no grid.
+        Tries again, less and less often, when the values show no grid.
         """
         if self._skip:
             self._skip -= 1
@@ -79,7 +79,7 @@ class ScaleFinder:
 
 
 def step_of(values: FloatArray, known: tuple[float, ...] = ()) -> float | None:
-    """Step in µT of the grid that every column of (k, m) values lies on; None: there is none."""
+    """Step, µT, of the grid on which every column of (k, m) values lies; None: there is none."""
     flat = np.abs(values[np.isfinite(values)])
     distinct = np.unique(flat[flat > FINEST_UT])
     if len(distinct) < DISTINCT:
@@ -93,7 +93,7 @@ def step_of(values: FloatArray, known: tuple[float, ...] = ()) -> float | None:
     if not steps:
         return None
     step = min(steps)
-    # Small values first: each refines the step well enough for the next larger ones.
+    # Small values first: they refine the step well enough for the next larger ones.
     for most in (8, 64, 512, 4096, COUNTS):
         some = distinct[distinct < most * step]
         counts = np.rint(some / step)
@@ -108,17 +108,17 @@ def step_of(values: FloatArray, known: tuple[float, ...] = ()) -> float | None:
 
 
 def on_grid(values: FloatArray, step: float) -> bool:
-    """Whether all values are whole steps."""
+    """Whether all values are multiples of ``step``."""
     counts = values / step
     return bool((np.abs(counts - np.rint(counts)) < ON_GRID).all())
 
 
 class Scales:
-    """Sizes of the counts of a board's chips, and the limits that follow from them.
+    """Scales of a board's arrays, and the limits that follow from them.
 
-    ``steps``: (A, 3, 1) µT a count, NaN where it is not known. ``jump``: (A, 3, 1) µT from one
-    reading to the next that no contact makes, or that may as well be a wrap. ``rails``: the lowest
-    and the highest count, µT. ``top``: µT, the least of the latter.
+    ``steps``: (A, 3, 1) µT per count, NaN where unknown. ``jump``: (A, 3, 1) µT from one reading to
+    the next that no contact causes, or that may be a wrap. ``rails``: lowest and highest count,
+    (A, 3, 1) µT each. ``top``: the smallest highest count, µT.
     """
 
     def __init__(self, real: Bool) -> None:
@@ -130,19 +130,19 @@ class Scales:
         self._misfits = [0] * arrays
         self._finders: list[ScaleFinder | None] = [ScaleFinder() for _ in range(arrays)]
         self.seeking = True
-        """Whether there are arrays that `learn` is to look at."""
+        """Whether any scale is still unknown, so that `learn` must be called."""
         self.steps = np.full((arrays, 3, 1), np.nan)
         self._bounds()
 
     def told(self, array: int, scale: Scale) -> bool:
-        """Take over what the board says; True when it said otherwise before, or values did."""
+        """Set the scale that the board reports; True when a different one was known before."""
         if self._now[array] == scale:
             return False
         self._told[array] = True
         return self._set(array, scale)
 
     def learn(self, raw: FloatArray) -> list[int]:
-        """Look at (A, 3, n) µT as sent; arrays whose scale is found to be another than before."""
+        """Analyse readings as sent, (A, 3, n) µT; returns arrays whose scale has changed."""
         other = []
         for a, finder in enumerate(self._finders):
             if finder is None:
@@ -155,7 +155,7 @@ class Scales:
         return other
 
     def recheck(self, raw: FloatArray, good: Bool) -> None:
-        """Give up scales that were found and that the readings of ``good`` (A, n) fit no more."""
+        """Drop scales found earlier that the readings of ``good`` (A, n) no longer fit."""
         for a, scale in enumerate(self._now):
             if scale is None or self._told[a]:
                 continue
@@ -184,10 +184,10 @@ class Scales:
         known = np.isfinite(self.steps)
         steps = np.where(known, self.steps, 0.0)
         self.span = self.steps * COUNTS
-        """(A, 3, 1) µT of all counts: what a wrap is off by; NaN where it is not known."""
+        """Range of all counts, by which a wrap is off, (A, 3, 1) µT; NaN where unknown."""
         widest = np.minimum(AMBIGUOUS_RATIO * steps * COUNTS, JUMP_LIMIT_UT)
         self.jump = np.where(known, widest, JUMP_UT[None])
-        # the last count at either end, less half of one
+        # the last count at either end, minus half a count
         low = np.where(known, -(COUNTS / 2 - 0.5) * steps, -np.inf)
         high = np.where(known, (COUNTS / 2 - 1.5) * steps, np.inf)
         self.rails = low, high

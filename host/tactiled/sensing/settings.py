@@ -1,4 +1,4 @@
-"""What the user may choose of the sensing core, checked once."""
+"""User settings of the sensing core, checked once."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ TipForce = Annotated[Newtons, Meta(ge=0, le=1000)]
 class PipelineSettings:
     """Settings of `BoardPipeline`; `ConfigError` names the first that cannot be used.
 
-    Where the defaults come from: ``hold_s`` keeps the error of a held field below 0.25 N, half the
-    paper's least threshold, at 0.35 rad/s in 50 µT. It has no limit on arrays of fewer than nine
-    taxels, where every contact takes the support away; the ambient field itself is marked invalid
-    at once in any case. ``bound_limit_n`` is a third of the 1.5 N from which reachd's thresholds
-    act; it holds for the summed normal force, too, where every array has fewer than nine taxels.
+    Sources of the defaults: ``hold_s`` keeps the error of a held field below 0.25 N, half the
+    paper's lowest threshold, at 0.35 rad/s in 50 µT. It does not apply to arrays of fewer than nine
+    taxels, where every contact removes the support; the ambient field itself is always marked
+    invalid at once. ``bound_limit_n`` is a third of the 1.5 N at which reachd's thresholds begin;
+    it also limits the summed normal force where every array has fewer than nine taxels.
     ``tip_light_n`` is from the paper's Table II.
     """
 
@@ -117,7 +117,7 @@ class PipelineSettings:
     seed: Annotated[int, Meta(ge=0, le=2**32 - 1, description="of the random draws of ransac")] = 0
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be used."""
+        """Check the values; `ConfigError`."""
         check_fields(self)
         least, greatest = self.tip_light_n
         if greatest < least:

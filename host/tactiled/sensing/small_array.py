@@ -1,21 +1,20 @@
-"""Ambient field of an array of few magnetometers, all of which may feel the same contact.
+"""Ambient field of an array of few magnetometers, all of which may be under the same contact.
 
-Five chips cannot be fitted with a plane in every frame: a press reaches them all. So ambient field
-and contact are followed together over time. One Kalman filter an array, a quarter of a second
-behind the present, holds the ambient field ``b``, the same at every chip, and what contact adds at
-each chip, ``c_i``:
+A plane cannot be fitted to five chips in every frame, because a press reaches them all. So ambient
+field and contact are tracked together over time. One Kalman filter per array, a quarter of a second
+behind the present, estimates the ambient field ``b``, equal at every chip, and the contribution of
+contact at each chip, ``c_i``:
 
     d_i = b + c_i + noise
 
-A chip is *free* (its ``c_i`` is zero: it tells ``b`` itself), *loaded* (its ``c_i`` is what it
-was: it tells how ``b`` has changed since) or *changing* (it tells nothing). Which ones change is
-decided in the present, where the ambient field is sought that leaves the fewest of them, each at a
-price; the filter takes a frame only when it is known which chips changed soon after it, so that
-the slow beginning of a press is never taken for the field of the room.
+A chip is *free* (its ``c_i`` is zero, so it measures ``b``), *loaded* (its ``c_i`` is constant, so
+it measures changes of ``b``) or *changing* (it measures nothing). Which chips change is decided in
+the present: by the ambient field for which the fewest have changed, each at a price. The filter
+takes a frame only once it is known which chips changed soon after it, so that the slow beginning of
+a press is never taken for the ambient field.
 
-What cannot be known: a contact that loads all chips alike, slowly, is not told from the field of
-the room; nor is a field that turns while all chips are loaded told from their contact, which is
-why the bound then grows.
+Limits: a contact that slowly loads all chips alike cannot be told from the ambient field, nor can a
+field that turns while all chips are loaded be told from their contact; the bound then grows.
 """
 
 from __future__ import annotations
@@ -32,92 +31,92 @@ from tactile_core.arrays import FloatArray
 Bool = NDArray[np.bool_]
 
 LAG_S = 0.25
-"""s by which the filter is behind: presses begin within it."""
+"""s by which the filter lags: the onset of a press is shorter."""
 LAG_FRAMES = (3, 64)
-"""Fewest and most frames that it is behind, at very low and very high rates."""
+"""Fewest and most frames of that lag, at very low and very high rates."""
 SMOOTH_S = 0.05
-"""s over which the present is averaged before chips are judged by it."""
+"""s over which the present is averaged to judge the chips."""
 EVENT = 13.0
-"""Price of a contact that begins, or begins to change, in units of squared distance over variance;
-−2 ln of one in 700 frames."""
+"""Price of a contact that begins or begins to change, as squared distance over variance: −2 ln of
+one in 700 frames."""
 PRESSED, OTHER = 7.0, 11.0
-"""Least price of a chip that takes part in it, where it reads what a press makes and where not."""
+"""Least price of a changed chip, with a reading that a press makes, and with any other."""
 NEAR_UT, NEAR_SHEAR_UT = 16.0, 5.0
-"""µT rms along a press and across it that a contact may add at the other chips of the array
-without being seen at once."""
+"""µT rms, along and across the direction of a press, that a contact may add at the array's other
+chips without being noticed at once."""
 TURN = 20.0
-"""Price of an arm that begins to turn, or stops, while nothing touches."""
+"""Price of an arm that begins or stops turning while nothing touches."""
 FIRM_UT = 40.0
-"""µT of a contact that is more than what noise may pass for."""
+"""µT; a contact above this cannot be noise."""
 TURN_TOUCHED = 100.0
-"""The same while something touches: that the contact changes is more likely."""
+"""Price of a turn while something touches: a change of the contact is more likely."""
 LEAP = 60.0
-"""Price of an ambient field that leaps by more than turning explains."""
+"""Price of a leap of the ambient field by more than turning explains."""
 LEAP_SHARE = 0.8
-"""Share of the chips that must have leapt alike."""
+"""Share of the chips that must agree on a leap."""
 LEAST_LEAP_UT = 80.0
-"""µT of a leap; less is a turn that was missed."""
+"""µT, smallest leap; less is a turn that was missed."""
 EARTH_UT = 130.0
-"""Most that the earth's field can change: 65 µT turned round."""
+"""µT, largest possible change of the earth's field: 65 µT reversed."""
 LOST_UT = 60.0
-"""µT rms a component, how well the field is known when it was taken for more than that."""
+"""µT rms per component, uncertainty of the field after an estimate exceeded that."""
 SHEAR = 0.6
-"""Greatest shear over normal force of a press that is nothing unusual: friction of skin."""
+"""Largest shear over normal force of a usual press: friction of skin."""
 ROUNDS = 4
-"""Steps of the search from each start; it has settled after three or four."""
+"""Steps of the search from each start; it converges after three or four."""
 OPEN_UT = 3000.0
-"""µT rms, what the contact at a chip may be after it has changed."""
+"""µT rms, range of the contact at a chip after it has changed."""
 MODEL_ERROR_UT = 1.5
 """µT rms by which chips differ in a uniform field: 3 % sensitivity in 50 µT."""
 UNEVEN = 0.02
-"""Share by which they differ in a field that leaps."""
+"""Share by which chips differ in a field that leaps."""
 CALM_UT_PER_S = 0.3
-"""µT/s rms, how fast the field of the room changes while nothing moves: chips that warm up."""
+"""µT/s rms, change of the ambient field while nothing moves: chips warm up."""
 TURNING_UT_PER_S = 60.0
-"""µT/s rms, how fast it may change at all: an arm at 1 rad/s in 60 µT."""
+"""µT/s rms, fastest change of the ambient field: an arm turning at 1 rad/s in 60 µT."""
 UNSTEADY = 0.3
-"""Share by which the pace of a turning arm may change within the lag."""
+"""Share by which the rate of a turning arm may change within the lag."""
 KNOWN_UT = 6.0
-"""µT rms within which the field must be known before its pace is believed."""
+"""µT rms within which the field must be known before its rate is used."""
 MOVING_UT_PER_S = 8.0
-"""µT/s from which the arm is seen to turn: an arm at 0.15 rad/s."""
+"""µT/s above which the arm counts as turning: an arm at 0.15 rad/s."""
 PACE_TAU_S = 0.2
-"""s over which that pace is averaged."""
+"""s over which that rate is averaged."""
 CREEP_PER_S = 0.012
-"""Share of a contact that creeps in the first second, at all chips alike: rubber yields by 4 % in
-8 s."""
+"""Share of a contact by which it creeps in the first second, at all chips alike: rubber yields by
+4 % in 8 s."""
 UNEVEN_CREEP_PER_S = 0.004
-"""The same, at each chip by itself."""
+"""The same, for each chip on its own."""
 ALIKE_CHIPS = 3
 ALIKE_SHARE = 0.6
-"""Chips, and share of the array's, that must bear the same for it to be the ambient field."""
+"""Fewest chips, and share of the array's, with equal contact for that to be the ambient field."""
 ALIKE = 9.0
-"""Squared distance over variance within which contacts are the same."""
+"""Squared distance over variance within which contacts are equal."""
 LEAST_ALIKE_UT = 8.0
-"""µT below which it does not matter."""
+"""µT; smaller equal contacts are left alone."""
 LEAN_TAU_S = 0.3
-"""s over which readings that lean away from the filter's are averaged."""
+"""s over which deviations of readings from the filter's are averaged."""
 LEAN_RATIO = 3.0
-"""Variance of that mean among loaded chips over noise alone, from which their contact changes."""
+"""Variance of that mean among loaded chips, over that of noise, above which contact changes."""
 LEAN_GAIN = 3.0
-"""How many times the lean a contact may change within `LEAN_TAU_S`."""
+"""Multiple of that mean by which a contact may then change within `LEAN_TAU_S`."""
 RELEASED_SHARE = 0.03
-"""Share of its recent peak below which a chip's contact may be what the rubber has not recovered
-(hysteresis of 1 to 6 %, falling within seconds)."""
+"""Share of its recent peak below which a chip's contact may be unrecovered rubber (hysteresis of 1
+to 6 %, decaying within seconds)."""
 RECOVERY_S = 5.0
-"""s, time constant with which rubber forgets its peak."""
+"""s, time constant with which that peak decays."""
 RELEASED_SIGMAS = 2.5
 """Standard deviations below which a contact counts as released."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Small:
-    """What one frame says.
+    """Result of one frame.
 
-    ``field``: (3,) µT in ``ee``, the ambient field since the tare. ``sigma``: (3,) µT rms of it.
-    ``free``: (n,) bool, chips that bear nothing. ``changing``: (n,) bool. ``leap``: µT by which
-    the field has leapt, more than turning explains; 0 otherwise. ``left_over``: µT rms of the
-    chips that the field explains about it. ``moving``: the field is seen to turn.
+    ``field``: ambient field since the tare, (3,) µT in ``ee``. ``sigma``: its uncertainty, (3,) µT
+    rms. ``free``: (n,) bool, chips without contact. ``changing``: (n,) bool. ``leap``: µT by which
+    the field has leapt, more than turning explains; else 0. ``left_over``: residual of the chips
+    that the field explains, µT rms. ``moving``: whether the field is turning.
     """
 
     field: FloatArray
@@ -135,26 +134,26 @@ class _Frame:
     healthy: Bool
     elapsed: float
     changing: Bool
-    pace: FloatArray | None = None  # µT/s of the ambient field, by this frame and those before
+    pace: FloatArray | None = None  # rate of the ambient field as of this frame, (3,) µT/s
 
 
 class SmallArray:
-    """The filter of one array of ``n`` taxels; memory and time of a frame are bounded."""
+    """The filter of one array of ``n`` taxels; memory, and time per frame, are bounded."""
 
     def __init__(self, direction: FloatArray) -> None:
-        """``direction``: (3, n), unit vectors in ``ee`` along which a press changes the field."""
+        """``direction``: (3, n) unit vectors in ``ee`` along which a press changes the field."""
         self._n = direction.shape[1]
         self._direction = direction
         self.set_noise(np.array([4.4, 4.4, 6.7]))
         self.reset()
 
     def set_noise(self, noise: FloatArray) -> None:
-        """Noise of one sample, (3,) µT rms along ``ee``."""
+        """Set the noise of one sample, (3,) µT rms along ``ee``."""
         self._noise: FloatArray = noise**2
         self._variance: FloatArray = noise**2 + MODEL_ERROR_UT**2
 
     def reset(self, unknown: float = 0.0) -> None:
-        """Nothing touches; the ambient field is zero, ± ``unknown`` µT rms a component."""
+        """Start with no contact and zero ambient field, ± ``unknown`` µT rms per component."""
         n = self._n
         self._state = np.zeros((3, n + 1))  # b, then c of each chip
         self._cov = np.zeros((3, n + 1, n + 1))
@@ -171,9 +170,9 @@ class SmallArray:
         self._pace = np.zeros(3)  # µT/s
 
     def update(self, target: FloatArray, healthy: Bool, elapsed: float) -> Small:
-        """Take one frame.
+        """Process one frame.
 
-        ``target``: (3, n) µT in ``ee`` over rest, without what neighbours' contacts add.
+        ``target``: (3, n) µT in ``ee`` over rest, without the crosstalk of neighbours' contacts.
         ``healthy``: (n,). ``elapsed``: s since the last frame.
         """
         frame = _Frame(target, healthy, elapsed, np.zeros(self._n, dtype=bool))
@@ -191,19 +190,19 @@ class SmallArray:
     # The present
 
     def _smooth(self, target: FloatArray, elapsed: float) -> None:
-        """Average the frames of the last `SMOOTH_S`; one frame where they come more slowly."""
+        """Average the frames of the last `SMOOTH_S`; at low rates, only the last frame."""
         if self._mean is None:
             self._mean = target.copy()
             self._mean_variance = 1.0
             return
         share = -math.expm1(-elapsed / SMOOTH_S)
-        # the mean of a field that moves steadily is behind it by its own time constant
+        # without this, the mean of a steadily moving field would lag by its time constant
         self._mean += (self._pace * elapsed)[:, None]
         self._mean += share * (target - self._mean)
         self._mean_variance = (1 - share) ** 2 * self._mean_variance + share**2
 
     def _judge(self, frame: _Frame) -> Small:
-        """Where the ambient field is now, and which chips have changed since the filter's time."""
+        """Estimate the present ambient field, and which chips changed since the filter's time."""
         state, cov = self._state, self._cov
         seen = np.flatnonzero(frame.healthy)
         moved, unsteady, turning = self._moved()
@@ -226,8 +225,8 @@ class SmallArray:
             prior = np.full(3, OPEN_UT**2)
         elif kind == 1:
             prior = surprise
-        # a field that moves steadily is best known from the mean, one that has just begun to
-        # move from the newest frame
+        # the mean is best for a steadily moving field, the newest frame for one that has just
+        # begun to move
         signal = 0 if kind else 1
         chosen = away[:, signal][:, inside]
         shift, variance = self._locate(chosen, seen[inside], prior, noise[:, signal])
@@ -240,7 +239,8 @@ class SmallArray:
     def _locate(
         self, away: FloatArray, chips: NDArray[np.intp], prior: FloatArray, noise: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Shift of the ambient field by the readings ``away`` (3, k) of ``chips``; its variance."""
+        """Shift of the ambient field from the deviations ``away`` (3, k) of ``chips``, and its
+        variance, (3,) each."""
         cov = self._cov
         if not chips.size:
             return np.zeros(3), prior
@@ -253,10 +253,8 @@ class SmallArray:
         return (gain * away).sum(axis=1), np.maximum(prior - (gain * rows).sum(axis=1), 0.0)
 
     def _moved(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """How far the field should have moved since the filter's time; (3,) µT each.
-
-        What is expected of a steady motion, how far off that may be, and how far if the motion
-        has just begun or ended.
+        """Motion of the field since the filter's time, (3,) µT each: expected for a steady motion,
+        its uncertainty, and the uncertainty if the motion has just begun or ended.
         """
         pace, behind = self._pace, self._behind
         doubt = max(CALM_UT_PER_S, UNSTEADY * float(np.linalg.norm(pace)))
@@ -265,7 +263,7 @@ class SmallArray:
         return moved, unsteady, turning
 
     def _follow_pace(self, frame: _Frame, seen: FloatArray) -> None:
-        """The field of the room was ``seen`` to move at so many µT/s, (3,)."""
+        """Average the observed rate of the ambient field, ``seen`` (3,) µT/s."""
         share = -math.expm1(-frame.elapsed / PACE_TAU_S)
         pace = self._pace + share * (seen - self._pace)
         fast = float(np.linalg.norm(pace))
@@ -286,10 +284,10 @@ class SmallArray:
             float(np.linalg.norm(self._pace)) >= MOVING_UT_PER_S,
         )
 
-    # The filter, a moment later
+    # The filter, which lags
 
     def _take(self, frame: _Frame) -> None:
-        """Let the filter take the oldest frame, knowing what came after it."""
+        """Let the filter take the oldest frame, given the frames after it."""
         self._behind -= frame.elapsed
         changing = frame.changing.copy()
         for later in self._waiting:
@@ -303,7 +301,7 @@ class SmallArray:
         if self._free.all():
             self._near[:] = False
         else:
-            # a contact reaches neighbours, too little to be told from noise at once
+            # a contact reaches neighbours too, by too little to be told from noise at once
             fresh = 1 + np.flatnonzero(self._free & ~self._near)
             along = self._direction[:, fresh - 1] ** 2
             cov[:, fresh, fresh] += along * NEAR_UT**2 + (1 - along) * NEAR_SHEAR_UT**2
@@ -316,7 +314,7 @@ class SmallArray:
         self._reinterpret(frame.healthy & ~changing)
         size = float(np.linalg.norm(state[:, 0]))
         if size > EARTH_UT and 2 * np.count_nonzero(self._free) <= self._n:
-            # creep of a contact was taken for the field of the room
+            # creep of a contact was taken for the ambient field
             state[:, 0] *= EARTH_UT / size
             cov[:, 0, 0] = np.maximum(cov[:, 0, 0], LOST_UT**2)
         load = np.linalg.norm(state[:, 1:], axis=0)
@@ -325,7 +323,7 @@ class SmallArray:
         moving = float(np.linalg.norm(self._pace)) >= MOVING_UT_PER_S
         firm = float(load.max()) > FIRM_UT
         if covered and firm and not moving:
-            # what all chips do together may be the contact
+            # a common change of all chips may be the contact
             self._follow_pace(frame, np.zeros(3))
         elif frame.pace is not None and not changing.any():
             self._follow_pace(frame, frame.pace)
@@ -334,7 +332,7 @@ class SmallArray:
         """Let time pass: the ambient field moves on, loaded chips creep."""
         cov, elapsed = self._cov, frame.elapsed
         self._state[:, 0] += self._pace * elapsed
-        # what is unknown of it is the same from frame to frame: deviations add up
+        # the unknown part is the same from frame to frame, so deviations add up
         step = max(CALM_UT_PER_S, UNSTEADY * float(np.linalg.norm(self._pace))) * elapsed
         cov[:, 0, 0] += (2.0 * np.sqrt(cov[:, 0, 0]) + step) * step
         contact = np.where(self._free, 0.0, self._state[:, 1:])
@@ -343,9 +341,9 @@ class SmallArray:
         cov[:, index, index] += UNEVEN_CREEP_PER_S**2 * elapsed * contact**2
 
     def _stir(self, frame: _Frame, seen: NDArray[np.intp]) -> None:
-        """Let loaded chips change while their readings lean away from what is expected, unevenly.
+        """Let loaded chips change while their readings deviate unevenly from the expected ones.
 
-        A contact that grows slowly changes each chip by its own; the field of the room all alike.
+        A slowly growing contact changes each chip differently, the ambient field all alike.
         """
         share = -math.expm1(-frame.elapsed / LEAN_TAU_S)
         away = frame.target - self._state[:, 1:] - self._state[:, :1]
@@ -364,7 +362,7 @@ class SmallArray:
             self._cov[:, index, index] += moved * min(1.0, frame.elapsed / LEAN_TAU_S)
 
     def _absorb(self, target: FloatArray, seen: NDArray[np.intp]) -> None:
-        """Kalman's update with the chips ``seen``."""
+        """Kalman update with the chips ``seen``."""
         state, cov = self._state, self._cov
         rows = cov[:, 0, :][:, None, :] + cov[:, 1 + seen, :]  # H P
         inner = rows[:, :, 0][:, :, None] + rows[:, :, 1 + seen]  # H P H'
@@ -378,14 +376,14 @@ class SmallArray:
         cov *= 0.5
 
     def _release(self, judged: Bool) -> None:
-        """Chips whose contact is gone tell the ambient field again."""
+        """Free the chips whose contact is gone."""
         state, cov = self._state, self._cov
         for i in np.flatnonzero(~self._free & judged).tolist():
             own = cov[:, 1 + i, 1 + i]
             slack = (RELEASED_SHARE * self._peak[i]) ** 2
             distance = (state[:, 1 + i] ** 2 / (own + slack + MODEL_ERROR_UT**2)).sum()
             if distance < RELEASED_SIGMAS**2:
-                # while its neighbours are loaded it may bear a little still
+                # while its neighbours are loaded it may still bear a little
                 self._free[i] = self._near[i] = True
         if self._free.all():
             for i in np.flatnonzero(self._near).tolist():
@@ -395,7 +393,7 @@ class SmallArray:
             cov[:, :, 1:] = 0.0
 
     def _reinterpret(self, judged: Bool) -> None:
-        """What most chips bear alike, and no press makes, is the ambient field after all."""
+        """Move an equal contact of most chips, if no press explains it, to the ambient field."""
         state, cov = self._state, self._cov
         chips = np.flatnonzero(judged)
         if self._free.all() or chips.size < ALIKE_CHIPS:
@@ -420,7 +418,7 @@ class SmallArray:
             self._pin(i, 0.0)
 
     def _pin(self, i: int, slack: float) -> None:
-        """Chip ``i`` bears nothing, to within ``slack`` µT²."""
+        """Set the contact of chip ``i`` to zero, to within ``slack`` µT²."""
         state, cov = self._state, self._cov
         column = cov[:, :, 1 + i].copy()
         total = column[:, 1 + i] + slack + MODEL_ERROR_UT**2
@@ -431,18 +429,17 @@ class SmallArray:
 
 
 class _Vote:
-    """Which chips have changed, by the cheapest explanation of what they read.
+    """Finds the chips that have changed, by the cheapest explanation of the readings.
 
-    For S signals (the frame and the mean of the last few) of k chips: ``away`` (3, S, k) µT of
-    what was expected, ``spread`` (3, S, k) µT² its variance without that of the ambient field,
-    ``contact`` (3, k) µT, what contact adds at the chips so far, ``direction`` (3, k) of a press.
+    For S signals (the frame and the mean of the last few) of k chips: ``away`` (3, S, k) deviation
+    from the expected, µT; ``spread`` (3, S, k) its variance without that of the ambient field, µT²;
+    ``contact`` (3, k) present contribution of contact, µT; ``direction`` (3, k) of a press.
     ``touched``: there is contact already.
 
-    A chip that has changed costs more, the more precisely its new contact is known beside how
-    large it might have been; and more again when it is not what a press makes. An explanation
-    costs the chips that it lets change, an `EVENT` where a contact begins, the distance of its
-    ambient field from the expected, and the price of its kind: 0 steady, 1 a turn that begins or
-    ends, 2 a leap.
+    A changed chip costs the more, the more precisely its new contact is known relative to its
+    possible range, and more again when no press explains it. An explanation costs the sum of its
+    changed chips, an `EVENT` where a contact begins, the distance of its ambient field from the
+    expected, and the price of its kind: 0 steady, 1 a turn that begins or ends, 2 a leap.
     """
 
     def __init__(
@@ -463,9 +460,10 @@ class _Vote:
         self._sigma = np.sqrt(spread.mean(axis=0))  # (S, k)
 
     def result(self, steady: FloatArray, turning: FloatArray) -> tuple[Bool, int, float]:
-        """Chips (k,) that both signals' best explanations keep, its kind, and a leap's size, µT.
+        """Chips (k,) unchanged in the best explanations of both signals, the kind, and the size of
+        a leap, µT.
 
-        ``steady``, ``turning``: (3,) µT², variance of the ambient field in either kind.
+        ``steady``, ``turning``: variance of the ambient field in either kind, (3,) µT².
         """
         away, spread = self._away, self._spread
         chips = away.shape[2]
@@ -512,7 +510,7 @@ class _Vote:
         return kept, kind, leap
 
     def _prices(self, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Squared distance of each chip, and the price of letting it change; (S, kinds, s, k)."""
+        """Squared distance of each chip and the price of its change, (S, kinds, s, k) each."""
         rest = self._away[:, :, None, None] - shift[..., None]
         spread = self._spread[:, :, None, None]
         slack = spread
@@ -526,7 +524,7 @@ class _Vote:
         across = np.sqrt(np.maximum((after**2).sum(axis=0) - along**2, 0.0))
         sigma = self._sigma[:, None, None]
         pressed = across <= SHEAR * np.maximum(along, 0.0) + 3.0 * sigma
-        # a contact that grows or lessens keeps the direction of what it does to a chip
+        # a contact that grows or shrinks changes a chip along its present contribution
         more = np.abs((rest * self._unit[:, None, None, None]).sum(axis=0))
         change = (rest**2).sum(axis=0)
         aside = np.sqrt(np.maximum(change - more**2, 0.0))

@@ -1,4 +1,4 @@
-"""Ways to a board: serial ports, CAN buses and recorded logs behind one interface."""
+"""Transports: serial ports, CAN buses and recorded logs behind one interface."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ __all__ = [
 
 
 def make_transport(spec: str, baud: int = 115_200, speed: float = 1.0) -> Transport:
-    """Transport, not yet open, for a port, a CAN bus or a log, told apart by how it is written.
+    """Make the transport, not yet open, for a port, a CAN bus or a log.
 
     ``/dev/ttyACM0``, ``./board0`` or ``usb:SERIAL``: serial; ``INTERFACE:CHANNEL[@BITRATE][+fd]``:
     CAN; a name that ends in ``.mcap``: replay at ``speed`` times real time. ValueError otherwise.
@@ -58,7 +58,7 @@ def make_transport(spec: str, baud: int = 115_200, speed: float = 1.0) -> Transp
 
 
 def open_spec(spec: str, baud: int = 115_200, speed: float = 1.0) -> Transport:
-    """`make_transport`, opened; raises `TransportError` with the remedy."""
+    """Make a transport and open it; `TransportError` names the remedy."""
     transport = make_transport(spec, baud, speed)
     transport.open()
     return transport

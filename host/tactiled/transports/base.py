@@ -1,4 +1,4 @@
-"""What every way to a board has in common: one interface and one family of errors."""
+"""The interface of all transports, and their errors."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from tactiled.blocks import Chunk
 
 
 class Medium(StrEnum):
-    """What a transport's chunks hold: bytes, or tuples of CAN frames."""
+    """Content of a transport's chunks: bytes, or tuples of CAN frames."""
 
     SERIAL = "serial"
     CAN = "can"
 
 
 class TransportError(Exception):
-    """What went wrong with a port, and after it what the user can do about it."""
+    """A port failed; the text is the problem, then the remedy."""
 
     def __init__(self, problem: str, remedy: str = "") -> None:
         super().__init__(f"{problem}; {remedy}" if remedy else problem)
@@ -28,11 +28,11 @@ class TransportError(Exception):
 
 
 class PortMissing(TransportError):  # noqa: N818 - names a state of the port
-    """There is no such port, interface or file (now)."""
+    """The port, interface or file does not exist (now)."""
 
 
 class PortBusy(TransportError):  # noqa: N818 - names a state of the port
-    """Somebody else has the port open."""
+    """Another process has the port open."""
 
 
 class PortDenied(TransportError):  # noqa: N818 - names a state of the port
@@ -40,11 +40,11 @@ class PortDenied(TransportError):  # noqa: N818 - names a state of the port
 
 
 class PortUnsuitable(TransportError):  # noqa: N818 - names a state of the port
-    """It is there, but is no port of this kind, or cannot do what is asked of it."""
+    """The path exists, but is not a port of this kind, or cannot do what is asked."""
 
 
 class PortGone(TransportError):  # noqa: N818 - names a state of the port
-    """The port vanished while open: unplugged, or the process behind it ended."""
+    """The port disappeared while open: it was unplugged, or the process behind it ended."""
 
 
 class PortClosed(TransportError):  # noqa: N818 - names a state of the port
@@ -52,14 +52,11 @@ class PortClosed(TransportError):  # noqa: N818 - names a state of the port
 
 
 class EndOfLog(TransportError):  # noqa: N818 - names a state of the port
-    """A replay has come to the end of its file; nothing went wrong."""
+    """A replay has reached the end of its file; not a failure."""
 
 
 class Transport(Protocol):
-    """One port. One thread reads; any thread may write or close.
-
-    ``losses``: snapshot of what this end could not deliver or use, one counter per reason.
-    """
+    """A port. One thread reads; any thread may write or close."""
 
     @property
     def name(self) -> str:
@@ -67,45 +64,47 @@ class Transport(Protocol):
 
     @property
     def medium(self) -> Medium:
-        """What ``Chunk.payload`` holds."""
+        """Content of ``Chunk.payload``."""
 
     @property
     def state(self) -> BusState:
-        """What the medium says of itself."""
+        """State of the bus."""
 
     @property
     def losses(self) -> dict[str, int]:
-        """Counters, one per reason."""
+        """Snapshot of what could not be delivered or used, one counter per reason."""
 
     def open(self) -> None:
-        """Open the port for this process alone; raises `TransportError` with the remedy."""
+        """Open the port exclusively; `TransportError` names the remedy."""
 
     def read(self, timeout: float) -> Chunk | None:
-        """Everything that has come, stamped right after the read; None after ``timeout`` s.
+        """Read all data that has arrived, stamped right after; None after ``timeout`` s.
 
-        Raises `PortGone` when the port has vanished (at once, not after the timeout) and
-        `PortClosed` when this end is closed, also by another thread during the wait.
+        Raises `PortGone` as soon as the port disappears, and `PortClosed` when this end is closed,
+        also by another thread during the wait.
         """
 
     def write(self, data: bytes | tuple[CanFrame, ...]) -> None:
-        """Send; never waits longer than `WRITE_TIMEOUT` and never raises for what the port does.
+        """Send; waits at most `WRITE_TIMEOUT` and never raises for failures of the port.
 
-        What could not be sent is counted in ``losses``. TypeError for the wrong medium's data.
+        Data that could not be sent is counted in ``losses``. TypeError for data of the wrong
+        medium.
         """
 
     def close(self) -> None:
-        """Close; safe from any thread and more than once. A waiting `read` ends at once."""
+        """Close; safe from any thread and repeatedly. A waiting `read` ends at once."""
 
 
 WRITE_TIMEOUT = 0.02
-"""s. Commands are some thirty bytes and a tty takes 4 KiB at once: who waits longer is stuck."""
+"""s. Commands are some thirty bytes and a tty takes 4 KiB at once, so a longer wait is a stuck
+port."""
 
 READ_LIMIT = 16_384
-"""Bytes one read may return: more than a tty's 4 KiB buffer, less than a log message may have."""
+"""Most bytes of one read: more than a tty's 4 KiB buffer, less than fits into a log message."""
 
 
 class Losses:
-    """Counters of one transport. Written by its reader and its writers under the GIL."""
+    """Loss counters of one transport; safe from several threads because of the GIL."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
@@ -115,12 +114,12 @@ class Losses:
         self._counts[reason] += amount
 
     def snapshot(self) -> dict[str, int]:
-        """Counters so far."""
+        """Copy of the counters."""
         return dict(self._counts)
 
 
 class Waker:
-    """A pipe that another thread writes to, so that a poll on it ends at once."""
+    """A pipe with which another thread ends a poll at once."""
 
     def __init__(self) -> None:
         self.read_end, self._write_end = os.pipe()
@@ -132,6 +131,6 @@ class Waker:
         os.write(self._write_end, b"\0")
 
     def close(self) -> None:
-        """Give both ends back."""
+        """Close both ends."""
         os.close(self.read_end)
         os.close(self._write_end)

@@ -1,4 +1,4 @@
-"""A CAN bus: any interface python-can has, with error frames read and given their names."""
+"""A CAN bus, by any interface of python-can; error frames are read and counted by name."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_BATCH = 512
-"""Frames one read returns at most: some 60 ms of a full 1 Mbit/s bus."""
+"""Most frames of one read: some 60 ms of a full 1 Mbit/s bus."""
 
 RECV_SLICE = 0.02
-"""s. Drivers without a descriptor to poll cannot be woken, so a wait on one is cut into these."""
+"""s. Drivers without a descriptor to poll cannot be woken, so waits are split into slices."""
 
 RESTART_EVERY = 0.25
-"""s between attempts to leave bus-off; the standard itself demands 128 × 11 bit times."""
+"""s between attempts to leave bus-off; the standard demands at least 128 × 11 bit times."""
 
 TROUBLES = {
     Trouble.MISSING: PortMissing,
@@ -56,23 +56,23 @@ TROUBLES = {
 
 
 class CanLink(Protocol):
-    """Frames through one adapter. `CanTransport` adds states, stamps and counting."""
+    """Frames through one adapter; `CanTransport` adds bus states and counts."""
 
     @property
     def losses(self) -> dict[str, int]:
-        """Counters, one per reason."""
+        """Loss counters, one per reason."""
 
     def open(self) -> None:
-        """Open; raises `TransportError`."""
+        """Open the adapter; `TransportError`."""
 
     def close(self) -> None:
-        """Close, waking a reader."""
+        """Close the adapter and wake the reader."""
 
     def receive(self, timeout: float) -> tuple[Instant, list[CanFrame]] | None:
-        """Frames, error frames among them, and when they were read."""
+        """Instant of the read and its frames, including error frames; None after ``timeout`` s."""
 
     def send(self, frames: tuple[CanFrame, ...]) -> None:
-        """Send in order; counts what cannot be sent."""
+        """Send in order; counts frames that cannot be sent."""
 
     def restart(self) -> None:
         """Try to leave bus-off."""
@@ -81,7 +81,7 @@ class CanLink(Protocol):
 class CanTransport:
     """A CAN bus by its spec, ``INTERFACE:CHANNEL[@BITRATE[/DATA_BITRATE]][+fd]``.
 
-    ValueError for a spec that is none. ``losses`` also counts each kind of error frame
+    ValueError for an invalid spec. ``losses`` also counts each kind of error frame
     (``can_bus-off``, ``can_no-acknowledgement`` …) and every attempt to leave bus-off.
     """
 
@@ -110,21 +110,21 @@ class CanTransport:
 
     @property
     def state(self) -> BusState:
-        """What the last error frame told; ACTIVE again with the first frame after bus-off."""
+        """State by the last error frame; ACTIVE again with the first frame after bus-off."""
         return self._state
 
     @property
     def losses(self) -> dict[str, int]:
-        """Error frames by kind, foreign frames, frames not sent."""
+        """Counts of error frames by kind, foreign frames, and frames not sent."""
         return self._losses.snapshot() | self._link.losses
 
     def open(self) -> None:
-        """Open the bus; raises `TransportError` with the remedy."""
+        """Open the bus; `TransportError` names the remedy."""
         self._link.open()
         self._state = BusState.ACTIVE
 
     def read(self, timeout: float) -> Chunk | None:
-        """Frames that have come, error frames among them; see `Transport.read`."""
+        """Read frames, including error frames; see `Transport.read`."""
         got = self._link.receive(timeout)
         if got is not None:
             for frame in got[1]:
@@ -139,7 +139,7 @@ class CanTransport:
         return None if got is None else Chunk(got[0], tuple(got[1]))
 
     def write(self, data: bytes | tuple[CanFrame, ...]) -> None:
-        """Send frames in order; see `Transport.write`. ValueError: FD frames on a bus without."""
+        """Send frames in order; see `Transport.write`. ValueError for FD frames without +fd."""
         if isinstance(data, bytes):
             raise TypeError("a CAN bus takes a tuple of CanFrame, not bytes")
         if not self.spec.fd and any(frame.fd for frame in data):
@@ -182,18 +182,18 @@ class PythonCanLink:
 
     @property
     def losses(self) -> dict[str, int]:
-        """Frames of others on the bus that cannot be ours, and frames not sent."""
+        """Counts of foreign frames, and of frames not sent."""
         return self._losses.snapshot()
 
     def open(self) -> None:
-        """Open; raises `TransportError`."""
+        """Open the adapter; `TransportError`."""
         self.close()
         try:
             bus = open_bus(self._spec)
         except CanUnavailable as error:
             raise TROUBLES[error.trouble](error.problem, error.remedy) from error
         if self._spec.interface == "socketcan":
-            # Only here is it sure that nothing is buffered above the descriptor.
+            # Only socketcan surely buffers nothing above the descriptor, so that it can be polled.
             self._waker = Waker()
             self._poll = select.poll()
             self._poll.register(bus.fileno(), select.POLLIN)
@@ -202,7 +202,7 @@ class PythonCanLink:
         self._bus = bus
 
     def close(self) -> None:
-        """Wake the reader and close; more than once is fine."""
+        """Wake the reader and close; may be called again."""
         import can
 
         self._closing.set()
@@ -222,7 +222,7 @@ class PythonCanLink:
                     log.debug("closing %s: %s", self._spec, error)  # unplugged
 
     def receive(self, timeout: float) -> tuple[Instant, list[CanFrame]] | None:
-        """Frames and when they were read; raises `PortGone` and `PortClosed`."""
+        """Instant of the read and its frames; raises `PortGone` and `PortClosed`."""
         import can
 
         with self._reading:
@@ -248,7 +248,8 @@ class PythonCanLink:
             return (monotonic_now(), frames) if frames else None
 
     def send(self, frames: tuple[CanFrame, ...]) -> None:
-        """Send within `WRITE_TIMEOUT` in all; the rest of a transfer that failed is not sent."""
+        """Send within `WRITE_TIMEOUT` in total; after a failure the rest of the transfer is
+        dropped."""
         import can
 
         with self._writing:
@@ -265,7 +266,7 @@ class PythonCanLink:
                     return
 
     def restart(self) -> None:
-        """Nothing to do: kernel and drivers restart by themselves, where they are set to."""
+        """Do nothing but warn: kernel and drivers restart by themselves if set to."""
         if self._spec.interface == "socketcan":
             log.warning(
                 "%s is bus-off; unless restart-ms is set, run `sudo ip link set %s type can "

@@ -1,4 +1,4 @@
-"""Which serial ports there are, who holds one, and where a replugged one went."""
+"""List serial ports, find who holds one, and find a replugged one again."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pathlib import Path
 from serial.tools import list_ports as pyserial_ports
 
 MAX_PROCESSES = 4096
-"""Processes looked at in search of a port's holder: bounds the search on a crowded machine."""
+"""Most processes searched for a port's holder, which bounds the search on a busy machine."""
 
 
 @dataclass(frozen=True, slots=True)
 class PortInfo:
-    """One serial port. ``vid``, ``pid`` and ``serial_number`` are None where it is not on USB."""
+    """A serial port. ``vid``, ``pid`` and ``serial_number`` are None if it is not on USB."""
 
     device: str
     description: str
@@ -32,7 +32,7 @@ class PortInfo:
 
 
 def list_ports() -> list[PortInfo]:
-    """Every serial port of this machine, USB first, then by name."""
+    """List the serial ports of this machine, USB first, then by name."""
     ports = [
         PortInfo(p.device, p.description or "", p.vid, p.pid, p.serial_number or None)
         for p in pyserial_ports.comports()
@@ -41,18 +41,18 @@ def list_ports() -> list[PortInfo]:
 
 
 def find_by_serial(usb_serial: str) -> PortInfo | None:
-    """The port whose USB device has this serial number, wherever it was plugged in; None: none."""
+    """Find the port whose USB device has this serial number; None if there is none."""
     return next((p for p in list_ports() if p.serial_number == usb_serial), None)
 
 
 def usb_serial_of(device: str) -> str | None:
-    """USB serial number behind a device path, symbolic links followed; None: it has none."""
+    """USB serial number of a device, following symbolic links; None if it has none."""
     real = os.path.realpath(device)
     return next((p.serial_number for p in list_ports() if os.path.realpath(p.device) == real), None)
 
 
 def known_ports(limit: int = 8) -> str:
-    """The ports there are, in one line of a message."""
+    """The available ports, for a message."""
     devices = [p.device for p in list_ports()]
     if not devices:
         return "no serial port is plugged in"
@@ -61,7 +61,7 @@ def known_ports(limit: int = 8) -> str:
 
 
 def holders(device: str) -> list[str]:
-    """Who has ``device`` open, as "name (pid)"; best effort: other users' processes are hidden."""
+    """Processes that have ``device`` open, as "name (pid)"; other users' processes are hidden."""
     real = os.path.realpath(device)
     return [
         f"{_process_name(pid)} (pid {pid}{', this process' if pid == os.getpid() else ''})"
@@ -84,7 +84,7 @@ def _has_open(pid: int, real: str) -> bool:
     try:
         return any(os.readlink(f"{folder}/{fd}") == real for fd in os.listdir(folder))
     except OSError:
-        return False  # it ended meanwhile, or belongs to somebody else
+        return False  # it has ended meanwhile, or belongs to another user
 
 
 def _process_name(pid: int) -> str:

@@ -1,4 +1,4 @@
-"""A recorded log as a port: its raw chunks again, at the pace at which they came."""
+"""A recorded log as a port: plays its raw chunks at the pace at which they were recorded."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ID_MASK = ERROR_BIT - 1
 
 
 def to_raw(chunk: Chunk, port: str, wall: WallClock) -> Any:
-    """RawChunk message of a chunk read from ``port``."""
+    """Convert a chunk read from ``port`` to a RawChunk message."""
     payload = chunk.payload
     if isinstance(payload, bytes):
         ids, lengths, data, medium = [], [], payload, SERIAL
@@ -58,7 +58,7 @@ def to_raw(chunk: Chunk, port: str, wall: WallClock) -> Any:
 
 
 def from_raw(message: Any) -> Chunk:
-    """Chunk of a RawChunk message; raises `DecodeError` when its parts disagree."""
+    """Convert a RawChunk message to a chunk; `DecodeError` when it is inconsistent."""
     data = np.asarray(message.data, np.uint8).tobytes()
     received = Instant(int(message.received_ns))
     if message.medium == SERIAL:
@@ -84,12 +84,12 @@ log = logging.getLogger(__name__)
 
 
 class McapTransport:
-    """Raw chunks of one board of a log (`RawChunk` on ``tactile/<board>/raw``), in file order.
+    """Plays the raw chunks of one board of a log (`RawChunk` on ``tactile/<board>/raw``), in order.
 
-    ``board`` None: the first board in the log. ``speed``: times real time, `math.inf` for as fast
-    as it is read. Chunks keep the spacing of their stamps, divided by a finite ``speed``, from the
-    moment of opening; at `math.inf` the spacing is the recorded one. Of files that were cut off or
-    damaged, all that can be read is replayed. Behind the last chunk `read` raises `EndOfLog`.
+    ``board`` None: the first board in the log. ``speed``: times real time; `math.inf`: as fast as
+    possible. Stamps begin at the moment of opening and keep the recorded spacing, divided by a
+    finite ``speed``. Of damaged or truncated files, everything readable is played. After the last
+    chunk `read` raises `EndOfLog`.
     """
 
     def __init__(self, path: str | Path, board: str | None = None, speed: float = 1.0) -> None:
@@ -108,7 +108,7 @@ class McapTransport:
         self._first = self._start = Instant(0)
         self._medium = Medium.SERIAL
         self.metadata: dict[str, dict[str, str]] = {}
-        """Metadata records read so far, by name: those before the first chunk once open."""
+        """Metadata records read so far, by name; once open, those before the first chunk."""
 
     @property
     def name(self) -> str:
@@ -117,7 +117,7 @@ class McapTransport:
 
     @property
     def board(self) -> str | None:
-        """Name of the board played; where none was asked for known once open."""
+        """Name of the board played; if none was given, known once open."""
         return self._board
 
     @property
@@ -132,11 +132,11 @@ class McapTransport:
 
     @property
     def losses(self) -> dict[str, int]:
-        """Broken records, and writes (a recording answers nobody)."""
+        """Counts of damaged records, and of writes, which are dropped."""
         return self._losses.snapshot()
 
     def open(self) -> None:
-        """Find the first chunk; raises `TransportError` for no such file, no log, no raw chunks."""
+        """Find the first chunk; `TransportError` when there is no file, log or raw chunk."""
         try:
             self._path.open("rb").close()
         except FileNotFoundError as error:
@@ -163,7 +163,7 @@ class McapTransport:
         self._start = monotonic_now()
 
     def read(self, timeout: float) -> Chunk | None:
-        """Next chunk when it is due; see `Transport.read`."""
+        """Return the next chunk when it is due; see `Transport.read`."""
         with self._reading:
             if self._closed.is_set():
                 raise PortClosed(f"{self._path} is closed")
@@ -188,7 +188,7 @@ class McapTransport:
             return Chunk(stamp, chunk.payload)
 
     def write(self, data: bytes | tuple[CanFrame, ...]) -> None:
-        """Counted and dropped: a recording answers nobody."""
+        """Drop and count: a recording takes no data."""
         self._losses.add("write_to_recording", len(data))
 
     def close(self) -> None:

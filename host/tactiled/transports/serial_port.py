@@ -1,4 +1,4 @@
-"""A serial port: exclusive, low latency, gone within milliseconds of being unplugged."""
+"""A serial port: exclusive, low latency, and unplugging is noticed within milliseconds."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ LOST_SLAVE = select.POLLHUP | select.POLLERR | select.POLLNVAL
 class SerialTransport:
     """A serial port by its path, or by the serial number of its USB device (``usb:SERIAL``).
 
-    Opened once, it is found again by that USB serial number when it was plugged in elsewhere.
-    ``baud`` in bit/s; USB devices ignore it. POSIX only.
+    Once opened, it is found again by its USB serial number, even when plugged in elsewhere.
+    ``baud``: bit/s; USB devices ignore it. POSIX only.
     """
 
     def __init__(self, port: str, baud: int = 115_200) -> None:
@@ -76,12 +76,12 @@ class SerialTransport:
 
     @property
     def state(self) -> BusState:
-        """Always active: a serial line knows no other state."""
+        """Always active: a serial line has no other state."""
         return BusState.ACTIVE
 
     @property
     def losses(self) -> dict[str, int]:
-        """Bytes that could not be written, by reason."""
+        """Counts of bytes that could not be written, by reason."""
         return self._losses.snapshot()
 
     @property
@@ -90,7 +90,7 @@ class SerialTransport:
         return None if self._serial is None else self._serial.port
 
     def open(self) -> None:
-        """Open for this process alone; raises `TransportError`, its message holds the remedy."""
+        """Open the port exclusively; `TransportError` names the remedy."""
         self.close()
         device = self._locate()
         port = _open_exclusively(device, self.baud)
@@ -108,9 +108,9 @@ class SerialTransport:
 
     @property
     def leads_elsewhere(self) -> bool:
-        """Whether the path as given has come to mean another device than the one that is open.
+        """Whether the path now leads to another device than the one that is open.
 
-        Of a link that was laid anew, say; false where the path leads nowhere at present.
+        A symbolic link may have been changed. False while the path leads nowhere.
         """
         port = self._serial
         if port is None or self._name.startswith(USB_PREFIX):
@@ -121,12 +121,12 @@ class SerialTransport:
             return False
 
     def forget_device(self) -> None:
-        """Open the path as given next time, whatever USB device was behind it before."""
+        """Next time, open the path as given, whatever USB device it led to before."""
         if not self._name.startswith(USB_PREFIX):
             self.usb_serial = None
 
     def read(self, timeout: float) -> Chunk | None:
-        """Bytes that have come, at most `READ_LIMIT`; see `Transport.read`."""
+        """Read at most `READ_LIMIT` bytes; see `Transport.read`."""
         with self._reading:
             port, waker = self._serial, self._waker
             if port is None or waker is None:
@@ -151,7 +151,7 @@ class SerialTransport:
             return Chunk(received, data)
 
     def write(self, data: bytes | tuple[CanFrame, ...]) -> None:
-        """Send bytes within `WRITE_TIMEOUT`; those that did not go are counted."""
+        """Send bytes within `WRITE_TIMEOUT`; bytes not sent are counted."""
         if not isinstance(data, bytes):
             raise TypeError(f"a serial port takes bytes, not {type(data).__name__}")
         with self._writing:
@@ -171,17 +171,17 @@ class SerialTransport:
                         self._losses.add("write_timeout_bytes", len(rest))
                         return
                 except OSError:
-                    # The reader sees the same unplugging and raises `PortGone`.
+                    # The reader notices the same unplugging and raises `PortGone`.
                     self._losses.add("write_gone_bytes", len(rest))
                     return
 
     def close(self) -> None:
-        """Wake a waiting reader, then give the port back; more than once is fine."""
+        """Wake a waiting reader, then close the port; may be called again."""
         waker = self._waker
         if waker is not None:
             waker.wake()
         with self._reading, self._writing:
-            # Only now is nobody waiting on the descriptors, which the system may reuse at once.
+            # Only now does nobody wait on the descriptors, which the system may reuse at once.
             port, self._serial = self._serial, None
             if self._waker is not None:
                 self._waker.close()
@@ -196,7 +196,7 @@ class SerialTransport:
         return PortGone(f"{self._name} is gone ({why})", "plug it in again")
 
     def _locate(self) -> str:
-        """Path to open: where the remembered USB device is now, else the path as given."""
+        """Path to open: that of the known USB device, wherever it is, else the path as given."""
         if self.usb_serial is not None:
             found = listing.find_by_serial(self.usb_serial)
             if found is not None:
@@ -210,7 +210,7 @@ class SerialTransport:
 
 
 def _open_exclusively(device: str, baud: int) -> serial.Serial:
-    """Open ``device`` so that no second process reads it, or say why not and what to do."""
+    """Open ``device`` exclusively; `TransportError` names the remedy."""
     _check_is_port(device)
     try:
         port = serial.Serial(device, baud, timeout=0, exclusive=True)
@@ -223,16 +223,16 @@ def _open_exclusively(device: str, baud: int) -> serial.Serial:
             f"{device} refuses {baud} bit/s: {error}", "give a baud rate that the port supports"
         ) from error
     if os.major(os.fstat(port.fileno()).st_rdev) in PTY_MAJORS:
-        return port  # its other end holds it open rightly, and TIOCEXCL would outlive our death
+        return port  # the process at its other end holds it too, and TIOCEXCL would outlive us
     others = [who for who in listing.holders(device) if f"pid {os.getpid()}" not in who]
     if others:
         port.close()
         raise _busy(device, others)
-    # flock stops only programs that ask for it; this also stops those that do not.
+    # flock stops only programs that use it as well; this stops all others.
     try:
         ioctl(port.fileno(), termios.TIOCEXCL)
     except OSError as error:
-        log.debug("%s cannot be made exclusive: %s", device, error)  # flock holds all the same
+        log.debug("%s cannot be made exclusive: %s", device, error)  # flock still holds
     return port
 
 
@@ -266,7 +266,7 @@ def _busy(device: str, who: list[str]) -> PortBusy:
 
 
 def permission_remedy(device: str) -> str:
-    """What lets a user open ``device``: its group, or a udev rule."""
+    """How to permit a user to open ``device``: join its group, or add a udev rule."""
     import grp
 
     try:

@@ -1,9 +1,9 @@
 """A USB-CAN adapter that speaks slcan, on top of a serial port.
 
-python-can's own slcan driver reads byte by byte (some 5,000 frames/s at a full core), sleeps 2 s
-after opening and lets a second process open the same adapter; this one reads all that has come at
-once and keeps what `SerialTransport` gives: exclusive, found again by USB serial number, woken at
-once when closed or unplugged.
+python-can's own slcan driver reads byte by byte (some 5,000 frames/s with a full core), sleeps 2 s
+after opening and lets a second process open the same adapter. This one reads everything available
+at once and keeps the properties of `SerialTransport`: exclusive, found again by USB serial number,
+woken at once when closed or unplugged.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from tactiled.transports.serial_port import SerialTransport
 log = logging.getLogger(__name__)
 
 ANSWER_TIME = 0.15
-"""s an adapter has to answer a command; those over USB take a few milliseconds."""
+"""s for an adapter to answer a command; over USB it takes a few milliseconds."""
 
 MARK = b"N\r"
-"""Question whose answer is like no other: whatever comes before it belongs to earlier commands,
-however late it comes and however many lines the adapter makes of it."""
+"""Command with a unique answer: every line before it belongs to earlier commands, however late and
+however many."""
 
 MARK_TIME = 0.3
-"""s to wait for the first answer. Some firmware never answers; the bus then shows what is there."""
+"""s to wait for the first answer. Some firmware never answers; then traffic shows an adapter."""
 
 SILENCE = 0.08
-"""s without a frame after which the adapter is asked for its flags: bus-off is known in 0.1 s even
-from adapters that do not tell of it, and a busy one is never asked."""
+"""s without a frame after which the adapter's flags are requested: this finds bus-off in 0.1 s even
+with adapters that do not report it, and never disturbs a busy one."""
 
 
 def slcan_commands(spec: CanSpec) -> tuple[bytes, ...]:
-    """Commands that set the bit rates of ``spec``; ValueError names those that adapters have."""
+    """Commands that set the bit rates of ``spec``; ValueError lists the allowed rates."""
     bitrate = spec.bitrate or DEFAULT_BITRATE
     if bitrate not in slcan.BITRATES:
         raise ValueError(
@@ -56,7 +56,7 @@ def slcan_commands(spec: CanSpec) -> tuple[bytes, ...]:
 
 
 class SlcanLink:
-    """Frames in both directions through one adapter; see `CanTransport` for the contract."""
+    """Frames through one adapter; see `CanLink` for the contract."""
 
     def __init__(self, spec: CanSpec) -> None:
         self._spec = spec
@@ -73,13 +73,13 @@ class SlcanLink:
 
     @property
     def losses(self) -> dict[str, int]:
-        """Bytes not written and lines not understood."""
+        """Counts of bytes not written and lines not understood."""
         return self.port.losses | self._decoder.counters
 
     def open(self) -> None:
-        """Open port and channel; raises `TransportError`, also for what is not an adapter.
+        """Open port and channel; `TransportError`, also when the device is not an adapter.
 
-        An adapter that answers nothing is opened all the same.
+        An adapter that does not answer is opened all the same.
         """
         self.port.open()
         self._decoder.reset()
@@ -101,7 +101,7 @@ class SlcanLink:
         self.port.close()
 
     def receive(self, timeout: float) -> tuple[Instant, list[CanFrame]] | None:
-        """Frames and error frames that have come, and when; None after ``timeout`` s."""
+        """Instant of the read and its frames, including error frames; None after ``timeout`` s."""
         if self._pending:
             frames, self._pending = self._pending, []
             return monotonic_now(), frames
@@ -125,15 +125,15 @@ class SlcanLink:
                 return None
 
     def send(self, frames: tuple[CanFrame, ...]) -> None:
-        """Send frames in order; ValueError for frames no adapter could send."""
+        """Send frames in order; ValueError for frames that no adapter can send."""
         self.port.write(b"".join(map(slcan.encode_frame, frames)))
 
     def restart(self) -> None:
-        """Leave bus-off: the channel is closed and opened again."""
+        """Leave bus-off by closing and opening the channel."""
         self.port.write(b"C\rO\r")
 
     def _decode(self, chunk: Chunk) -> list[CanFrame]:
-        """Frames of a serial chunk, without those that tell a state once more."""
+        """Frames of a serial chunk, without repeated reports of a state."""
         if not isinstance(chunk.payload, bytes):
             raise TypeError("a serial chunk holds bytes")
         frames = []
@@ -142,13 +142,13 @@ class SlcanLink:
             if state is None or state is not self._told:
                 frames.append(frame)
             if not frame.error and self._told is BusState.BUS_OFF:
-                state = BusState.ACTIVE  # nothing comes in during bus-off
+                state = BusState.ACTIVE  # no frames arrive during bus-off
             self._told = state or self._told
         return frames
 
     def _open_channel(self) -> None:
         known = self._decoder.counters
-        # Empty lines end whatever a previous owner left half-written; a closed channel refuses C.
+        # Empty lines end a command left unfinished by a previous owner. A closed channel refuses C.
         self._asked = monotonic_now()
         answers = self._collect(b"\r\rC\r" + MARK, MARK_TIME)
         commands = (*self._setup, b"O")
@@ -158,7 +158,7 @@ class SlcanLink:
                 self._judge(command, self._collect(command + slcan.CR + MARK, wait))
             answers = self._collect(b"F\r" + MARK, wait)
         elif answers:
-            # It knows no serial number: then only prompt answers can be matched.
+            # The adapter does not know the command N, so only prompt answers can be matched.
             while self._collect(b"", ANSWER_TIME):
                 pass
             for command in commands:
@@ -182,7 +182,7 @@ class SlcanLink:
         self._tells_flags = any(slcan.flags_of(answer) is not None for answer in answers)
 
     def _judge(self, command: bytes, answers: list[bytes]) -> None:
-        """Refuse the adapter when it refused ``command``."""
+        """Raise `PortUnsuitable` when the adapter refused ``command``."""
         if slcan.BEL in answers:
             raise PortUnsuitable(self._refused(command), self._remedy())
 
@@ -197,7 +197,8 @@ class SlcanLink:
         return f"give a bit rate it has{fd}; plug it out and in when it hangs"
 
     def _collect(self, command: bytes, wait: float, wanted: int | None = None) -> list[bytes]:
-        """Send ``command``; answers up to that of `MARK`, or ``wanted``, or all in ``wait`` s."""
+        """Send ``command``; return the answers up to `MARK`'s, to ``wanted`` ones, or in ``wait``
+        s."""
         self._decoder.answers.clear()
         if command:
             self.port.write(command)
@@ -215,7 +216,7 @@ class SlcanLink:
             self._pending += self._decode(chunk)
 
     def _hear_late(self, now: Instant) -> None:
-        """Match what an adapter answers after it was opened: the mark first, then its commands."""
+        """Match late answers, after opening: first that of the mark, then those of the commands."""
         answers = self._decoder.answers
         while answers and self._unanswered:
             answer = answers.popleft()
