@@ -19,10 +19,10 @@ from tactile_core.cli import (
 )
 
 DEFAULT_SET = "hardware"
-"""The slower one, with every check of the gate switched on."""
+"""The slower set, with every check of the gate on."""
 
 DEFAULT_WAIT_S = 10.0
-"""For features and arm to come: a board's first tare takes a few seconds."""
+"""Time for features and arm to appear: a board's first tare takes a few seconds."""
 
 EPILOG = """\
 examples:

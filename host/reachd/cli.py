@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 REFRESH_S = 0.1
-"""Between looks of the main thread at the others."""
+"""Time between checks of the main thread on the others."""
 
 HUNG = 20
-"""Looks in a row that see no new cycle after which the control loop is taken to be stuck: 2 s."""
+"""Checks in a row without a new cycle after which the control loop counts as stuck: 2 s."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run reachd; the exit status: 0 reached, 1 not, 2 usage, 3 refused.
+    """Run reachd and return the exit status: 0 reached, 1 not reached, 2 usage, 3 refused.
 
-    Without ``argv`` this is the whole process, which then ends here.
+    Without ``argv`` the arguments are those of the process, which ends here.
     """
 
     def parser(shutdown: Shutdown) -> argparse.ArgumentParser:
@@ -75,7 +75,7 @@ def _run(shutdown: Shutdown, options: argparse.Namespace) -> int:
 
 
 def _load(settings: Settings) -> Strategy:
-    """The strategy; one of the user's own may lie in the folder reachd was started in."""
+    """Load the strategy; the user's own may be in the folder that reachd was started in."""
     import numpy as np
 
     from reachd.strategies import load_strategy
@@ -87,7 +87,7 @@ def _load(settings: Settings) -> Strategy:
 
 
 class _Session:
-    """What the main thread does while the daemon runs."""
+    """The main thread's work while the daemon runs."""
 
     def __init__(self, daemon: Daemon, shutdown: Shutdown) -> None:
         self._daemon = daemon
@@ -97,7 +97,7 @@ class _Session:
         self._looks = 0
 
     def run(self, line: StatusLine) -> int:
-        """Reach once, or serve until told to stop; the exit status."""
+        """Reach once, or serve until told to stop; returns the exit status."""
         daemon, settings = self._daemon, self._daemon.settings
         if settings.goal is not None:
             daemon.wait_ready(self._shutdown_requested)
@@ -115,7 +115,7 @@ class _Session:
         return DONE if self._outcome is not None and self._outcome.success else FAILED
 
     def say_why(self) -> None:
-        """Say why there was no reach."""
+        """Print why there was no reach."""
         if self._outcome is None and self._daemon.failure is None:
             cycle = self._daemon.loop.last
             why = "" if cycle is None else cycle.status.text
@@ -138,7 +138,7 @@ class _Session:
             )
 
     def _note_outcome(self) -> None:
-        """Show new outcomes, write them where they are wanted."""
+        """Show new outcomes, and write them to the file asked for."""
         from rich.console import Console
 
         from reachd.publish import show

@@ -1,4 +1,4 @@
-"""The control loop's thread: absolute deadlines, newest inputs, one command a cycle."""
+"""The control loop: absolute deadlines, newest inputs, one command per cycle."""
 
 from __future__ import annotations
 
@@ -24,18 +24,19 @@ from reachd.strategies import StrategyEvent
 from reachd.trial import Outcome, Status, Supervisor
 from tactile_core.types import NS_PER_S, Instant, monotonic_now, seconds_between
 
-# One cycle of control: supervisor, then gate, then the twist to send. Pure.
+# One cycle of control: supervisor, then gate, which gives the twist to send. Pure.
 
 
 MAX_FINISHED = 16
-"""Outcomes that wait to be taken; somebody does so several times a second."""
+"""Most outcomes kept until they are taken, which happens several times a second."""
 
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """Newest inputs, None where none ever came; whether a second publisher was seen on one.
+    """Newest inputs; None where none has come yet.
 
-    ``rivalled``: somebody else was seen to send commands to the arm.
+    ``duplicate``: a second publisher was seen on an input. ``rivalled``: another sender of commands
+    to the arm was seen.
     """
 
     touch: Touch | None
@@ -46,9 +47,9 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True)
 class Cycle:
-    """All that one cycle saw and decided. ``onsets``: interventions that have just set in.
+    """Inputs and decisions of one cycle. ``wanted``: twist from the strategy.
 
-    ``lateness`` in s.
+    ``onsets``: interventions that began in this cycle. ``lateness``: s.
     """
 
     now: Instant
@@ -62,22 +63,22 @@ class Cycle:
 
     @property
     def touch_age(self) -> float:
-        """Age of the features in s, NaN before the first."""
+        """Age of the features, s; NaN before the first."""
         touch = self.inputs.touch
         return math.nan if touch is None else seconds_between(touch.captured, self.now)
 
     @property
     def arm_age(self) -> float:
-        """Age of the arm's state in s, NaN before the first."""
+        """Age of the arm's state, s; NaN before the first."""
         arm = self.inputs.arm
         return math.nan if arm is None else seconds_between(arm.captured, self.now)
 
 
 class Controller:
-    """What the control loop runs. ``gate`` and ``supervisor`` are one arm's.
+    """One arm's supervisor and gate, run cycle by cycle. Pure.
 
-    Everything here belongs to the loop's thread, but for ``finished``: outcomes with their goals,
-    oldest first, for whoever takes them.
+    Owned by the loop's thread, except ``finished``: outcomes with their goals, oldest first, which
+    the main thread takes.
     """
 
     def __init__(self, supervisor: Supervisor, gate: SafetyGate, settings: SafetySettings) -> None:
@@ -90,10 +91,10 @@ class Controller:
         self._troubles: tuple[str, ...] = ()
 
     def cycle(self, inputs: Inputs, now: Instant, lateness: float) -> Cycle:
-        """Decide what is sent now."""
+        """Run one cycle and return its decision."""
         self.inputs = inputs
         if lateness > self._settings.arm_latch:
-            # Stopped and continued, or the machine slept: nobody has watched since.
+            # The process or the machine was suspended: nobody has watched the arm since.
             self.gate.disarm(now, f"the control loop stood still for {lateness:.1f} s")
         command = self.supervisor.step(inputs.touch, inputs.arm, now)
         decision = self.gate.step(
@@ -129,17 +130,17 @@ class Controller:
     def arm(
         self, requested: Instant, since: Instant, now: Instant, *, free_air: bool
     ) -> tuple[str, ...]:
-        """Arm at an operator's request; returns why not.
+        """Arm at an operator's request; returns why not, empty when armed.
 
-        ``since``: when the operator acted; ``requested``: when what had to come before (limits)
-        was done. Whatever latched in between was not known to the operator.
+        ``since``: when the operator acted. ``requested``: when the preparations (limits) were done.
+        A fault that latched in between is refused: the operator did not know of it.
         """
         if self.gate.armed:
             return ()
         if any(
             at > since
             for code, at in self.gate.latched_at.items()
-            if code is not Check.ARM_LIMITS  # which the request itself is about to set right
+            if code is not Check.ARM_LIMITS  # the request itself corrects the limits
         ):
             return self._troubles or ("something failed after the request to arm: ask again",)
         refusals = self.gate.arm(
@@ -150,12 +151,12 @@ class Controller:
             duplicate=self.inputs.duplicate,
             free_air=free_air,
         )
-        # A fault that goes on makes every request too old: it is the fault that matters.
+        # A lasting fault also makes every request too old; report the fault.
         causes = [r.text for r in refusals if r.code is not Check.REQUEST_STALE]
         return tuple(dict.fromkeys(causes or [r.text for r in refusals]))
 
     def reach(self, goal: Goal, now: Instant) -> str | None:
-        """Begin a trial; returns why not."""
+        """Begin a trial; returns why not, or None."""
         held = self.gate.held
         if held is not None:
             return f"the arm is not armed: {held.text}"
@@ -168,22 +169,22 @@ class Controller:
 log = logging.getLogger(__name__)
 
 CALLS = 32
-"""Requests that may wait for the control loop; it serves them every cycle."""
+"""Most requests that may wait for the control loop, which serves them in every cycle."""
 
 LATENESS_KEPT = 60_000
-"""Cycles of which the lateness is kept for the status: ten minutes."""
+"""Cycles whose lateness is kept for the status: ten minutes."""
 
 LAST_ZEROS = 3
-"""Zero twists sent at the end: one may be lost on the way."""
+"""Zero twists sent at the end, because one may be lost."""
 
 R = TypeVar("R")
 
 
 def ask_real_time(priority: int) -> bool:
-    """Have the calling thread, and those it starts, run before all ordinary ones; False if refused.
+    """Give the calling thread, and those it starts, real-time priority; False when refused.
 
-    The interpreter's lock has no priorities: a thread that holds it while other programs have the
-    processor makes the control loop wait. So the daemon asks for all of its threads.
+    Python's interpreter lock has no priorities: a thread that holds it while other programs use the
+    processor delays the control loop. So the daemon requests it for all of its threads.
     """
     if not hasattr(os, "sched_setscheduler"):  # macOS
         return False
@@ -200,9 +201,9 @@ def ask_real_time(priority: int) -> bool:
 
 
 class Schedule:
-    """Absolute deadlines ``period`` s apart; those that were missed are skipped, not made up for.
+    """Absolute deadlines ``period`` s apart. Pure.
 
-    Pure. ``missed`` counts them.
+    Missed deadlines are skipped and counted in ``missed``.
     """
 
     def __init__(self, period: float, start: Instant) -> None:
@@ -211,7 +212,7 @@ class Schedule:
         self.missed = 0
 
     def begin(self, now: Instant) -> float:
-        """A cycle begins at ``now``: returns its lateness in s and sets the next deadline."""
+        """Begin a cycle at ``now``: set the next deadline and return the lateness, s."""
         late_ns = max(0, now - self.deadline)
         skipped = late_ns // self._period_ns
         self.missed += skipped
@@ -227,12 +228,12 @@ class Lateness:
         self.cycles = 0
 
     def add(self, lateness: float) -> None:
-        """Take one cycle's."""
+        """Add the lateness of one cycle, s."""
         self._kept.append(lateness)
         self.cycles += 1
 
     def summary(self) -> dict[str, float]:
-        """Percentiles of the cycles kept, empty before the first."""
+        """Percentiles over the cycles kept, s; empty before the first."""
         kept = np.array(list(self._kept))
         if not kept.size:
             return {}
@@ -241,11 +242,12 @@ class Lateness:
 
 
 class ControlLoop:
-    """Runs a controller at its period until `stop`. ``failure``: what it died of.
+    """Runs a controller at its period, on a thread of its own, until `stop`.
 
-    ``sense`` fetches the newest inputs, ``act`` sends a twist with its expiry in s and returns what
-    was sent, ``report`` is told of every cycle and of that; none of them may block. ``priority``:
-    real-time priority to take where ``real_time`` says that the system grants it.
+    ``sense`` returns the newest inputs. ``act`` sends a twist with its expiry in s and returns the
+    bytes sent. ``report`` receives every cycle and those bytes. None of them may block. ``failed``
+    receives the error that ended the thread. ``priority``: real-time priority to use when
+    ``real_time`` is set.
     """
 
     def __init__(
@@ -277,14 +279,15 @@ class ControlLoop:
         self._thread = threading.Thread(target=self._run, name="control", daemon=True)
 
     def start(self) -> None:
-        """Begin to run; disarmed, it sends zero twists."""
+        """Start the thread; while disarmed, it sends zero twists."""
         self.beat = monotonic_now()
         self._thread.start()
 
     def stop(self, timeout: float) -> bool:
-        """Zero twists, then the end; False when the thread does not end within ``timeout`` s.
+        """Send zero twists and end; False when the thread does not end within ``timeout`` s.
 
-        Then the zero twist is sent from here: the thread is stuck in somebody's code.
+        In that case it is stuck in other code, such as the strategy's, and the zero twists are sent
+        from here.
         """
         self._stopping = True
         if self._thread.ident is None:
@@ -296,7 +299,7 @@ class ControlLoop:
         return True
 
     def call(self, work: Callable[[Instant], R]) -> Future[R]:
-        """Have ``work`` done by the loop's thread between two cycles, told the instant."""
+        """Run ``work`` on the loop's thread between two cycles, with the present instant."""
         future: Future[R] = Future()
         if len(self._calls) >= CALLS:
             future.set_exception(ValueError(f"{CALLS} requests are waiting already"))
@@ -324,7 +327,7 @@ class ControlLoop:
 
     def _cycle(self, now: Instant, lateness: float) -> None:
         inputs = self._sense(now)
-        # Read again: an input captured since then must not seem to come from the future.
+        # Read the clock again, or an input captured since then would seem to be in the future.
         now = monotonic_now()
         cycle = self.controller.cycle(inputs, now, lateness)
         sent = self._act(cycle.decision.twist, cycle.decision.expiry, now)
@@ -336,10 +339,10 @@ class ControlLoop:
             work, future = self._calls.popleft()
             try:
                 future.set_result(work(monotonic_now()))
-            except Exception as error:  # noqa: BLE001 - whoever asked is told; the loop goes on
+            except Exception as error:  # noqa: BLE001 - the caller gets it; the loop goes on
                 future.set_exception(error)
 
     def _halt(self) -> None:
         for _ in range(LAST_ZEROS):
-            with suppress(ArmError):  # it stops by itself, then
+            with suppress(ArmError):  # the arm then stops by itself
                 self._act(ZERO, self._expiry, monotonic_now())

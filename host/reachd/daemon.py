@@ -1,8 +1,8 @@
-"""The daemon: threads and I/O round the pure parts.
+"""The daemon: threads and I/O around the pure core.
 
-Threads: the control loop's (`loop`), the reporter's (`publish`), the log's writer (`recorder`),
-zenoh's own for services and for what is logged, and the main thread, which watches. Each that dies
-takes the daemon down loudly; the arm then stops by itself, for commands have ceased.
+Threads: the control loop's (`control`), the reporter's (`publish`), the log's writer (`recorder`),
+zenoh's own for services and for logged topics, and the main thread, which watches. If one dies,
+the daemon ends with an error; the arm then stops by itself because commands cease.
 """
 
 from __future__ import annotations
@@ -45,23 +45,22 @@ from tactile_core.types import Echo, Instant, WallClock, monotonic_now, seconds_
 log = logging.getLogger(__name__)
 
 SWITCH_INTERVAL = 0.0002
-"""s after which Python hands the interpreter on: the control loop must get it soon after it
-wakes."""
+"""s after which Python switches threads: the control loop must run soon after it wakes."""
 
 ASK_COMMANDERS = 0.5
-"""s to ask the bus whether somebody else commands the arm; links take some of it to come about."""
+"""s to find out whether another reachd commands the arm; part of it is needed to connect."""
 
 ASK_AGAIN = 0.02
-"""s between two such questions."""
+"""s between queries meanwhile."""
 
 STOP_TIMEOUT = 0.3
-"""s for the control loop to end: a cycle takes 10 ms."""
+"""s for the control loop to end; a cycle takes 10 ms."""
 
 COLLECT_EVERY = 10.0
 """s between collections of garbage while nothing moves."""
 
 NAMES_TIMEOUT = 0.5
-"""s to ask the bus for the names of boards, for an error message."""
+"""s to query the names of boards, for an error message."""
 
 
 class Daemon(Service):
@@ -85,7 +84,7 @@ class Daemon(Service):
         self._tokens: list[zenoh.LivelinessToken] = []
         self._log_state = "recording"
         self._disk: DiskWatch | None = None
-        self._commanded = False  # the arm was ours once
+        self._commanded = False  # whether we have ever commanded the arm
         self._collected = monotonic_now()
         p = settings.parameters
         supervisor = Supervisor(strategy, p, settings.home, auto_reset=settings.auto_reset)
@@ -102,7 +101,7 @@ class Daemon(Service):
 
     @property
     def about(self) -> dict[str, Any]:
-        """What a reach was made with."""
+        """Settings that describe a reach in logs and outcomes."""
         s = self.settings
         return {
             "strategy": s.strategy,
@@ -165,7 +164,7 @@ class Daemon(Service):
         if settings.parameters.note:
             log.info("set %s: %s", settings.parameters.name, settings.parameters.note)
             self._reporter.event("safety", "note", settings.parameters.note)
-        # What lives now is taken out of the collector's sight, which must not stop the loop.
+        # Objects alive now are exempted from garbage collection, which would stop the loop.
         gc.collect()
         gc.freeze()
         gc.disable()
@@ -173,7 +172,7 @@ class Daemon(Service):
         self._services = ReachServices(session, settings.name, self._requests, self.summary)
 
     def _claim(self, session: zenoh.Session) -> None:
-        """Say who commands the arm; refuse when somebody on another machine does."""
+        """Declare that we command the arm; `StartError` when another reachd on the bus does."""
         arm, name = self.settings.arm, self.settings.name
         mine = commander_key(arm, f"{name}-{str(session.zid())[:32]}")
         self._tokens = [
@@ -193,7 +192,7 @@ class Daemon(Service):
             )
 
     def wait_ready(self, stopping: threading.Event) -> None:
-        """Wait until valid features and the arm's state come; `StartError` when they do not."""
+        """Wait for valid features and the arm's state; `StartError` when they do not come."""
         safety = self.settings.parameters.safety
         deadline = time.monotonic() + self.settings.wait
         while not (stopping.is_set() or self.done.is_set()):
@@ -206,7 +205,7 @@ class Daemon(Service):
             stopping.wait(0.02)
 
     def check_arm(self) -> None:
-        """`StartError` when the arm was never ours and is another's."""
+        """Raise `StartError` when we never commanded the arm and another commander has it."""
         if self._arm is not None and self._arm.denied is not None and not self._commanded:
             raise StartError(self._arm.denied)
         cycle = self.loop.last
@@ -214,7 +213,7 @@ class Daemon(Service):
         self._commanded |= arm is not None and arm.echo is not None and arm.echo.own
 
     def reach(self, goal: Goal) -> None:
-        """Arm and begin a reach; `StartError` when either is refused."""
+        """Arm the gate and begin a reach; `StartError` when either is refused."""
         requests, touch = self._requests, self._touch
         if requests is None or touch is None:
             raise RuntimeError("reach() before start()")
@@ -227,7 +226,7 @@ class Daemon(Service):
             raise StartError(f"nothing moves: {error}") from error
 
     def cancel(self, text: str) -> None:
-        """Stop a reach that is under way, with an outcome: the next cycle sends the zero twist."""
+        """Stop a reach under way and give it an outcome; the next cycle sends the zero twist."""
         if self._requests is None or not self.moving:
             return
         try:
@@ -245,14 +244,14 @@ class Daemon(Service):
         return self.loop.controller.supervisor.state in (State.HOMING, State.REACHING)
 
     def conclude(self, outcome: Outcome, goal: Goal) -> str:
-        """Write an outcome into the log; returns it as JSON."""
+        """Write an outcome into the log and return it as JSON."""
         text = as_json(outcome, goal, self.about)
         if self.recorder is not None:
             self.recorder.metadata("outcome", {"json": text})
         return text
 
     def watch(self) -> None:
-        """Look after log, geometry and garbage; called a few times a second by the main thread."""
+        """Watch the log, request the geometry, collect garbage; called a few times a second."""
         if self.recorder is not None:
             stats = self.recorder.stats
             if stats.state != self._log_state:
@@ -263,14 +262,14 @@ class Daemon(Service):
         if self._listener is not None and cycle is not None and cycle.inputs.touch is not None:
             try:
                 self._listener.ask_geometry()
-            except zenoh.ZError as error:  # a picture less in the log
+            except zenoh.ZError as error:  # the log only lacks a picture
                 log.debug("the geometry of the board cannot be asked for: %s", error)
         if not self.moving and seconds_between(self._collected, now) > COLLECT_EVERY:
             self._collected = now
             gc.collect()
 
     def _log_trouble(self) -> str | None:
-        """Why the log that was asked for is not being written."""
+        """Why a requested log is not being written, or None."""
         if self.recorder is None:
             return None
         stats = self.recorder.stats
@@ -284,8 +283,8 @@ class Daemon(Service):
     def stop(self) -> bool:
         """End in order: zero twist, services, reports, log (at most 1 s), arm, bus, lock.
 
-        Nothing publishes once the session closes, which it does last. False when a thread is still
-        inside somebody's code: it must then be left behind.
+        The session closes after everything that publishes. False when a thread is still inside
+        other code, such as the strategy's: it must be left behind.
         """
         clean = ended = self.loop.stop(STOP_TIMEOUT)
         if self._disk is not None:
@@ -312,7 +311,7 @@ class Daemon(Service):
         return clean
 
     def summary(self) -> dict[str, Any]:
-        """Everything worth knowing, for the status service. s, m, N."""
+        """State for the status service, in s, m and N."""
         cycle, touch, arm = self.loop.last, self._touch, self._arm
         values: dict[str, Any] = self.about | {
             "board": self.settings.board,
@@ -330,7 +329,7 @@ class Daemon(Service):
             "reports_unsent": 0 if self._reporter is None else self._reporter.unsent,
             "clock_problem": self._wall.problem,
         }
-        # Asked themselves, for the last cycle may be older than a request that was just granted.
+        # Not from the last cycle, which may be older than a request that was just granted.
         status = self.loop.controller.supervisor.status(monotonic_now())
         held = self.loop.controller.gate.held
         values |= {
@@ -355,7 +354,7 @@ class Daemon(Service):
         disk = None if self._disk is None else self._disk.alarm(monotonic_now())
         return [] if disk is None else [disk]
 
-    # What the control loop calls
+    # Called by the control loop
 
     def _sense(self, now: Instant) -> Inputs:
         touch, arm = self._touch, self._arm
@@ -388,7 +387,7 @@ class Daemon(Service):
         return recorder
 
     def _missing(self) -> str:
-        """Which input does not come, or is no good, and what to do about it."""
+        """Which inputs are missing or unusable, and the remedy."""
         s, cycle, touch = self.settings, self.loop.last, self._touch
         safety = s.parameters.safety
         seen = None if cycle is None else cycle.inputs.touch
@@ -426,7 +425,7 @@ class Daemon(Service):
 
 
 def _fit(cycle: Cycle, safety: SafetySettings) -> bool:
-    """Whether both inputs are there, valid and stamped by a clock like ours."""
+    """Whether both inputs are present, valid and fresh."""
     touch = cycle.inputs.touch
     return (
         touch is not None

@@ -1,9 +1,8 @@
-"""The newest of each input of control: who may publish it, and how old it is. Pure.
+"""The newest value of each input of control: who may publish it, and its age.
 
-Ages are judged on this host's monotonic clock. A stamp is taken at its word only as the stamp of
-this machine's own clock; a sender on another machine has to be named in the settings, for then
-the clock it stamps with is another. A sender that is not named shows up as stamps far from now,
-which the gate refuses. Any doubt so ends in standing still.
+Ages are measured on this host's monotonic clock. Stamps are assumed to be of the same clock, unless
+the settings say that the sender runs on another machine. A sender elsewhere that the settings do
+not name gives stamps far from now, which the gate refuses. When in doubt, the arm stops.
 """
 
 from __future__ import annotations
@@ -24,23 +23,23 @@ from tactile_core.types import Echo, Instant, RemoteClock, monotonic_now, second
 T = TypeVar("T")
 
 DUPLICATE_FOR = 1.0
-"""s after the last sample of a second publisher until it is taken to be gone."""
+"""s after the last sample of a second publisher until it counts as gone."""
 
 
 class Verdict(Enum):
-    """What becomes of a sample."""
+    """Judgement of a sample."""
 
     ACCEPTED = auto()
-    REPEATED = auto()  # the very sample before, brought by a second link
+    REPEATED = auto()  # the last sample again, over a second link
     DUPLICATE = auto()  # from a second publisher, or one that pretends to be the first
-    ANONYMOUS = auto()  # its publisher does not say who it is, so it cannot be told from others
+    ANONYMOUS = auto()  # has no publisher's id, so it cannot be told from others
 
 
 class SourcePin:
-    """Holds an input to its first publisher for as long as that one is heard.
+    """Pins an input to its first publisher for as long as that one sends.
 
-    Once it was silent for ``takeover`` s, by which time nothing moves on its word, the next
-    publisher is as good as a restart of the first.
+    After ``takeover`` s of silence, when nothing moves on its data any more, the next publisher is
+    accepted like a restart of the first.
     """
 
     def __init__(self, takeover: float) -> None:
@@ -53,15 +52,15 @@ class SourcePin:
 
     @property
     def source(self) -> bytes | None:
-        """Id of the publisher it is held to."""
+        """Id of the publisher that the input is pinned to."""
         return self._source
 
     def judge(self, sample: BusSample, now: Instant) -> Verdict:
-        """Whether a sample received at ``now`` may be used."""
+        """Judge a sample received at ``now``."""
         if sample.source is None or sample.sequence is None:
             return self._note_foreign(now) if self._live(now) else Verdict.ANONYMOUS
         if not self._live(now):
-            # Whoever it is: a number forged under the first one's name must not lock him out.
+            # Any sequence number: one forged under the publisher's id must not lock it out.
             repeated = sample.source == self._source and sample.data == self._data
             if repeated and sample.sequence == self._sequence:
                 return Verdict.REPEATED
@@ -76,7 +75,7 @@ class SourcePin:
         return Verdict.ACCEPTED
 
     def duplicated(self, now: Instant) -> bool:
-        """Whether a second publisher was heard of late."""
+        """Whether a second publisher was seen in the last `DUPLICATE_FOR` s."""
         return self._foreign is not None and seconds_between(self._foreign, now) < DUPLICATE_FOR
 
     def _live(self, now: Instant) -> bool:
@@ -88,7 +87,7 @@ class SourcePin:
 
 
 class Input(Generic[T]):
-    """One input: newest value, and what was not used, by reason.
+    """One input: its newest value, and counts of samples by what became of them. Pure.
 
     ``make`` turns a message, its captured and its received instant into the value, and may raise
     ValueError. ``remote``: the sender's monotonic clock is not this machine's.
@@ -116,7 +115,7 @@ class Input(Generic[T]):
         self._clock_of: bytes | None = None
 
     def take(self, sample: BusSample, now: Instant) -> None:
-        """Take in a sample received at ``now``; what cannot be used is counted."""
+        """Process a sample received at ``now``; samples that cannot be used are counted."""
         verdict = self.pin.judge(sample, now)
         if verdict is not Verdict.ACCEPTED:
             self.counters[verdict.name.lower()] += 1
@@ -140,7 +139,7 @@ class Input(Generic[T]):
 
 
 def make_touch(message: Any, captured: Instant, received: Instant) -> Touch:
-    """``ContactFeatures`` as strategies see them; ValueError for a side that does not exist."""
+    """Convert ``ContactFeatures`` for strategies; ValueError for an unknown side."""
     return Touch(
         captured=captured,
         received=received,
@@ -159,7 +158,10 @@ def make_touch(message: Any, captured: Instant, received: Instant) -> Touch:
 def make_arm_state(
     message: Any, captured: Instant, received: Instant, commander: str = ""
 ) -> ArmState:
-    """``ArmState.msg`` as strategies and gate see it; ``commander``: as whom we command the arm."""
+    """Convert an ``ArmState`` message for strategies and gate.
+
+    ``commander``: the name under which we command the arm.
+    """
     linear, angular = message.twist.linear, message.twist.angular
     says = str(message.commander)
     echo = Echo(
@@ -191,7 +193,7 @@ def make_arm_state(
 
 
 class TouchInput:
-    """Newest features of ``board``; `newest` and `duplicated` are the control loop's."""
+    """Newest features of ``board``; the control loop calls `newest` and `duplicated`."""
 
     def __init__(
         self, session: zenoh.Session, board: str, takeover: float, *, remote: bool = False
@@ -200,18 +202,18 @@ class TouchInput:
         self._input: Input[Touch] = Input(FEATURES, make_touch, takeover, remote=remote)
         self._watch = SourcePin(takeover)
         self._latest: Latest = latest(session, key)
-        # The newest sample may hide another publisher's, so all of them are watched beside it.
+        # The newest sample may hide another publisher's, so every sample is checked as well.
         self._tap = Tap(session, key, self._watch_features)
 
     def newest(self, now: Instant) -> Touch | None:
-        """Newest features, None before the first."""
+        """Newest features; None before the first."""
         sample = self._latest.newest()
         if sample is not None:
             self._input.take(sample, now)
         return self._input.value
 
     def duplicated(self, now: Instant) -> bool:
-        """Whether a second publisher was heard of late."""
+        """Whether a second publisher was seen in the last `DUPLICATE_FOR` s."""
         return self._input.pin.duplicated(now) or self._watch.duplicated(now)
 
     @property
@@ -227,11 +229,11 @@ class TouchInput:
         return message is not None and bool(message.calibrated)
 
     def counters(self) -> dict[str, int]:
-        """Features received, and what was not used, by reason."""
+        """Counts of samples accepted, and of those not used, by reason."""
         return self._input.counters | {"oversized": self._latest.refused}
 
     def close(self) -> None:
-        """Take the subscriptions back."""
+        """Undeclare the subscriptions."""
         self._tap.close()
         self._latest.close()
 

@@ -1,9 +1,9 @@
-"""One reachd an arm: a file lock for its user, named after the arm.
+"""One reachd per arm: a file lock for each user, named after the arm.
 
-The kernel lets go of it when its holder dies, however it dies. The lock is of a file that is its
-user's own, in a folder that is; the file is opened and never written, so whatever lies under its
-name keeps its contents. What the holder says of itself stands in a file beside it. That two users
-do not command one arm is seen to on the bus, where every commander of an arm shows itself.
+The kernel releases it when its holder dies, however it dies. The lock file and its folder belong to
+the user; the file is opened and never written, so whatever exists under its name keeps its
+contents. The holder describes itself in a second file. Commanders of different users find each
+other on the bus, where every commander of an arm shows itself.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from pathlib import Path
 from tactile_core.config import printable
 
 RUNTIME_VARIABLE = "TACTILE_RUNTIME_DIR"
-"""Environment variable that names another folder for locks: simulations side by side, each with
-its own arm of the same name, need one each."""
+"""Environment variable for another folder of locks: simulations side by side, each with its own arm
+of the same name, need one each."""
 
 MAX_NOTE = 4096
-"""Bytes read of what a holder wrote about itself."""
+"""Most bytes read of a holder's note."""
 
 
 class LockError(Exception):
-    """The arm is taken, or the lock cannot be had; the message names the remedy."""
+    """The arm is locked by another process, or the lock is unusable; the text names the remedy."""
 
 
 def runtime_folder() -> Path:
-    """Folder of this user's locks: as given, or one that is made for them."""
+    """Folder of this user's locks: as given in the environment, else the default."""
     given = os.environ.get(RUNTIME_VARIABLE)
     if given:
         return Path(given)
-    # Not the folder of a login: a service and a login of one user must find each other's lock.
+    # Not a login's folder: a service and a login of one user must find each other's lock.
     common = Path("/run/lock")
     if not (common.is_dir() and os.access(common, os.W_OK)):
         common = Path(tempfile.gettempdir())
@@ -53,7 +53,7 @@ class ArmLock:
 
     @property
     def note(self) -> Path:
-        """File in which the holder says who it is."""
+        """File in which the holder describes itself."""
         return self.path.with_suffix(".holder")
 
     def acquire(self, name: str) -> None:
@@ -86,14 +86,14 @@ class ArmLock:
             ) from error
 
     def release(self) -> None:
-        """Let the arm go. The file stays: to delete it would let two hold locks of one name."""
+        """Release the arm. The lock file stays: deleting it could give two holders of one name."""
         if self._file is not None:
             self.note.unlink(missing_ok=True)
             os.close(self._file)
             self._file = None
 
     def _open(self) -> int:
-        """The lock's file: plain, this user's, under no other name; made when missing."""
+        """Open or make the lock file; OSError unless it is plain, this user's, with one name."""
         flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
         try:
             file = os.open(self.path, flags | os.O_CREAT | os.O_EXCL, 0o600)
@@ -114,7 +114,7 @@ class ArmLock:
         return file
 
     def _write_note(self, name: str) -> None:
-        """Say who holds it, in a new file that takes the place of an old one."""
+        """Write who holds the lock, in a new file that replaces an old one."""
         note = json.dumps({"pid": os.getpid(), "reach": name}).encode()
         fresh = self.note.with_suffix(f".{os.getpid()}")
         fresh.unlink(missing_ok=True)
@@ -126,13 +126,13 @@ class ArmLock:
         os.replace(fresh, self.note)
 
     def _holder(self, file: int) -> str:
-        """Who holds the lock, in words: as the kernel says, with the name it gave itself."""
+        """Text on who holds the lock: from the kernel, with the name from its note."""
         told = self._read_note()
         pid = _holding_process(file) or told.get("pid")
         parts = []
         if isinstance(pid, int):
             parts.append(f"process {pid}")
-            with suppress(OSError):  # it is gone, or this is not Linux
+            with suppress(OSError):  # the process is gone, or this is not Linux
                 parts.append(f"user {_user(Path(f'/proc/{pid}').stat().st_uid)}")
         if "reach" in told and told.get("pid") == pid:
             parts.append(f"reach {printable(str(told['reach']))!r}")
@@ -153,9 +153,9 @@ class ArmLock:
 
 
 def _make_folder(folder: Path) -> None:
-    """Make the folder when missing; OSError for the usual one where it is somebody else's.
+    """Make the folder if missing; OSError when the default one belongs to another user.
 
-    Of a folder that was given, the files are judged one by one.
+    In a folder given by the environment only the files are checked.
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     owner = folder.lstat().st_uid
@@ -164,7 +164,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def _holding_process(file: int) -> int | None:
-    """Process that holds a lock on an open file, as Linux says; None where it does not."""
+    """Process that holds a lock on an open file, by Linux's list; None if unknown."""
     try:
         status = os.fstat(file)
         place = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"

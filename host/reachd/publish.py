@@ -1,6 +1,6 @@
-"""What reachd says: state and events on the bus, and everything into the log.
+"""Publish reachd's state and events, and write everything about a trial into the log.
 
-A thread of its own does it, so that the control loop only ever drops a value into a queue.
+This has a thread of its own, so that the control loop only puts values into a queue.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ from tactile_core.log.recorder import Recorder
 from tactile_core.throttle import Throttle
 from tactile_core.types import Instant, WallClock, monotonic_now
 
-# Everything that is said on the bus about a trial, into the log as it came.
+# Logs everything on the bus that concerns a trial, as received.
 
 
 MAX_NAMES = 16
-"""Names of streams that are logged: a board's, an arm's and a world's, and some to spare; so that
-a publisher that makes up names cannot fill the log with channels."""
+"""Most names of streams that are logged, for board, arm, world and some to spare, so that a
+publisher that invents names cannot fill the log with channels."""
 
 ANSWER = 5.0
-"""s for which an answer of the board may come."""
+"""s for the board's answer."""
 
 
 class Listener:
-    """Logs all streams of ``board``, the state of ``arm``, frames, and every world's objects.
+    """Logs all streams of ``board``, the state of ``arm``, frames, and the objects of every world.
 
-    ``refused``: samples of topics or names that are not logged.
+    ``refused``: count of samples with topics or names that are not logged.
     """
 
     def __init__(
@@ -78,10 +78,9 @@ class Listener:
         self._taps = [Tap(session, key, self._take) for key in keys]
 
     def ask_geometry(self) -> None:
-        """Have the board's geometry published once more, for it was before this began to listen.
+        """Ask the board, once, to publish its geometry again: the log may have begun after it did.
 
-        To be called when features come, so that the board can be asked. Nobody waits for the
-        answer; a second call does nothing.
+        Call this when features come, which shows that the board answers. Does not wait.
         """
         if not self._asked:
             self._asked = True
@@ -118,7 +117,7 @@ DIRECTIONS = ("ccw", "cw")
 
 
 def as_json(outcome: Outcome, goal: Goal, about: dict[str, Any]) -> str:
-    """One JSON object: ``about`` (strategy, set, seed), goal and outcome. m, s, N."""
+    """One JSON object of ``about`` (strategy, set, seed), goal and outcome, in m, s and N."""
     values = about | {
         "goal": {"x": goal.x, "y": goal.y, "radius": goal.radius, "time_limit": goal.time_limit},
         "success": outcome.success,
@@ -139,7 +138,7 @@ def as_json(outcome: Outcome, goal: Goal, about: dict[str, Any]) -> str:
 
 
 def excavations(outcome: Outcome) -> str:
-    """Excavations by direction and trigger."""
+    """Text of excavations by direction and trigger."""
     count = len(outcome.excavations)
     if not count:
         return "none"
@@ -150,13 +149,13 @@ def excavations(outcome: Outcome) -> str:
 
 
 def interventions(outcome: Outcome) -> str:
-    """Interventions by code, the most frequent first."""
+    """Text of interventions by code, most frequent first."""
     ordered = sorted(outcome.interventions.items(), key=lambda item: -item[1])
     return ", ".join(f"{code} {n}" for code, n in ordered) or "none"
 
 
 def last_line(outcome: Outcome) -> str:
-    """All that matters, in one line."""
+    """Summary of an outcome in one line."""
     word = "REACHED" if outcome.success else f"NOT REACHED ({outcome.reason})"
     return (
         f"{word}: {_mm(outcome.distance)} from the target, {outcome.time:.2f} s, peak force "
@@ -195,18 +194,18 @@ def _finite(value: float) -> float | None:
 log = logging.getLogger(__name__)
 
 MAX_WAITING = 1000
-"""Cycles and events that may wait for the thread: ten seconds' worth; then the oldest go."""
+"""Most cycles and events that wait for the thread, ten seconds' worth; the oldest are dropped."""
 
 MAX_TEXT = 1000
-"""Characters of an event's text; some of it comes from whoever asks for a stop."""
+"""Most characters of an event's text, part of which may come from a request."""
 
 NO_TWIST = Twist(math.nan, math.nan, math.nan)
-"""Shown as wanted where the strategy gave none."""
+"""Published as wanted when the strategy gave no twist."""
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened once; see ``ReachEvent.msg``."""
+    """A single event; see ``ReachEvent.msg``."""
 
     at: Instant
     kind: str
@@ -215,7 +214,10 @@ class Event:
 
 
 class Reporter:
-    """Publishes and logs for the reach called ``name``. ``recorder`` None: nothing is logged."""
+    """Publishes and logs the state of the reach ``name``. ``recorder`` None: nothing is logged.
+
+    ``dropped``: cycles and events that found the queue full.
+    """
 
     def __init__(
         self,
@@ -229,7 +231,7 @@ class Reporter:
     ) -> None:
         self.dropped = 0
         self.unsent = 0
-        """Messages that could not be encoded, or that the bus did not take."""
+        """Messages that could not be encoded or that the bus did not take."""
         self._ended = False
         self._publishing = threading.Lock()
         self._complaints = Throttle(rate=0.1, burst=3)
@@ -254,21 +256,21 @@ class Reporter:
         self._thread.start()
 
     def cycle(self, cycle: Cycle, sent: bytes) -> None:
-        """Report a cycle and the command that was sent in it, empty for none.
+        """Report a cycle and the command sent in it, which may be empty.
 
-        Called by the control loop alone. Never blocks.
+        Only the control loop calls this. Never blocks.
         """
         self._sequence = (self._sequence + 1) & 0xFFFFFFFF
         self._put((self._sequence, cycle, sent))
 
     def event(self, kind: str, code: str, text: str, at: Instant | None = None) -> None:
-        """Report something that happened; from any thread. Never blocks."""
+        """Report an event, from any thread. Never blocks."""
         self._put(Event(monotonic_now() if at is None else at, kind, code, text))
 
     def close(self, timeout: float = 0.5) -> bool:
-        """Report what waits and end; False when that takes longer than ``timeout`` s.
+        """Report what is waiting and end; False when that takes longer than ``timeout`` s.
 
-        Either way nothing is published after it.
+        In either case nothing is published afterwards.
         """
         self._queue.put(None)
         self._thread.join(timeout)
@@ -286,11 +288,11 @@ class Reporter:
             try:
                 self._queue.get_nowait()
                 self.dropped += 1
-            except queue.Empty:  # the thread has just taken it
+            except queue.Empty:  # the thread has just emptied it
                 pass
         self._queue.put(item)
 
-    # What follows runs in the reporter's thread.
+    # Everything below runs on the reporter's thread.
 
     def _run(self) -> None:
         try:

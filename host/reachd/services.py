@@ -1,4 +1,4 @@
-"""What an operator may ask for, from the command line or over the bus, in whole steps."""
+"""Requests of an operator, from the command line or over the bus."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from tactile_core.bus.topics import service_key
 from tactile_core.config import ConfigError, printable
 from tactile_core.types import ArmLimits, ArmState, Instant, monotonic_now
 
-# Targets as people give them, checked before anything moves.
+# Targets, checked before anything moves.
 
 
 def parse_target(text: str) -> tuple[float, float]:
-    """``X,Y`` in m in ``cupboard``; ConfigError says what was given."""
+    """Parse ``X,Y``, m in ``cupboard``; ConfigError names the form."""
     parts = text.split(",")
     try:
         x, y = (float(part) for part in parts)
@@ -49,10 +49,10 @@ def make_goal(
     radius: float | None = None,
     time_limit: float | None = None,
 ) -> Goal:
-    """Goal of a reach with the set's radius and time limit unless given.
+    """Make the goal of a reach: target, m in ``cupboard``; radius, m; time limit, s.
 
-    ConfigError for a target where the tip may not go, or a radius or time that is not positive
-    and finite.
+    Radius and time limit default to those of the set. ConfigError for a target outside the tip's
+    region, or a radius or time that is not positive and finite.
     """
     goal = Goal(
         x,
@@ -76,23 +76,23 @@ def make_goal(
 
 
 LOOP_TIMEOUT = 1.0
-"""s the control loop may take to look at a request: it does so every 10 ms."""
+"""s for the control loop to serve a request; it does so every 10 ms."""
 
 CONFIRM_TIMEOUT = 0.5
 """s until the arm's state must show the limits that it confirmed."""
 
 POLL = 0.005
-"""s between looks at the arm's state meanwhile."""
+"""s between checks of the arm's state meanwhile."""
 
 R = TypeVar("R")
 
 
 class RefusedError(Exception):
-    """A request that is not granted; the message says why."""
+    """A request was refused; the text says why."""
 
 
 class OperatorRequests:
-    """Arm, reach, stop, reset and clear; from any thread but the control loop's.
+    """Arm, reach, stop, reset and clear; call from any thread but the control loop's.
 
     All raise `RefusedError`.
     """
@@ -105,7 +105,7 @@ class OperatorRequests:
         reporter: Reporter,
         log_trouble: Callable[[], str | None] = lambda: None,
     ) -> None:
-        """``log_trouble``: why the log that was asked for is not being written, None if it is."""
+        """``log_trouble``: returns why a requested log is not being written, or None."""
         self._loop = loop
         self._arm = arm
         self._parameters = parameters
@@ -114,9 +114,9 @@ class OperatorRequests:
         self._arming = threading.Lock()
 
     def arm(self, *, free_air: bool = True) -> None:
-        """Set the arm's limits, have them confirmed, and let commands pass.
+        """Set the arm's limits, wait for their confirmation, and arm the gate.
 
-        ``free_air=False``: the finger touches something, so its force sensor cannot be judged.
+        ``free_air=False``: the finger touches something, so the force sensor cannot be checked.
         """
         with self._arming:
             since = monotonic_now()
@@ -134,10 +134,10 @@ class OperatorRequests:
     def reach(
         self, x: float, y: float, radius: float | None = None, time_limit: float | None = None
     ) -> Goal:
-        """Begin a trial. `ConfigError` for a goal that cannot be.
+        """Begin a trial towards (x, y), m in ``cupboard``; see `make_goal` for errors.
 
-        Without the log that was asked for none begins; one that is under way when the log fails
-        goes on.
+        Refused while a requested log is not being written. A trial under way when the log fails
+        continues.
         """
         trouble = self._log_trouble()
         if trouble is not None:
@@ -149,7 +149,7 @@ class OperatorRequests:
         return goal
 
     def stop(self, text: str = "stopped by the operator") -> None:
-        """End whatever moves."""
+        """End any motion."""
         self._granted(lambda now: self._loop.controller.supervisor.request_stop(now, text))
         self._reporter.event("operator", "stop", text)
 
@@ -159,7 +159,7 @@ class OperatorRequests:
         self._reporter.event("operator", "reset", "")
 
     def clear(self) -> str:
-        """Have the arm clear a fault or stop; it stays disarmed here. Returns the arm's mode."""
+        """Make the arm clear a fault or stop, and return its mode. The gate stays disarmed."""
         try:
             mode = self._arm.request_clear()
         except ArmError as error:
@@ -199,7 +199,7 @@ class OperatorRequests:
 
 
 def same_limits(state: ArmState, limits: ArmLimits) -> bool:
-    """Whether an arm's state confirms ``limits``, to within its rounding."""
+    """Whether an arm's state confirms ``limits``, to within rounding."""
     pairs = (
         (state.v_max, limits.v_max),
         (state.omega_max, limits.omega_max),
@@ -209,13 +209,11 @@ def same_limits(state: ArmState, limits: ArmLimits) -> bool:
     return all(abs(has - asked) <= CONFIRMED_WITHIN * asked for has, asked in pairs)
 
 
-# What can be asked of reachd over the bus: goal, stop, reset, arm, clear, status.
-#
-# Errors are replies.
+# Services on the bus: goal, stop, reset, arm, clear, status. Errors are sent as replies.
 
 
 MAX_REASON = 200
-"""Characters of a reason that are kept: it is shown to people and logged."""
+"""Most characters kept of a reason, which is shown and logged."""
 
 
 class Nothing(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -223,7 +221,7 @@ class Nothing(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
 
 class GoalRequest(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """Target in m in ``cupboard``; radius in m and time limit in s, the parameter set's if None."""
+    """Target, m in ``cupboard``; radius, m, and time limit, s; None: the parameter set's."""
 
     x: float
     y: float
@@ -232,7 +230,7 @@ class GoalRequest(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
 
 class ArmRequest(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """``free_air`` false: the finger touches something, the force sensor cannot be checked."""
+    """``free_air`` False: the finger touches something, so the force sensor cannot be checked."""
 
     free_air: bool = True
 
@@ -269,7 +267,7 @@ class ReachServices:
         ]
 
     def close(self) -> None:
-        """Take the services back."""
+        """Undeclare the services."""
         for service in self._services:
             service.close()
 

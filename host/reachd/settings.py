@@ -1,7 +1,7 @@
-"""What reachd is to do: a TOML file and flags, checked once, as one frozen value.
+"""Settings of reachd from a TOML file and flags, checked once, as one frozen value.
 
-Flags win over the file. `SettingsError` says what was given and what is allowed; the command then
-exits with 2.
+Flags take precedence over the file. `SettingsError` says what was given and what is allowed; the
+command then exits with 2.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from tactile_core.log.recorder import RecorderSettings
 from tactile_core.options import BusTable, LogTable, bus_config, log_destination
 
 DEFAULT_PRIORITY = 20
-"""Of the control loop among real-time threads, below those of the kernel's interrupts (50)."""
+"""Real-time priority of the control loop, below the kernel's interrupt threads (50)."""
 
 SEEDS = 1 << 32
-"""A seed that nobody gave is drawn from so many: short enough to be typed again."""
+"""Range of seeds drawn when none is given: short enough to type."""
 
 Clock = Literal["same", "remote"]
 
 
 class SettingsError(Exception):
-    """Arguments or configuration that are refused."""
+    """Arguments or configuration that are refused; the text names the remedy."""
 
 
 class InputsTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -105,9 +105,10 @@ class ConfigFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Everything. ``goal``: of the first reach, None to wait for one; ``serve``: stay after it.
+    """All settings. ``goal``: of the first reach; None: wait for one. ``serve``: stay after it.
 
-    ``log``: folder or file, None for none. ``wait``: s for the inputs to come.
+    ``log``: folder or file; None: no log. ``wait``: s to wait for the inputs. ``json``: file for
+    outcomes. ``remote_board``, ``remote_arm``: the sender runs on another machine.
     """
 
     strategy: str
@@ -132,7 +133,7 @@ class Settings:
 
 
 def make_settings(options: argparse.Namespace) -> Settings:
-    """Settings from parsed flags and the file they name; `SettingsError` for anything wrong."""
+    """Make settings from parsed flags and the file they name; `SettingsError` for any mistake."""
     path: Path | None = options.config
     document = Document({})
     try:

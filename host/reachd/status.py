@@ -1,4 +1,4 @@
-"""What people see while reachd runs: a live line, or plain lines now and then."""
+"""The status shown while reachd runs: a live line, or plain lines now and then."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tactile_core.log.recorder import Recorder
 
 
 class StatusLine(LiveLines):
-    """Shows what ``loop`` does."""
+    """Live line of a control loop."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class StatusLine(LiveLines):
         return table
 
     def lines(self) -> list[str]:
-        """One line, once there was a control cycle."""
+        """One line; empty before the first control cycle."""
         cycle = self._loop.last
         if cycle is None:
             return []
@@ -51,9 +51,9 @@ class StatusLine(LiveLines):
 
 
 def describe(cycle: Cycle, cautions: int = 0) -> dict[str, str]:
-    """State of a reach in a few short texts; empty where there is nothing to say.
+    """State of a reach in a few short texts, some of which may be empty.
 
-    ``cautions``: how many checks are off and limits too wide.
+    ``cautions``: number of checks that are off and limits that are too wide.
     """
     status, touch, arm = cycle.status, cycle.inputs.touch, cycle.inputs.arm
     return {

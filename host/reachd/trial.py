@@ -1,6 +1,7 @@
 """The states of a trial: idle → homing → reaching → resetting → idle. Pure.
 
-Each cycle of the control loop: ``step`` says what is wanted, the gate decides, ``observe`` is told.
+In each cycle of the control loop `Supervisor.step` gives the wanted twist, the gate decides, and
+`Supervisor.observe` receives the decision.
 """
 
 from __future__ import annotations
@@ -19,20 +20,20 @@ from reachd.strategies.primitives import aim, wrapped
 from reachd.strategies.runner import ask, begin
 from tactile_core.types import Instant, record, seconds_between
 
-# Motion to the pose from which a reach starts.
+# Motion to the home pose, from which a reach starts.
 
 
 NEAR = 0.002
-"""m from the pose that counts as there: the noise of a robot arm's pose is a tenth of it."""
+"""m from the pose that count as there; the noise of a robot arm's pose is a tenth of it."""
 
 STRAIGHT = 0.02
-"""rad from the heading that counts as there: 3 mm at the tip."""
+"""rad from the heading that count as there: 3 mm at the tip."""
 
 APPROACH = 2.0
-"""1/s: speed per distance left, so that the arm arrives without overshoot at 100 Hz."""
+"""1/s, speed per distance left, so that the arm arrives without overshoot at 100 Hz."""
 
 CLEAR = 0.01
-"""m in front of the cupboard at which the tip is out of it."""
+"""m in front of the cupboard from which the tip counts as outside."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +46,10 @@ class Pose:
 
 
 def home_twist(arm: ArmState, home: Pose, parameters: Parameters) -> Twist | None:
-    """Twist towards ``home``, None when there.
+    """Twist towards ``home``; None when there.
 
-    As long as the tip is inside the cupboard the arm only backs out along −x, so that it sweeps
-    nothing aside; in front of it, it goes straight home, turning as it goes.
+    While the tip is inside the cupboard the arm only backs out along −x, so that it sweeps nothing
+    aside; in front of the cupboard it moves straight home, turning on the way.
     """
     ex, ey = home.x - arm.x, home.y - arm.y
     turn = wrapped(home.heading - arm.heading)
@@ -64,11 +65,11 @@ def home_twist(arm: ArmState, home: Pose, parameters: Parameters) -> Twist | Non
     return Twist(ex * part, ey * part, omega)
 
 
-# What became of a reach, gathered while it runs.
+# The record of a reach, and its outcome.
 
 
 class Reason(StrEnum):
-    """Why a reach ended. Written to logs: never change the meaning of a word."""
+    """Why a reach ended. Logs contain these words, so their meaning must never change."""
 
     REACHED = "reached"
     TIMEOUT = "timeout"
@@ -78,7 +79,7 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Excavation:
-    """One excavation: direction "cw" or "ccw", what triggered it, s since the reach began."""
+    """An excavation: direction "cw" or "ccw", its trigger, and s since the reach began."""
 
     direction: str
     trigger: str
@@ -87,11 +88,11 @@ class Excavation:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A reach that has ended. m, s, N.
+    """Outcome of a reach, in m, s and N.
 
-    ``distance`` is that of tip and goal at the end, ``closest`` the least there was.
-    ``peak_force`` is the greatest normal force of a taxel, ``peak_load`` the greatest in-plane
-    force that the arm reported. ``interventions``: how often each one set in.
+    ``distance``: from tip to goal at the end; ``closest``: the smallest. ``peak_force``: largest
+    normal force of a taxel; ``peak_load``: largest in-plane force that the arm reported.
+    ``interventions``: how often each began, by code.
     """
 
     success: bool
@@ -106,7 +107,7 @@ class Outcome:
     interventions: dict[str, int]
 
     def count(self, direction: str | None = None, trigger: str | None = None) -> int:
-        """Excavations with this direction and trigger, None for any."""
+        """Number of excavations with this direction and trigger; None: any."""
         return sum(
             direction in (None, e.direction) and trigger in (None, e.trigger)
             for e in self.excavations
@@ -115,13 +116,13 @@ class Outcome:
 
 @dataclass(slots=True)
 class Onsets:
-    """Tells interventions that set in from those that go on, and counts them by code."""
+    """Finds interventions that begin, and counts them by code."""
 
     counts: dict[str, int] = field(default_factory=dict)
     _present: frozenset[Check] = frozenset()
 
     def update(self, interventions: Iterable[Intervention]) -> tuple[Intervention, ...]:
-        """Interventions of this cycle that were not there in the one before."""
+        """Interventions of this cycle that were not present in the one before."""
         found = tuple(interventions)
         if not found and not self._present:
             return ()
@@ -134,7 +135,7 @@ class Onsets:
 
 @dataclass(slots=True)
 class Trial:
-    """The running account of one reach towards ``goal``."""
+    """The running record of one reach towards ``goal``."""
 
     goal: Goal
     began: Instant
@@ -146,7 +147,7 @@ class Trial:
     onsets: Onsets = field(default_factory=Onsets)
 
     def see(self, touch: Touch | None, arm: ArmState, distance: float) -> None:
-        """Take in one cycle; numbers that are not finite leave the record as it is."""
+        """Add one cycle; numbers that are not finite do not change the peaks."""
         self.distance = distance
         self.closest = min(self.closest, distance)
         load = math.hypot(arm.fx, arm.fy)
@@ -156,14 +157,14 @@ class Trial:
             self.peak_force = touch.peak_force
 
     def hear(self, events: Iterable[StrategyEvent]) -> None:
-        """Take in what the strategy decided."""
+        """Add events of the strategy."""
         for event in events:
             if event.kind == "excavation_start":
                 at = seconds_between(self.began, event.at)
                 self.excavations.append(Excavation(event.direction, event.trigger, at))
 
     def end(self, reason: Reason, text: str, now: Instant) -> Outcome:
-        """Close the account."""
+        """Make the outcome."""
         return Outcome(
             success=reason is Reason.REACHED,
             reason=reason,
@@ -179,7 +180,7 @@ class Trial:
 
 
 HOMING_LIMIT = 60.0
-"""s that homing or resetting may take: half a turn at 0.1 rad/s and the way across the shelf."""
+"""s for homing or resetting: half a turn at 0.1 rad/s and the path across the shelf."""
 
 
 class State(StrEnum):
@@ -193,10 +194,10 @@ class State(StrEnum):
 
 @record
 class Command:
-    """What is wanted now: for the gate, and ``events`` for the log.
+    """The twist wanted now, for the gate, and ``events`` for the log.
 
-    ``wanted`` is None with the reason in ``failure`` when the strategy failed. ``goal`` is set
-    while reaching.
+    ``wanted``: None, with the reason in ``failure``, when the strategy failed. ``goal``: set while
+    reaching.
     """
 
     wanted: Twist | None
@@ -207,7 +208,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What the supervisor is at. ``elapsed`` in s since the state began; ``distance`` in m."""
+    """State of the supervisor. ``elapsed``: s since the state began; ``distance``: m."""
 
     state: State
     activity: str
@@ -219,10 +220,10 @@ class Status:
 
 
 class Supervisor:
-    """Runs one trial after another with one strategy.
+    """Runs trials one after another with one strategy.
 
-    ``home``: pose from which every reach starts; None to start wherever the arm is, and to stay
-    there on a reset. ``auto_reset``: go home after a reach without being asked.
+    ``home``: pose from which every reach starts; None: start wherever the arm is, and stay there on
+    a reset. ``auto_reset``: go home after a reach without a request.
     """
 
     def __init__(
@@ -253,11 +254,11 @@ class Supervisor:
 
     @property
     def outcome(self) -> Outcome | None:
-        """Outcome of the last reach; None before it and as soon as another goal is accepted."""
+        """Outcome of the last reach; None before the first and once another goal is accepted."""
         return self._outcome
 
     def request_goal(self, goal: Goal, now: Instant) -> str | None:
-        """Begin a trial towards ``goal`` (of ``goals.make_goal``); returns why not."""
+        """Begin a trial towards ``goal`` (see `services.make_goal`); returns why not, or None."""
         if self._state is not State.IDLE:
             return f"a goal is accepted when idle, not when {self._state}: stop and reset first"
         self._trial = Trial(goal, now)
@@ -266,14 +267,14 @@ class Supervisor:
         return None
 
     def request_stop(self, now: Instant, text: str = "stopped by the operator") -> str | None:
-        """End whatever moves; returns why there is nothing to stop."""
+        """End any motion; returns why there is nothing to stop, or None."""
         if self._state is State.IDLE:
             return "nothing to stop: idle"
         self._abort(Reason.STOPPED, text, now)
         return None
 
     def request_reset(self, now: Instant) -> str | None:
-        """After a reach: go home and be ready for another goal; returns why not."""
+        """After a reach, go home and accept another goal; returns why not, or None."""
         if self._state is not State.RESETTING:
             return f"a reset follows a reach; the state is {self._state}"
         self._enter(State.RESETTING, "returning", now)
@@ -281,7 +282,7 @@ class Supervisor:
         return None
 
     def status(self, now: Instant) -> Status:
-        """What is going on."""
+        """State of the trial for status and publishing."""
         trial = self._trial
         return Status(
             state=self._state,
@@ -294,7 +295,7 @@ class Supervisor:
         )
 
     def step(self, touch: Touch | None, arm: ArmState | None, now: Instant) -> Command:
-        """What is wanted in this cycle; zero as long as an input has never come."""
+        """Decide the wanted twist of this cycle; zero until every input has come once."""
         if self._since is None:
             self._since = now
         trial = self._trial
@@ -319,9 +320,9 @@ class Supervisor:
         return Command(ZERO)
 
     def observe(self, decision: Decision, now: Instant) -> tuple[Intervention, ...]:
-        """Take in what the gate made of it; returns the interventions that have just set in.
+        """Process the gate's decision; returns the interventions that have just begun.
 
-        A latch ends a reach with its reason and stops homing and resetting.
+        A latch ends a reach, with its reason, and stops homing and resetting.
         """
         found = decision.interventions
         if self._trial is not None:
@@ -332,7 +333,7 @@ class Supervisor:
         return self._onsets.update(found)
 
     def _abort(self, reason: Reason, text: str, now: Instant) -> None:
-        """End whatever moves, without going home."""
+        """End any motion, without going home."""
         if self._state is State.REACHING and self._trial is not None:
             self._finish(self._trial, reason, text, now)
         elif self._state is State.HOMING:
@@ -348,7 +349,7 @@ class Supervisor:
         self._returning = False
 
     def _finish(self, trial: Trial, reason: Reason, text: str, now: Instant) -> None:
-        """Close the trial and wait, holding still, to be reset."""
+        """End the trial, and stand still until reset."""
         self._outcome = trial.end(reason, text, now)
         self._text = text
         self._enter(State.RESETTING, "waiting for a reset", now)
@@ -362,7 +363,7 @@ class Supervisor:
         return 0.0 if self._since is None else seconds_between(self._since, now)
 
     def _in_time(self, twist: Twist, now: Instant) -> Command:
-        """``twist``, or standing still when going home takes too long."""
+        """``twist``, or zero when going home takes too long."""
         if self._elapsed(now) < HOMING_LIMIT:
             return Command(twist)
         text = f"not home after {HOMING_LIMIT:g} s: free the arm and bring it home by hand"

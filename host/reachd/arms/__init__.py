@@ -1,4 +1,4 @@
-"""Drivers of arms behind one seam, `reachd.arms.base.Arm`."""
+"""Drivers of arms behind one interface, `reachd.arms.base.Arm`."""
 
 from reachd.arms.base import Arm, ArmError
 from reachd.arms.bus_arm import BusArm

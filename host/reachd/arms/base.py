@@ -1,4 +1,4 @@
-"""The seam between reachd and an arm. A driver for another arm is another class like this."""
+"""The interface between reachd and an arm; a driver for another arm implements it."""
 
 from __future__ import annotations
 
@@ -8,68 +8,70 @@ from tactile_core.types import ArmLimits, ArmState, Instant, Twist
 
 
 class ArmError(Exception):
-    """The arm cannot be had, or does not do as it is told; the message names the remedy."""
+    """The arm is not available or does not obey; the text names the remedy."""
 
 
 class Arm(Protocol):
     """A planar velocity-controlled arm.
 
-    `state`, `command`, `duplicated` and `rivalled` are called by the control loop and never
-    block; the others by other threads, and may. Every driver must see to it that the
-    arm rests within 0.1 s after commands have ceased (each carries its expiry), even when this
-    process is killed.
+    The control loop calls `state`, `command`, `duplicated` and `rivalled`, which must never block;
+    other threads call the other methods, which may block. Every driver must ensure that the arm
+    rests within 0.1 s after commands cease (each carries its expiry), even when this process is
+    killed.
     """
 
     name: str
-    """As it is called on the bus and in logs."""
+    """Name on the bus and in logs."""
 
     def open(self) -> None:
-        """Get hold of the arm without moving it; `ArmError` when it cannot be had."""
+        """Connect to the arm without moving it; `ArmError` when that fails."""
         ...
 
     def state(self, now: Instant) -> ArmState | None:
-        """Newest state, None before the first."""
+        """Newest state; None before the first."""
         ...
 
     def command(self, twist: Twist, expiry: float, now: Instant) -> bytes:
-        """Move the pivot at ``twist`` for at most ``expiry`` s from ``now``, when it was decided.
+        """Move the pivot with ``twist``, m/s and rad/s in ``cupboard``, for at most ``expiry`` s.
 
-        Returns the ``ArmCommand`` that was sent, for the log, empty when none was because the arm
-        has not granted its command. `ArmError` when it can no longer be commanded at all.
+        ``now``: when the twist was decided, from which the expiry counts. Returns the bytes of the
+        ``ArmCommand``, for the log; empty when the arm has not granted its command, so that none
+        was sent.
+        `ArmError` when the arm can no longer be commanded.
         """
         ...
 
     @property
     def denied(self) -> str | None:
-        """Why the arm does not grant its command; None once it did, or before it answered.
+        """Why the arm does not grant its command; None once it has, and before it answers.
 
-        It is asked for again and again, by a thread of the driver.
+        A thread of the driver requests it repeatedly.
         """
         ...
 
     def duplicated(self, now: Instant) -> bool:
-        """Whether somebody else was seen to speak for the arm."""
+        """Whether another publisher of the arm's state was seen."""
         ...
 
     def rivalled(self, now: Instant) -> bool:
-        """Whether somebody else was seen to send it commands, which it does not obey."""
+        """Whether another sender of commands was seen; the arm does not obey it."""
         ...
 
     def request_limits(self, limits: ArmLimits) -> ArmLimits:
-        """Ask for limits; returns those that the arm confirms; `ArmError` when it does not say."""
+        """Request limits; returns those that the arm confirms. `ArmError` without confirmation."""
         ...
 
     def request_clear(self) -> str:
-        """Have a fault or stop cleared, at an operator's wish; returns the arm's mode.
+        """Clear a fault or stop at an operator's request; returns the arm's mode.
 
-        `ArmError` when it is not.
+        `ArmError` when that fails.
         """
         ...
 
     def counters(self) -> dict[str, int]:
-        """States received, and what was not used, by reason."""
+        """Counts of states accepted, and of those not used, by reason."""
         ...
 
     def close(self) -> None:
-        """Let go of the arm."""
+        """Disconnect from the arm."""
         ...

@@ -1,7 +1,7 @@
-"""An arm behind the topics ``arm/<name>/...``: the simulated one, or any driver that speaks them.
+"""An arm on the topics ``arm/<name>/...``: the simulated one, or any driver that serves them.
 
-Commands are ``ArmCommand`` at ``cmd_vel``, each with its instant, number, expiry and the proof that
-it comes from the one to whom the arm granted its command (`tactile_core.bus.commanding`).
+Commands are ``ArmCommand`` at ``cmd_vel``, each with its instant, number, expiry, and proof that it
+comes from the commander to whom the arm granted its command (`tactile_core.bus.commanding`).
 """
 
 from __future__ import annotations
@@ -42,29 +42,30 @@ from tactile_core.types import (
 log = logging.getLogger(__name__)
 
 ANSWER_TIMEOUT = 1.0
-"""s for the arm's answer. It is asked while an operator waits, whose request dies in 2 s."""
+"""s for the arm's answer, while an operator waits, whose request times out after 2 s."""
 
 CLAIM_AGAIN = 0.1
 """s between two requests for the arm's command."""
 
 GRANT_SHOWN = 0.5
-"""s after a grant by which the arm's state must show it; else it is asked for anew."""
+"""s after a grant by which the arm's state must show it; otherwise it is requested again."""
 
 DENIED_FOR = 1.0
-"""s of refusals after which the arm is taken to be another's: a commander that was killed is
-forgotten sooner."""
+"""s of refusals after which the arm counts as another commander's; one that was killed is forgotten
+sooner."""
 
 RELEASE_TIMEOUT = 0.2
-"""s for the arm to take its command back; if it does not, silence ends it."""
+"""s for the arm to take its command back; if it does not, silence ends the grant."""
 
 RIVAL_GONE = 1.0
-"""s after the last command of somebody else until they are taken to be gone."""
+"""s after the last command of another sender until it counts as gone."""
 
 
 class BusArm:
-    """See `reachd.arms.base.Arm`. ``takeover``: s of silence after which another sender is heeded.
+    """Implements `reachd.arms.base.Arm`. ``takeover``: s of silence until another publisher of the
+    state is accepted.
 
-    ``reach``: as whom the arm is commanded. ``remote``: the arm's driver runs on another machine.
+    ``reach``: our name as commander. ``remote``: the arm's driver runs on another machine.
     """
 
     def __init__(
@@ -97,10 +98,10 @@ class BusArm:
         self._claimer = threading.Thread(target=self._claim, name="claim", daemon=True)
 
     def open(self) -> None:
-        """Subscribe, publish, and begin to ask for the arm; whether it is there shows later."""
+        """Subscribe, declare the publisher, and begin to request the arm, present or not."""
         state_key, command_key = ARM_STATE.key(self.name), COMMAND.key(self.name)
         self._latest = latest(self._session, state_key)
-        # The newest sample may hide another publisher's, so all of them are watched beside it.
+        # The newest sample may hide another publisher's, so every sample is checked as well.
         self._taps = [
             Tap(self._session, state_key, self._watch_state),
             Tap(self._session, command_key, self._watch_commands, remote_only=True),
@@ -109,14 +110,14 @@ class BusArm:
         self._claimer.start()
 
     def state(self, now: Instant) -> ArmState | None:
-        """Newest state, None before the first."""
+        """Newest state; None before the first."""
         sample = None if self._latest is None else self._latest.newest()
         if sample is not None:
             self._input.take(sample, now)
         return self._input.value
 
     def command(self, twist: Twist, expiry: float, now: Instant) -> bytes:
-        """Publish ``twist``; nothing without a grant. `ArmError` when the bus is closed."""
+        """Publish ``twist``, if the arm has granted its command. `ArmError` on a closed bus."""
         signer, publisher = self._signer, self._publisher
         if signer is None or publisher is None:
             return b""
@@ -137,16 +138,16 @@ class BusArm:
         return self._denied
 
     def duplicated(self, now: Instant) -> bool:
-        """Whether a second sender of states was heard of late."""
+        """Whether a second publisher of states was seen lately."""
         return self._input.pin.duplicated(now) or self._watch.duplicated(now)
 
     def rivalled(self, now: Instant) -> bool:
-        """Whether commands of somebody else were heard of late."""
+        """Whether commands of another sender were seen lately."""
         rival = self._rival
         return rival is not None and seconds_between(rival, now) < RIVAL_GONE
 
     def request_limits(self, limits: ArmLimits) -> ArmLimits:
-        """Ask the arm's ``limits`` service."""
+        """Call the arm's ``limits`` service."""
         reply = self._ask("limits", limits_fields(limits))
         try:
             return msgspec.convert(reply, ArmLimits)
@@ -154,17 +155,17 @@ class BusArm:
             raise ArmError(f"arm {self.name!r} confirms no limits: {error}") from error
 
     def request_clear(self) -> str:
-        """Ask the arm's ``clear`` service; returns its mode."""
+        """Call the arm's ``clear`` service; returns its mode."""
         reply = self._ask("clear")
         return str(reply.get("mode", "")) if isinstance(reply, dict) else ""
 
     def counters(self) -> dict[str, int]:
-        """States received, what was not used, by reason, and others' commands."""
+        """Counts of states accepted and not used, by reason, and of others' commands."""
         refused = 0 if self._latest is None else self._latest.refused
         return self._input.counters | {"oversized": refused, "rival_commands": self._rivals}
 
     def close(self) -> None:
-        """Give the arm's command back, and take subscriptions and publisher back."""
+        """Release the arm's command, and undeclare subscriptions and publisher."""
         self._closing.set()
         if self._signer is not None:
             with suppress(ArmError):
@@ -186,7 +187,7 @@ class BusArm:
         fields: Mapping[str, object] = MappingProxyType({}),
         timeout: float = ANSWER_TIMEOUT,
     ) -> Any:
-        """Have the arm do what its commander may ask for; `ArmError` when it does not."""
+        """Call a service that the arm reserves for its commander; `ArmError` when it fails."""
         signer = self._signer
         if signer is None:
             raise ArmError(f"arm {self.name!r} has not granted its command: {self._why()}")
@@ -212,10 +213,10 @@ class BusArm:
         self._rival = monotonic_now()
         self._rivals += 1
 
-    # What follows runs in the claimer's thread.
+    # Everything below runs on the claimer's thread.
 
     def _claim(self) -> None:
-        """Ask for the arm's command whenever it is not ours."""
+        """Request the arm's command whenever we do not have it."""
         while not self._closing.wait(CLAIM_AGAIN):
             if self._signer is not None and self._ours():
                 continue
@@ -228,7 +229,7 @@ class BusArm:
                 log.debug("arm %s: %s", self.name, error)
 
     def _ours(self) -> bool:
-        """Whether the arm says so; it is given time to, after a grant."""
+        """Whether the arm's state names us as commander; after a grant it has time to show it."""
         state, now = self._input.value, monotonic_now()
         if seconds_between(self._granted_at, now) < GRANT_SHOWN or state is None:
             return True

@@ -1,1 +1,1 @@
-"""The safety gate: the last check on every command."""
+"""The safety gate: the final check on every command."""

@@ -1,7 +1,8 @@
-"""The safety gate: the last hand on every command, pure, one object an arm.
+"""The safety gate: the final check on every command. Pure; one instance per arm.
 
-Any fault ends in the zero twist, never in the last velocity. A latch is undone only by a fresh
-request of the operator, with every condition healthy. Nothing here is a certified safety function.
+Any fault results in the zero twist, never in the last velocity. A latch is cleared only by a fresh
+request of the operator while every condition is healthy. Nothing here is a certified safety
+function.
 """
 
 from __future__ import annotations
@@ -37,33 +38,35 @@ from tactile_core.types import Echo, Instant, record, seconds_between
 Effect = Literal["ignored", "limited", "stopped", "latched", "refused"]
 
 ON_THE_WAY = 0.003
-"""s from a cycle's deadline to the arm: what the loop is late and what the bus takes. An input is
-too old by so much and a period before its age is reached, so that zero is there in time."""
-FEATURES_ON_THE_WAY = 0.008  # on a busy machine 3 ms were not enough in one of forty kills
+"""s from a cycle's deadline until its command is at the arm: lateness of the loop and transport. An
+input counts as too old this much, and one period, before it reaches its age limit, so that the zero
+twist arrives in time."""
+FEATURES_ON_THE_WAY = 0.008
+"""The same for features: on a busy machine 3 ms were not enough in one of forty kills."""
 
 ECHO_LOST = 0.05
-"""s for which commands must come late until it latches: one hiccup only stops."""
+"""s for which commands must take effect late before the gate latches; a single delay only stops."""
 
 SPARSE_OVER = 0.2
-"""s over which touch must have been valid for at least half of the time."""
+"""s of which touch must have been valid for at least half."""
 
 HARD_STATES = 2
-"""States in a row that must be overloaded for it to latch."""
+"""States in a row that must be overloaded for the gate to latch."""
 
 HARD_AT_ONCE = 2.0
-"""Times that load at which one state is enough."""
+"""Multiple of the overload at which one state is enough."""
 
 SKIN_LATCH = 2.0
-"""Times the limit on what the skin feels at which it latches."""
+"""Multiple of the limit of force on the skin at which the gate latches."""
 
 CONFIRMED_WITHIN = 1e-3
-"""Part by which a limit read back may differ from the one sent: arms round theirs. A lower one is
-refused too, for the arm would clip what the strategy wants without a word."""
+"""Relative difference allowed between a limit read back and the one sent: arms round. A lower limit
+is refused as well, because the arm would silently clip the strategy's twists."""
 
 
 @dataclass(frozen=True, slots=True)
 class Intervention:
-    """What the gate did and why. ``code`` is stable; ``text`` is for people."""
+    """Effect of a check and its reason. ``code`` is stable; ``text`` is for people."""
 
     code: Check
     effect: Effect
@@ -72,9 +75,9 @@ class Intervention:
 
 @record
 class Decision:
-    """The twist to send, s for which the arm may follow it, and why it is not the one wanted.
+    """The twist to send, its ``expiry`` in s, and why it is not the one wanted.
 
-    ``held`` is the reason for which the gate is disarmed or latched, None when it is armed.
+    ``held``: why the gate is disarmed or latched; None when it is armed.
     """
 
     twist: Twist
@@ -84,12 +87,12 @@ class Decision:
 
 
 class SafetyGate:
-    """Disarmed at first. ``step`` every cycle of the control loop, armed or not."""
+    """The gate of one arm; disarmed at first. Call `step` in every cycle, armed or not."""
 
     def __init__(self, settings: SafetySettings) -> None:
         self._settings = settings
         self._off = settings.disabled
-        # Asked in every cycle, and an enum takes its time to be found in a set.
+        # Cached because they are used in every cycle, and finding an enum in a set is slow.
         self._bounds_speed = Check.SPEED not in self._off
         self._bounds_turning = Check.TURN_RATE not in self._off
         self._bounds_acceleration = Check.ACCELERATION not in self._off
@@ -98,41 +101,41 @@ class SafetyGate:
         self._bounds_wrench = Check.WRENCH not in self._off
         self._bounds_skin = Check.SKIN_FORCE not in self._off
         self._bounds_touch = Check.TOUCH_RISING not in self._off
-        self._confirmed: tuple[float, ...] = ()  # limits last read back and found as asked
+        self._confirmed: tuple[float, ...] = ()  # limits last read back that equal those asked
         self._hold: Intervention | None = Intervention(
             Check.NOT_ARMED, "stopped", "the gate is not armed: arm it by an operator's request"
         )
         self._held_at: Instant | None = None
         self.latched_at: dict[Check, Instant] = {}
-        """When each reason to hold was last seen, even while the gate was holding already."""
-        self._proven = False  # the force sensor read next to nothing in free air
+        """When each latching fault was last seen, also while the gate was latched already."""
+        self._proven = False  # whether the force sensor has read about zero in free air
         self._last = ZERO
         self._stepped: Instant | None = None
         self._felt: Instant | None = None  # when the last valid features were captured
         self._motion = MotionWatch(settings)
-        self._own_since: Instant | None = None  # the arm says that it is ours
-        self._late_since: Instant | None = None  # commands come late
-        self._passes: deque[Instant] = deque()  # of the limit of force or torque
-        self._hard = 0  # states in a row that were overloaded
-        self._beyond = False  # it, and not below the soft one since
-        self._seen: deque[tuple[Instant, bool]] = deque()  # whether touch was valid, until then
-        self._touched: Touch | None = None  # the newest that was usable
-        self._rising = 0.0  # N/s at which the force on the skin grew when it was captured
+        self._own_since: Instant | None = None  # since when the arm says that we command it
+        self._late_since: Instant | None = None  # since when commands take effect late
+        self._passes: deque[Instant] = deque()  # when force or torque passed its limit
+        self._hard = 0  # overloaded states in a row
+        self._beyond = False  # whether load passed its limit and has not fallen below soft since
+        self._seen: deque[tuple[Instant, bool]] = deque()  # whether touch was valid up to then
+        self._touched: Touch | None = None  # the newest usable touch
+        self._rising = 0.0  # rate at which the force on the skin grew at that touch, N/s
         self._loaded_at: Instant | None = None  # capture of the newest state
         self._state_at: Instant | None = None  # capture of the state of the last cycle
 
     @property
     def armed(self) -> bool:
-        """Whether commands pass."""
+        """Whether commands may pass."""
         return self._hold is None
 
     @property
     def held(self) -> Intervention | None:
-        """Why commands do not pass, or None."""
+        """Why the gate is disarmed or latched, or None."""
         return self._hold
 
     def disarm(self, now: Instant, why: str) -> None:
-        """Hold at the operator's wish, or at the end of the daemon."""
+        """Disarm, at the operator's request or for the reason ``why``."""
         self._latch(Intervention(Check.NOT_ARMED, "stopped", why), now)
 
     def arm(
@@ -147,8 +150,8 @@ class SafetyGate:
     ) -> tuple[Intervention, ...]:
         """Arm at an operator's request made at ``requested``; returns why not, empty when armed.
 
-        ``free_air=False`` says that the finger touches something: allowed only after the force
-        sensor was once found unbiased in free air.
+        ``free_air=False``: the finger touches something, which is allowed only after the force
+        sensor has once been found unbiased in free air.
         """
         if self._hold is None:
             return ()
@@ -158,9 +161,9 @@ class SafetyGate:
         if not fresh or not -self._settings.future <= age <= self._settings.request_age:
             text = f"the request to arm is {age:.3f} s old, or older than what it is to clear"
             refusals.append(Intervention(Check.REQUEST_STALE, "refused", text))
-        self._motion.restart()  # what it did before is what the operator has looked after
+        self._motion.restart()  # earlier motion is the operator's responsibility
         faults, stops, _ = self._inputs(touch, arm, now, duplicate)
-        # An arm that stopped by itself is revived by the zero commands that follow.
+        # An arm that stopped by itself resumes with the zero commands that follow.
         refusals += [
             Intervention(i.code, "refused", i.text)
             for i in (*faults, *stops)
@@ -188,12 +191,12 @@ class SafetyGate:
         rivalled: bool = False,
         failure: str | None = None,
     ) -> Decision:
-        """The twist that may be sent.
+        """Decide the twist to send.
 
-        ``wanted``: what the strategy wants, None with ``failure`` when it failed. ``touch``,
-        ``arm``: the newest, None when there never was one. ``goal``: where to slow down.
-        ``lateness``: s by which the loop missed its deadline. ``duplicate``: a second publisher
-        was seen on an input. ``rivalled``: somebody else was seen to send commands.
+        ``wanted``: the strategy's twist; None, with ``failure``, when it failed. ``touch``,
+        ``arm``: newest inputs; None before the first. ``goal``: where to slow down. ``lateness``:
+        s by which the loop missed its deadline. ``duplicate``: a second publisher was seen on an
+        input. ``rivalled``: another sender of commands was seen.
         """
         decision = self._decide(
             wanted, touch, arm, goal, now, lateness, duplicate, rivalled, failure
@@ -231,7 +234,7 @@ class SafetyGate:
         twist = self._limited(wanted, arm, goal, passed, notes)
         if not finite(
             twist.vx, twist.vy, twist.omega
-        ):  # numbers near the end of the range, with limits disabled
+        ):  # possible for numbers near the end of the range when limits are disabled
             self._latch(_not_finite(wanted), now)
             return self._stop((_not_finite(wanted),), Check.COMMAND_NOT_FINITE)
         self._last = twist
@@ -241,7 +244,7 @@ class SafetyGate:
         return check not in self._off
 
     def _latch(self, fault: Intervention, now: Instant) -> None:
-        """Hold, keeping the first reason; a request to arm must be newer than the last."""
+        """Latch; the first reason is kept, but a request to arm must be newer than the last."""
         self._held_at = self.latched_at[fault.code] = now
         if self._hold is None:
             self._hold = fault
@@ -251,7 +254,7 @@ class SafetyGate:
         return Decision(ZERO, self._settings.command_expiry, why, held)
 
     def _command(self, wanted: Twist | None, failure: str | None) -> list[Intervention]:
-        """What is wrong with the command itself."""
+        """Check the command itself."""
         if failure is not None or wanted is None:
             text = f"the strategy failed: {failure or 'it gave no command'}"
             return [Intervention(Check.STRATEGY_FAILED, "latched", text)]
@@ -259,7 +262,7 @@ class SafetyGate:
         return [] if ok else [_not_finite(wanted)]
 
     def _timing(self, passed: float, lateness: float) -> list[Intervention]:
-        """What is wrong with the loop: its own report, and the time since its last step."""
+        """Check the loop: its reported lateness, and the time since the last step."""
         s = self._settings
         found = []
         if passed < 0.0 and self._on(Check.CLOCK_BACKWARDS):
@@ -274,7 +277,7 @@ class SafetyGate:
     def _inputs(
         self, touch: Touch | None, arm: ArmState | None, now: Instant, duplicate: bool
     ) -> tuple[list[Intervention], list[Intervention], list[Intervention]]:
-        """What is wrong with the inputs: what latches, what stops, what is only noted."""
+        """Check the inputs; returns faults, which latch, then stops, then mere notes."""
         faults: list[Intervention] = []
         stops: list[Intervention] = []
         notes: list[Intervention] = []
@@ -293,7 +296,7 @@ class SafetyGate:
         stops: list[Intervention],
         notes: list[Intervention],
     ) -> None:
-        """Age of the last valid features."""
+        """Check the age of the last valid features, and their force."""
         s = self._settings
         if touch is not None and usable(touch):
             ahead = seconds_between(now, max(touch.captured, touch.received))
@@ -316,7 +319,7 @@ class SafetyGate:
             stops.append(Intervention(Check.FEATURES_STALE, "stopped", text))
 
     def _touch(self, touch: Touch) -> None:
-        """Keep the newest usable touch, and how fast its force grew."""
+        """Keep the newest usable touch, and the rate at which its force grew."""
         last = self._touched
         if last is not None and touch.captured <= last.captured:
             return
@@ -328,7 +331,7 @@ class SafetyGate:
         self._touched = touch
 
     def _squeezed(self, faults: list[Intervention]) -> None:
-        """More force on the skin than twice what it may feel; known until it is felt anew."""
+        """Check for force on the skin far above its limit; the last touch counts until the next."""
         if self._touched is None or not self._on(Check.SKIN_OVERLOAD):
             return
         force, limit = felt(self._touched), self._settings.skin_force
@@ -337,7 +340,7 @@ class SafetyGate:
             faults.append(Intervention(Check.SKIN_OVERLOAD, "latched", text))
 
     def _sparse(self, touch: Touch | None, now: Instant, stops: list[Intervention]) -> None:
-        """Touch that is valid now and then, but not for half of the time."""
+        """Check for touch that is valid now and then, but less than half of the time."""
         seen = self._seen
         if seen and now <= seen[-1][0]:
             if now < seen[-1][0]:
@@ -361,7 +364,7 @@ class SafetyGate:
         faults: list[Intervention],
         stops: list[Intervention],
     ) -> None:
-        """Age, sanity and mode of the arm's state, and the limits it confirms."""
+        """Check age, sanity and mode of the arm's state, and the limits that it confirms."""
         s = self._settings
         if arm is None:
             stops.append(Intervention(Check.ARM_STALE, "stopped", "no arm state has come"))
@@ -410,9 +413,9 @@ class SafetyGate:
             self._confirmed = () if wrong else limits
 
     def _overload(self, arm: ArmState, now: Instant, faults: list[Intervention]) -> None:
-        """A load far beyond its limit, or beyond it again and again.
+        """Check for a load far beyond its limit, or beyond it repeatedly.
 
-        An impact is over with the next state: it counts only from twice that load on.
+        An impact lasts only one state, so it counts only from twice the overload.
         """
         s = self._settings
         part = load(arm, s)
@@ -445,7 +448,7 @@ class SafetyGate:
         faults: list[Intervention],
         stops: list[Intervention],
     ) -> None:
-        """Whose commands the arm obeys, and how late they come into force there."""
+        """Check whose commands the arm obeys, and how late they take effect."""
         s = self._settings
         if not echo.own:
             self._own_since = self._late_since = None
@@ -460,8 +463,8 @@ class SafetyGate:
             faults.append(Intervention(Check.ECHO_LOST, "latched", text))
         due = self._motion.first_after(echo.decided)
         if due is not None and echo.sequence == 0:
-            due = max(due, self._own_since)  # none was obeyed yet
-        # The one after that in force has been under way for so long; the loop sends one a period.
+            due = max(due, self._own_since)  # none has been obeyed yet
+        # How long the command after the one in effect has been on its way, plus one period.
         late = -math.inf if due is None else seconds_between(due, captured) + s.period
         if late <= s.echo_age:
             self._late_since = None
@@ -479,7 +482,7 @@ class SafetyGate:
             stops.append(Intervention(Check.ECHO_LATE, "stopped", text))
 
     def _unconfirmed(self, arm: ArmState) -> list[Intervention]:
-        """Limits that the arm does not confirm as asked, with both values."""
+        """Check the limits that the arm confirms; the text names both values."""
         ask = self._settings.arm_limits
         wrong = [
             f"{name} is {has:g} {unit}, {asked:g} asked"
@@ -497,7 +500,7 @@ class SafetyGate:
         return [Intervention(Check.ARM_LIMITS, "latched", text)]
 
     def _biased(self, arm: ArmState) -> list[Intervention]:
-        """Wrench in free air that shows a bias or a wrong tool."""
+        """Check the wrench in free air, which reveals a bias or a wrong tool."""
         s = self._settings
         force = math.hypot(arm.fx, arm.fy)
         if force < s.free_air_force and abs(arm.mz) < s.free_air_torque:
@@ -517,7 +520,7 @@ class SafetyGate:
         passed: float,
         notes: list[Intervention],
     ) -> Twist:
-        """Apply every limit of motion to a healthy command; says in ``notes`` which ones acted."""
+        """Apply all limits of motion; adds those that acted to ``notes``."""
         s = self._settings
         twist = self._speed(wanted, notes)
         fastest, fastest_turn = math.inf, math.inf
@@ -538,13 +541,13 @@ class SafetyGate:
                 within_speed(twist, fastest, fastest_turn) is not twist
                 or any(rule.broken_by(twist) for rule in rules)
             ):
-                # The way from the last command to the new one leaves what is allowed: brake first.
+                # The change from the last command to the new one would break a rule: brake first.
                 twist = braked(last, rules, fastest, fastest_turn)
             _note(notes, Check.ACCELERATION, before, twist, "the command changes too fast")
         return twist
 
     def _speed(self, wanted: Twist, notes: list[Intervention]) -> Twist:
-        """Greatest speed and turn rate; the path stays."""
+        """Limit speed and turn rate by scaling the twist, which keeps the path."""
         s = self._settings
         twist = wanted
         if self._bounds_speed:
@@ -559,14 +562,14 @@ class SafetyGate:
     def _held_back(
         self, twist: Twist, arm: ArmState, notes: list[Intervention]
     ) -> tuple[Twist, list[Constraint]]:
-        """Workspace, wrench and touch together, for each alone could undo the others.
+        """Apply workspace, wrench and touch together, because each alone could undo the others.
 
-        The twist that is left, and the rules that it keeps.
+        Returns the remaining twist and the rules that it obeys.
         """
         s = self._settings
         rules: list[Constraint] = []
         if self._bounds_workspace:
-            # The way from the last command may be faster than where it leads.
+            # While the command changes, the arm may still be as fast as the last one.
             fastest = max(fastest_point(twist, s), fastest_point(self._last, s))
             rules = workspace_constraints(arm, s, fastest)
             kept = constrained(twist, rules)
@@ -582,7 +585,7 @@ class SafetyGate:
         return constrained(twist, rules) if rules else twist, rules
 
     def _of_touch(self, twist: Twist, arm: ArmState, notes: list[Intervention]) -> list[Constraint]:
-        """What is felt, and what that will be in a moment at the rate at which it grows."""
+        """Rules from the force on the skin, now and as predicted from its growth."""
         s, touch = self._settings, self._touched
         if touch is None:
             return []
@@ -611,7 +614,7 @@ class SafetyGate:
 def _note(
     notes: list[Intervention], code: Check, before: Twist, after_it: Twist, text: str
 ) -> None:
-    if after_it is not before:  # what changes nothing hands back the very same twist
+    if after_it is not before:  # a limit that does not act returns the same object
         notes.append(Intervention(code, "limited", text))
 
 

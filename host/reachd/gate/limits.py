@@ -1,6 +1,6 @@
-"""The arithmetic of the safety gate: each function takes a twist and returns one that is no faster.
+"""The arithmetic of the safety gate: limits reduce a twist and never make it faster.
 
-Nothing here ever adds motion in a direction that was not asked for.
+Nothing here adds motion in a direction that was not commanded.
 """
 
 from __future__ import annotations
@@ -12,41 +12,41 @@ from reachd.interfaces import ArmState, Touch, Twist
 from tactile_core.geometry import Side
 from tactile_core.types import record
 
-# Whether numbers can be computed with.
+# Sanity of numbers.
 
 
 def finite(*values: float) -> bool:
-    """Whether all are finite, and so is their sum: what overflows it is no measurement.
+    """Whether all values and their sum are finite; values that overflow it are not measurements.
 
-    One sum is several times faster than asking each, and this is asked in every control cycle.
+    Checking the sum is several times faster than checking each, and this runs in every cycle.
     """
     return math.isfinite(sum(values))
 
 
 def usable(touch: Touch) -> bool:
-    """Whether ``touch`` may be acted on: valid, and every number in it finite."""
+    """Whether ``touch`` may be acted on: it is valid, and all its numbers are finite."""
     return touch.valid and finite(
         touch.peak_force, touch.peak_x, touch.peak_y, touch.total_force, touch.tip_force
     )
 
 
 ROUNDING = 1e-12
-"""m/s, rad/s: what floating point leaves of a component that was taken away."""
+"""m/s, rad/s that rounding leaves of a component that was removed."""
 
 NO_OVERSHOOT = math.e
-"""A motion that slows in proportion to what is left, seen with a delay, never overshoots when its
-time constant is at least e times the delay."""
+"""Ratio of time constant to delay from which a motion that slows in proportion to the distance
+left, observed with that delay, never overshoots."""
 
 PARALLEL = 1e-6
-"""Sine of the angle below which two borders have no corner worth the name, and a velocity is that
-before, slowed down."""
+"""Sine of the angle below which two borders have no usable corner, and two velocities count as
+parallel."""
 
 
 @record
 class Constraint:
-    """``nx·vx + ny·vy + nw·ω ≤ bound``, with ``bound`` ≥ 0 so that standing still always obeys.
+    """``nx·vx + ny·vy + nw·ω ≤ bound``, with ``bound`` ≥ 0 so that standing still always obeys it.
 
-    (nx, ny) is a unit vector, or zero where only the turning counts.
+    (nx, ny) is a unit vector, or zero if only turning is limited.
     """
 
     nx: float
@@ -59,27 +59,27 @@ class Constraint:
         return self.nx * twist.vx + self.ny * twist.vy + self.nw * twist.omega
 
     def broken_by(self, twist: Twist) -> bool:
-        """Whether the inequality fails by more than rounding."""
+        """Whether ``twist`` violates the inequality by more than rounding."""
         return self.along(twist) > self.bound + ROUNDING
 
 
 def scaled(twist: Twist, factor: float) -> Twist:
-    """The same path, slower."""
+    """Multiply ``twist`` by ``factor``, which keeps the path."""
     return Twist(twist.vx * factor, twist.vy * factor, twist.omega * factor)
 
 
 def within_speed(twist: Twist, speed: float, turn: float) -> Twist:
-    """``twist`` scaled as a whole to at most ``speed`` (m/s) and ``turn`` (rad/s): same path."""
+    """Scale ``twist`` to at most ``speed`` (m/s) and ``turn`` (rad/s), which keeps the path."""
     v, w = math.hypot(twist.vx, twist.vy), abs(twist.omega)
     factor = min(speed / v if v > speed else 1.0, turn / w if w > turn else 1.0)
     return twist if factor == 1.0 else scaled(twist, factor)
 
 
 def within_acceleration(twist: Twist, last: Twist, dv: float, dw: float) -> Twist:
-    """``twist``, at most ``dv`` (m/s) and ``dw`` (rad/s) away from the ``last`` command.
+    """Limit the change from the ``last`` command to ``dv`` (m/s) and ``dw`` (rad/s).
 
-    Braking is never delayed: a velocity along the last one and no faster passes as it is, and so
-    does a turning; one the other way is at once brought to zero.
+    Braking is never delayed: a velocity along the last one that is not faster passes unchanged, and
+    so does a turn rate; for a reversal, zero comes first, at once.
     """
     vx, vy = _velocity_step(twist, last, dv)
     omega = _turning_step(twist.omega, last.omega, dw)
@@ -116,7 +116,7 @@ def _turning_step(omega: float, last: float, dw: float) -> float:
 
 
 def braked(last: Twist, rules: list[Constraint], speed: float, turn: float) -> Twist:
-    """The last command, slowed down along its way until it keeps ``rules`` and both speeds."""
+    """Scale the last command until it obeys ``rules`` and both speeds."""
     twist = within_speed(last, speed, turn)
     for rule in rules:
         if rule.broken_by(twist):
@@ -127,11 +127,11 @@ def braked(last: Twist, rules: list[Constraint], speed: float, turn: float) -> T
 def workspace_constraints(
     arm: ArmState, settings: SafetySettings, fastest: float = math.inf
 ) -> list[Constraint]:
-    """What keeps tip and pivot inside their regions, as far as it binds at ``fastest`` (m/s).
+    """Constraints that keep tip and pivot inside their regions, if they matter at ``fastest`` m/s.
 
-    The speed towards a border is at most the distance left over a time constant, which is so long
-    that with the oldest state and a command kept for its whole life the point comes to rest inside.
-    Outside, only the way back is open.
+    The speed towards a border is at most the distance left divided by a time constant, chosen so
+    that the point comes to rest inside even with the oldest state and a command followed until it
+    expires. Outside, only motion back inside is allowed.
     """
     horizon = NO_OVERSHOOT * (settings.arm_age + settings.command_expiry)
     matters = fastest * horizon
@@ -155,25 +155,25 @@ def workspace_constraints(
 
 
 def fastest_point(twist: Twist, settings: SafetySettings) -> float:
-    """Speed (m/s) that neither tip nor pivot exceeds."""
+    """Upper bound of the speeds of tip and pivot, m/s."""
     return math.hypot(twist.vx, twist.vy) + settings.tip_length * abs(twist.omega)
 
 
 def load(arm: ArmState, settings: SafetySettings) -> float:
-    """Greater of force and torque as parts of their limits."""
+    """Larger of force and torque, each relative to its limit."""
     return max(math.hypot(arm.fx, arm.fy) / settings.force, abs(arm.mz) / settings.torque)
 
 
 def approach_left(part: float, soft: float) -> float:
-    """Part of an approach that is left at the load ``part``: all to ``soft``, none from 1 on."""
+    """Fraction of an approach allowed at the relative load ``part``: 1 up to ``soft``, 0 from 1."""
     return min(1.0, max(0.0, (1.0 - part) / (1.0 - soft)))
 
 
 def felt(touch: Touch) -> float:
-    """N that the skin may feel at most: touch with its own uncertainty.
+    """Largest force that may be on the skin, N: touch plus its bound.
 
-    A bound that is not known is taken to be as large as the force: nominal forces of boards that
-    nobody calibrated are right to a factor of two.
+    An unknown bound counts as large as the force: nominal forces of uncalibrated boards are
+    accurate to within a factor of two.
     """
     return max(
         _at_most(touch.total_force, touch.normal_force_bound),
@@ -191,7 +191,7 @@ NORMALS = {Side.TIP: (1.0, 0.0), Side.LEFT: (0.0, 1.0), Side.RIGHT: (0.0, -1.0)}
 
 
 def touch_constraints(touch: Touch, arm: ArmState, speed: float) -> list[Constraint]:
-    """What keeps the place of the peak contact from pressing on faster than ``speed`` (m/s)."""
+    """Constraint on pressing further at the peak contact, to at most ``speed`` (m/s)."""
     normal = NORMALS.get(touch.peak_side)
     if normal is None:
         return []
@@ -202,15 +202,15 @@ def touch_constraints(touch: Touch, arm: ArmState, speed: float) -> list[Constra
 
 
 def force_constraints(arm: ArmState, speed: float) -> list[Constraint]:
-    """What keeps the pivot from moving against the force on it faster than ``speed`` (m/s)."""
+    """Constraint on moving the pivot against the force on it, to at most ``speed`` (m/s)."""
     force = math.hypot(arm.fx, arm.fy)
     return [Constraint(-arm.fx / force, -arm.fy / force, 0.0, speed)] if force > 0.0 else []
 
 
 def squeeze_constraints(twist: Twist, arm: ArmState, left: float) -> list[Constraint]:
-    """What leaves only the part ``left`` of every motion but that straight back out.
+    """Constraints that allow the fraction ``left`` of every motion except straight back out.
 
-    The skin tells how hard it is squeezed, and not which motion would loosen it.
+    The skin shows how hard it is squeezed, but not which motion would relieve it.
     """
     c, s = math.cos(arm.heading), math.sin(arm.heading)
     found = []
@@ -222,11 +222,11 @@ def squeeze_constraints(twist: Twist, arm: ArmState, left: float) -> list[Constr
 
 
 def wrench_constraints(twist: Twist, arm: ArmState, left: float) -> list[Constraint]:
-    """What leaves only the part ``left`` of the motion in ``twist`` that increases the load.
+    """Constraints that allow the fraction ``left`` of the motion in ``twist`` that adds load.
 
-    That is the velocity against the force, and the turning against the torque: the environment's
-    wrench does negative work on both. Turning and moving are both held, whichever limit is near,
-    for a force at the tip grows by either.
+    That motion is the velocity against the force and the turning against the torque, on which the
+    environment's wrench does negative work. Both are limited whichever limit is near, because a
+    force at the tip grows with either.
     """
     found = []
     force = math.hypot(arm.fx, arm.fy)
@@ -242,11 +242,11 @@ def wrench_constraints(twist: Twist, arm: ArmState, left: float) -> list[Constra
 
 
 def constrained(twist: Twist, constraints: list[Constraint]) -> Twist:
-    """``twist`` reduced until every constraint holds.
+    """Reduce ``twist`` until it obeys every constraint.
 
-    First the velocity gives way, to the nearest one that obeys, so that the arm may slide along a
-    border; then the turning; and where less turning would need a velocity that turns back, the
-    whole twist is scaled.
+    First the velocity is replaced by the nearest one that obeys, so that the arm can slide along a
+    border; then turning is reduced; if that is not enough without reversing the velocity, the whole
+    twist is scaled.
     """
     if not any(rule.broken_by(twist) for rule in constraints):
         return twist
@@ -268,8 +268,8 @@ def constrained(twist: Twist, constraints: list[Constraint]) -> Twist:
 def _nearest(vx: float, vy: float, rules: list[tuple[float, float, float]]) -> tuple[float, float]:
     """Velocity nearest to (vx, vy) with ``nx·vx + ny·vy ≤ most`` for every (nx, ny, most ≥ 0).
 
-    The nearest point of a convex region lies on one border or in a corner of two. Standing still
-    is always inside, so the answer is never faster and never points the other way.
+    The nearest point of a convex region lies on a border or in a corner. Standing still is always
+    inside, so the result is never faster and never in the opposite direction.
     """
     broken = [rule for rule in rules if _beyond(vx, vy, rule)]
     if not broken:

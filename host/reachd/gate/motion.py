@@ -1,9 +1,9 @@
-"""Compares what an arm does with what it was told: the gate's judgement of the arm itself.
+"""Compare an arm's motion with its commands: the gate's check of the arm itself.
 
-Commands are integrated to the path that the arm was told to go; states tell the path it went. A
-command acts at once or up to its expiry later, and may have died on the way, so the arm may be
-anywhere between standing still and the whole of any such path, but nowhere beside it, before it or
-behind it. Translation of the pivot and turning are judged apart: either may fail alone.
+Commands are integrated to the commanded path; states give the actual path. A command takes effect
+at once or up to its expiry later, and may have been lost, so the arm may be anywhere between
+standing still and the end of any such path, but not beside it, before it or beyond it. Translation
+of the pivot and turning are checked separately, because either may fail alone.
 """
 
 from __future__ import annotations
@@ -16,77 +16,79 @@ from reachd.interfaces import ArmState, Twist
 from tactile_core.types import NS_PER_S, Instant
 
 TOO_FAST = 1.5
-"""Times the limit that the arm confirmed. Impacts make simulated fingers 1.3 times as fast."""
+"""Multiple of the confirmed limit. Impacts make simulated fingers 1.3 times as fast."""
 
 SPEED_OVER_NS = 30_000_000
-"""Time over which the pose alone tells the speed: three states at 100 a second."""
+"""Time over which speed is measured from the pose: three states at 100 per second."""
 
 TRACK_NS = 100_000_000
-"""Window over which the arm must not leave the way it was told to go."""
+"""Window over which the arm must stay on the commanded path."""
 
 OFF_THE_WAY = 0.001
-"""m by which it may leave it in such a window: simulated arms do by 0.3 mm in free motion, and by
-up to 0.6 mm when they are hit. An arm at its own limit of force gives way: there it may be pushed
-as fast as it may move."""
+"""m by which it may leave the path in that window: simulated arms do by 0.3 mm in free motion, and
+by up to 0.6 mm when hit. An arm at its own force limit gives way: it may be pushed at up to its
+speed limit."""
 
 AT_ITS_LIMIT = 0.8
-"""Part of the arm's own limit of force or torque from which it is taken to give way."""
+"""Fraction of the arm's own force or torque limit from which it may give way."""
 
 POSE_NOISE = 0.0003
-"""m by which a pose may err."""
+"""m, error of a pose."""
 
 COMMANDED = 0.002
-"""m/s at pivot, and by turning at the tip: slower commands are not watched, for arms do not follow
-them well."""
+"""m/s at the pivot, and at the tip from turning: slower commands are not checked, because arms do
+not follow them well."""
 
 STEADY = 0.7
-"""Part of a commanded path that its ends must lie apart, or it turns back and says little."""
+"""Least distance of a commanded path's ends, as a fraction of its length; a path that turns back
+shows little."""
 
 DISAGREES = 0.5
-"""Part of the commanded path by which the moved one may differ unless a load explains it."""
+"""Fraction of the commanded path by which the actual one may differ unless a load explains it."""
 
 ASTRAY = 0.002
-"""m by which it differs at least before an arm that goes far enough, or too far, is said to go
-astray: an impact turns a finger by a millimetre at its tip."""
+"""m, least difference for an arm that goes far enough, or too far, to count as astray: an impact
+turns a finger by a millimetre at its tip."""
 
 DEAD = 0.1
-"""Part of the commanded path below which the arm is said not to move at all."""
+"""Fraction of the commanded path below which the arm counts as not moving."""
 
 REPORTED = 0.25
-"""Part of the told motion that the twist reports while the pose stays: then the state is frozen,
-for a jammed arm reports none."""
+"""Fraction of the commanded motion that a twist must report for a constant pose to count as frozen:
+a jammed arm reports none."""
 
 CREEP = 0.001
 """m/s, rad/s of reported motion that contradicts a pose that does not change at all."""
 
 SAME = 1e-5
-"""m, rad within which a pose does not change: jammed arms tremble by more."""
+"""m, rad within which a pose does not change; jammed arms tremble by more."""
 
 DELAYS_NS = tuple(range(10_000_000, 60_000_001, 10_000_000))
-"""Ages at which a command may take effect, beside at once."""
+"""Delays with which a command may take effect, besides none."""
 
 LONGEST_GAP_NS = 150_000_000
-"""Between two states; after a longer one nothing is said until a window is full again."""
+"""Longest gap between states; after a longer one a new window must fill first."""
 
 JUMP = 0.05
-"""m between two states, which no arm goes: the pose was taken anew, and says nothing of motion."""
+"""m between two states that no arm can move: the pose was set anew and does not show motion."""
 
 DRIFT_NS = 1_000_000_000
-"""Window over which an arm that touches nothing must keep to what it was told."""
+"""Window over which an arm that touches nothing must follow its commands."""
 
 DRIFTS = 0.002
-"""m beside or beyond the told path in such a window that are called drift. An arm that lags may
-fall short of it: commands die on the way."""
+"""m beside or beyond the commanded path in that window that count as drift. Falling short is
+allowed, because commands may be lost."""
 
 KEPT = 512
+"""Commands and states kept, at least."""
 
 Finding = tuple[Check, str]
 Path = tuple[float, float, float, float, float]
-"""x, y m; heading rad; lengths of the way m and rad: integrals of commands."""
+"""x, y m; heading rad; path length m; total turning rad: integrals of commands."""
 
 
 class MotionWatch:
-    """Of one arm. `told` every command that is sent, `judge` every state."""
+    """Checks the motion of one arm. Call `told` with every command and `judge` with every state."""
 
     def __init__(self, settings: SafetySettings) -> None:
         self._s = settings
@@ -94,16 +96,16 @@ class MotionWatch:
         self._longest_ns = round(settings.command_expiry * NS_PER_S)
         self._told_at: list[Instant] = []
         self._told: list[Twist] = []
-        self._path: list[Path] = []  # up to the instant of the same index
+        self._path: list[Path] = []  # commanded path up to the instant of the same index
         self._seen_at: list[Instant] = []
         self._seen: list[ArmState] = []
         self._found: tuple[Finding, ...] = ()
-        self._free_since: Instant | None = None  # since when nothing has loaded the arm
+        self._free_since: Instant | None = None  # since when the arm has been without load
 
     def told(self, twist: Twist, at: Instant) -> None:
-        """``twist`` was sent at ``at``."""
+        """Add a command sent at ``at``."""
         if self._told_at and at <= self._told_at[-1]:
-            self._told_at.clear()  # time went back: what was before says nothing
+            self._told_at.clear()  # time went back, so earlier commands are useless
         if not self._told_at:
             self._told.clear()
             self._path[:] = [(0.0, 0.0, 0.0, 0.0, 0.0)]
@@ -115,28 +117,28 @@ class MotionWatch:
             del self._told_at[:KEPT], self._told[:KEPT], self._path[:KEPT]
 
     def restart(self) -> None:
-        """Judge what comes from now on."""
+        """Forget earlier states."""
         self._seen_at.clear()
         self._seen.clear()
         self._found = ()
         self._free_since = None
 
     def after_all(self, decided: Instant) -> bool:
-        """Whether ``decided`` is later than every command that was sent, of which there are any."""
+        """Whether commands were sent, and ``decided`` is later than all of them."""
         return bool(self._told_at) and decided > self._told_at[-1]
 
     def first_after(self, decided: Instant) -> Instant | None:
-        """When the first command after that of ``decided`` was sent; None when none was."""
+        """When the first command after that of ``decided`` was sent; None if none was."""
         index = bisect_right(self._told_at, decided)
         return self._told_at[index] if index < len(self._told_at) else None
 
     def judge(self, arm: ArmState) -> tuple[Finding, ...]:
-        """What is wrong with the arm's motion up to ``arm``, whose numbers are finite."""
+        """Check the arm's motion up to the state ``arm``, whose numbers must be finite."""
         at = arm.captured
         if self._seen_at:
             since = at - self._seen_at[-1]
             if -LONGEST_GAP_NS <= since <= 0:
-                return self._found  # seen already, or stamped before one that was
+                return self._found  # checked already, or older than one that was
             if abs(since) > LONGEST_GAP_NS or self._jumped(arm):
                 self._seen_at.clear()
                 self._seen.clear()
@@ -155,12 +157,12 @@ class MotionWatch:
         return self._found
 
     def _jumped(self, arm: ArmState) -> bool:
-        """Whether the pose is another one altogether, as after a reset of a simulated world."""
+        """Whether the pose has jumped, as after a reset of a simulated world."""
         dx, dy, dh = self._moved(-1, arm)
         return math.hypot(dx, dy) > JUMP or abs(dh) > JUMP / self._s.tip_length
 
     def _gone(self, index: int, at: Instant) -> Path:
-        """Path up to ``at``, the newest command before it being that of ``index``."""
+        """Commanded path up to ``at``; ``index``: newest command before it."""
         x, y, h, length, turned = self._path[index]
         twist = self._told[index]
         dt = min(at - self._told_at[index], self._longest_ns) / NS_PER_S
@@ -173,7 +175,7 @@ class MotionWatch:
         )
 
     def _way(self, begin: Instant, end: Instant) -> Path:
-        """Path told between two instants; none before the first command."""
+        """Path commanded between two instants; none before the first command."""
         ends = []
         for at in (begin, end):
             index = bisect_right(self._told_at, at) - 1
@@ -182,7 +184,7 @@ class MotionWatch:
         return x1 - x0, y1 - y0, h1 - h0, l1 - l0, t1 - t0
 
     def _before(self, at: Instant, window_ns: int) -> int | None:
-        """Index of the newest state at least ``window_ns`` before ``at``; None when none is."""
+        """Index of the newest state at least ``window_ns`` before ``at``; None if there is none."""
         index = bisect_right(self._seen_at, at - window_ns) - 1
         return index if index >= 0 else None
 
@@ -191,7 +193,7 @@ class MotionWatch:
         return arm.x - old.x, arm.y - old.y, math.remainder(arm.heading - old.heading, math.tau)
 
     def _stays(self, index: int) -> bool:
-        """Whether no pose from ``index`` on differs from the newest by more than `SAME`."""
+        """Whether all poses from ``index`` on equal the newest to within `SAME`."""
         last = self._seen[-1]
         return all(
             abs(a.x - last.x) <= SAME
@@ -201,7 +203,7 @@ class MotionWatch:
         )
 
     def _speed(self, arm: ArmState) -> Finding | None:
-        """Faster than the limit that the arm confirmed, by its twist or by its pose."""
+        """Check the speed, by twist and by pose, against the limit that the arm confirmed."""
         s, twist = self._s, arm.twist
         speed, turn = math.hypot(twist.vx, twist.vy), abs(twist.omega)
         index = self._before(arm.captured, SPEED_OVER_NS)
@@ -223,7 +225,7 @@ class MotionWatch:
         return None
 
     def _tracking(self, arm: ArmState) -> Finding | None:
-        """Against, across or beyond what was told, over `TRACK_NS`."""
+        """Check for motion against, across or beyond the commanded path, over `TRACK_NS`."""
         index = self._before(arm.captured, TRACK_NS)
         if index is None or not self._told_at:
             return None
@@ -250,7 +252,7 @@ class MotionWatch:
         )
 
     def _drift(self, arm: ArmState) -> Finding | None:
-        """Beside or beyond what was told, over `DRIFT_NS` in which nothing touched the arm."""
+        """Check for motion beside or beyond the commanded path, over `DRIFT_NS` without load."""
         end, free = arm.captured, self._free_since
         if free is None or end - free < DRIFT_NS or not self._told_at:
             return None
@@ -282,7 +284,7 @@ class MotionWatch:
         )
 
     def _disagreement(self, arm: ArmState) -> Finding | None:
-        """Another path than was told, over a longer window, although no load explains it."""
+        """Check for another path than commanded, over a longer window, that no load explains."""
         index = self._before(arm.captured, self._long_ns)
         if index is None or not self._told_at:
             return None
@@ -306,7 +308,7 @@ class MotionWatch:
     def _translation_differs(
         self, moved: tuple[float, float, float], way: Path, window_ns: int
     ) -> tuple[float, float, float] | None:
-        """Unit vector and length (m) of a told translation that ``moved`` contradicts."""
+        """Unit vector and length (m) of a commanded translation that ``moved`` contradicts."""
         x, y, _, length, _ = way
         apart = math.hypot(x, y)
         if apart < COMMANDED * window_ns / NS_PER_S or apart < STEADY * length:
@@ -320,7 +322,7 @@ class MotionWatch:
     def _turning_differs(
         self, moved: tuple[float, float, float], way: Path, window_ns: int
     ) -> tuple[float, float, float] | None:
-        """(0, 0) and the told angle (rad) that ``moved`` contradicts."""
+        """(0, 0) and the commanded angle (rad) that ``moved`` contradicts."""
         _, _, angle, _, turned = way
         lever = self._s.tip_length
         if abs(angle) * lever < COMMANDED * window_ns / NS_PER_S or abs(angle) < STEADY * turned:
@@ -338,7 +340,7 @@ class MotionWatch:
         told: tuple[float, float, float],
         window_ns: int,
     ) -> Finding | None:
-        """Say so, unless the environment pushed the arm that way and the arm's twist agrees."""
+        """The finding, unless the environment pushed the arm that way and its twist agrees."""
         s, states = self._s, self._seen[index:]
         ux, uy, length = told
         n, seconds = len(states), window_ns / NS_PER_S
@@ -362,8 +364,8 @@ class MotionWatch:
         pace = length / seconds
         dead = abs(moves) < DEAD * pace * TRACK_NS / NS_PER_S
         if 0.0 <= went < (1.0 - DISAGREES) * length:
-            # Held back: by whatever presses on the finger, for it may be wedged any way; or it was
-            # for a part of the window, and has come free.
+            # Held back by anything that presses on the finger, which may be wedged in any
+            # direction; or held back for a part of the window and now free.
             explained = any(
                 sum(math.hypot(a.fx, a.fy) for a in some) >= s.free_air_force * len(some)
                 or sum(abs(a.mz) for a in some) >= s.free_air_torque * len(some)
@@ -388,7 +390,7 @@ class MotionWatch:
 
 
 def _moving(states: list[ArmState]) -> bool:
-    """Whether their mean twist says that the arm moves: jammed arms creep slower."""
+    """Whether their mean twist shows motion; jammed arms creep more slowly."""
     n = len(states)
     vx = math.fsum(a.twist.vx for a in states) / n
     vy = math.fsum(a.twist.vy for a in states) / n
@@ -397,7 +399,7 @@ def _moving(states: list[ArmState]) -> bool:
 
 
 def _astray(mx: float, my: float, x: float, y: float) -> float:
-    """m by which a way of (mx, my) goes beside or beyond one of (x, y); short of it is 0."""
+    """m by which a motion (mx, my) goes beside or beyond (x, y); 0 if it falls short."""
     length = math.hypot(x, y)
     if length <= DRIFTS:
         return math.hypot(mx - x, my - y)
@@ -406,7 +408,8 @@ def _astray(mx: float, my: float, x: float, y: float) -> float:
 
 
 def _off(moved: tuple[float, float, float], way: Path) -> tuple[float, float]:
-    """Distance (m), angle (rad) of ``moved`` from the nearest part of ``way`` seen as straight."""
+    """Distance (m) and angle (rad) of ``moved`` from the nearest point of ``way``, taken as
+    straight."""
     mx, my, mh = moved
     x, y, h, _, _ = way
     square = x * x + y * y

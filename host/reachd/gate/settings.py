@@ -1,4 +1,4 @@
-"""What the safety gate checks, by stable code, and the limits it checks against."""
+"""The checks of the safety gate, by stable code, and its limits."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tactile_core.types import ArmLimits
 
 
 class Check(StrEnum):
-    """Reason codes of interventions. They are written to logs: never change their meaning."""
+    """Reason codes of interventions. Logs contain them, so their meaning must never change."""
 
     NOT_ARMED = "not_armed"
     COMMAND_NOT_FINITE = "command_not_finite"
@@ -79,7 +79,7 @@ ALWAYS_ON = frozenset(
         Check.COMMANDER,
     }
 )
-"""Checks without which the gate has nothing to judge by, or would arm itself."""
+"""Checks that cannot be disabled: without them the gate could not judge, or would arm itself."""
 
 HARD_CAPS: Mapping[str, float] = MappingProxyType(
     {
@@ -101,20 +101,20 @@ HARD_CAPS: Mapping[str, float] = MappingProxyType(
     }
 )
 """Limits beyond which somebody may be hurt or a cupboard broken before the gate acts: allowed, but
-never without a word. 0.25 m/s is what ISO 10218-1 calls reduced speed; the others are twice what
-the hardware set has, in round figures."""
+always with a warning. 0.25 m/s is the reduced speed of ISO 10218-1; the others are twice the values
+of the hardware set, in round figures."""
 
 MOVING_MODES = frozenset({"ready", "moving"})
 """Arm modes in which motion may be commanded."""
 
 PAUSED_MODE = "stopped"
-"""The driver stopped by itself because commands ceased; fresh zero commands revive it. An
-operator's stop is "estop" or "fault", which latch."""
+"""The driver stopped by itself because commands ceased; new zero commands resume it. An operator's
+stop is "estop" or "fault", which latch."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetySettings:
-    """Limits of the safety gate. Speeds are those of the pivot, SI units."""
+    """Limits of the safety gate, in SI units. Speeds are those of the pivot."""
 
     speed: Annotated[MetresPerSecond, Meta(gt=0, description="greatest speed of the pivot")]
     turn_rate: Annotated[RadiansPerSecond, Meta(gt=0, description="greatest turn rate")]
@@ -221,7 +221,7 @@ class SafetySettings:
     ] = frozenset()
 
     def __post_init__(self) -> None:
-        """Refuse values out of range, limits that contradict one another, checks that must stay."""
+        """Check ranges, contradicting limits, and checks that must stay on; `ConfigError`."""
         check_fields(self)
         for soon, late in (("features_age", "features_latch"), ("arm_age", "arm_latch")):
             age = getattr(self, soon)
@@ -241,7 +241,7 @@ class SafetySettings:
 
     @property
     def cautions(self) -> tuple[str, ...]:
-        """What an operator must know of these settings: checks that are off, limits too wide."""
+        """Warnings for the operator: checks that are off, and limits beyond `HARD_CAPS`."""
         off = [f"the check {check} is off" for check in sorted(self.disabled)]
         wide = [
             f"{name} is {getattr(self, name):g}, beyond the cap of {cap:g}"
@@ -252,5 +252,5 @@ class SafetySettings:
 
     @property
     def arm_limits(self) -> ArmLimits:
-        """What to tell the arm before it is armed."""
+        """Limits to set at the arm before it is armed."""
         return ArmLimits(self.arm_v_max, self.arm_omega_max, self.arm_f_max, self.arm_m_max)

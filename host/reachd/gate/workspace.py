@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from tactile_core.config import ConfigError
 
 MAX_CORNERS = 16
-"""Corners of a region: each is two constraints a control cycle, and no lab's shelf needs more."""
+"""Most corners of a region: each is two constraints per control cycle, and no shelf needs more."""
 
 
 @dataclass(frozen=True, slots=True)
 class Border:
-    """One edge: a point p is inside where ``nx·x + ny·y ≤ offset``; (nx, ny) points outward."""
+    """An edge: a point is inside where ``nx·x + ny·y ≤ offset``; (nx, ny) points outward."""
 
     nx: float
     ny: float
@@ -22,13 +22,13 @@ class Border:
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """Convex polygon, corners counter-clockwise, m in ``cupboard``."""
+    """Convex polygon; corners counter-clockwise, m in ``cupboard``."""
 
     corners: tuple[tuple[float, float], ...]
     borders: tuple[Border, ...] = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Work out the borders; ConfigError for what is no counter-clockwise convex polygon."""
+        """Compute the borders; ConfigError unless this is a counter-clockwise convex polygon."""
         corners = self.corners
         if not 3 <= len(corners) <= MAX_CORNERS:
             raise ConfigError(f"a region has 3 to {MAX_CORNERS} corners, not {len(corners)}")
@@ -46,7 +46,7 @@ class Region:
         object.__setattr__(self, "borders", tuple(borders))
 
     def depth(self, x: float, y: float) -> float:
-        """How far (m) a point lies inside the nearest border; negative outside."""
+        """Distance (m) of a point from the nearest border; negative outside."""
         return min(b.offset - b.nx * x - b.ny * y for b in self.borders)
 
 
