@@ -1,4 +1,4 @@
-"""Healthy inputs, an armed gate, a finger in free air; and a lab: fake arm, fake board, reachd."""
+"""Healthy inputs, an armed gate, a finger in free air, and a lab: fake arm, fake board, reachd."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
 T0 = Instant(5_000_000_000)
 GOAL = Goal(0.358, 0.0, 0.0075, 40.0)
 SLOWLY = Twist(0.001, 0.0, 0.0)
-"""So slow that one cycle's acceleration reaches it."""
+"""A twist slow enough to be reached in one cycle's acceleration."""
 
 
 @pytest.fixture(scope="session")
 def t0() -> Instant:
-    """Where the tests' time begins."""
+    """Begin of the tests' virtual time."""
     return T0
 
 
 @pytest.fixture(scope="session")
 def make_touch() -> Callable[..., Touch]:
-    """Valid touch of nothing at ``at``, values replaced as given."""
+    """Valid touch without contact at ``at``, with values replaced as given."""
 
     def make(at: Instant = T0, **values: Any) -> Touch:
         calm = Touch(at, at, True, 0.0, Side.NONE, 0.0, 0.0, 0.0, 0.0)
@@ -46,7 +46,7 @@ def make_touch() -> Callable[..., Touch]:
 
 @pytest.fixture(scope="session")
 def make_arm() -> Callable[..., ArmState]:
-    """Arm at rest in front of the cupboard at ``at``, as the hardware set wants it."""
+    """Arm at rest in front of the cupboard at ``at``, with the hardware set's limits."""
 
     def make(at: Instant = T0, **values: Any) -> ArmState:
         limits = SETS["hardware"].safety.arm_limits
@@ -81,7 +81,7 @@ def settings() -> SafetySettings:
 def make_gate(
     make_touch: Callable[..., Touch], make_arm: Callable[..., ArmState]
 ) -> Callable[[SafetySettings], SafetyGate]:
-    """Gate with these settings, armed at T0 and stepped once."""
+    """Gate with the given settings, armed at T0 and stepped once."""
 
     def make(settings: SafetySettings) -> SafetyGate:
         gate = SafetyGate(settings)
@@ -93,7 +93,7 @@ def make_gate(
 
 
 class Rig:
-    """A gate with inputs in good health, each of which a test may spoil."""
+    """A gate with healthy inputs, each of which a test may replace."""
 
     def __init__(self, gate: SafetyGate, touch: Touch, arm: ArmState, period: float) -> None:
         self.gate, self.touch, self.arm = gate, touch, arm
@@ -101,7 +101,7 @@ class Rig:
         self.period = round(period * 1e9)
 
     def step(self, wanted: Twist | None = SLOWLY, **how: Any) -> Decision:
-        """One cycle later, with fresh inputs unless ``touch`` or ``arm`` say otherwise."""
+        """Run one cycle, with fresh inputs unless ``touch`` or ``arm`` are given."""
         self.now = Instant(self.now + int(how.pop("passed", self.period)))
         touch = how.pop("touch", self.fresh_touch())
         arm = how.pop("arm", self.fresh_arm())
@@ -116,7 +116,7 @@ class Rig:
         return replace(self.arm, captured=at, received=at, **values)
 
     def request(self, **how: Any) -> set[str]:
-        """An operator's request now; returns the codes of the refusals."""
+        """Arm at an operator's request now; returns the codes of the refusals."""
         refusals = self.gate.arm(
             how.pop("requested", self.now),
             how.pop("touch", self.fresh_touch()),
@@ -132,7 +132,7 @@ class Rig:
 def rig(
     make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
 ) -> Callable[..., Rig]:
-    """Rig with an armed gate; ``off`` names disabled checks."""
+    """Rig with an armed gate; ``off``: disabled checks."""
 
     def make(*off: Check, armed: bool = True, **values: Any) -> Rig:
         chosen = replace(settings, disabled=frozenset(off), **values)
@@ -146,7 +146,7 @@ def rig(
 def send(
     make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
 ) -> Callable[..., Decision]:
-    """One command through an armed gate; ACCELERATION is off unless named in ``on``."""
+    """Send one command through an armed gate; ACCELERATION is off unless in ``on``."""
 
     def go(
         wanted: Twist,
@@ -170,7 +170,7 @@ def send(
 
 @pytest.fixture(scope="session")
 def codes() -> Callable[[Decision], list[str]]:
-    """Codes of what the gate did to a command, in order."""
+    """Codes of a decision's interventions, in order."""
 
     def of(decision: Decision) -> list[str]:
         return [i.code.value for i in decision.interventions]
@@ -180,7 +180,7 @@ def codes() -> Callable[[Decision], list[str]]:
 
 @pytest.fixture(scope="session")
 def passes() -> Callable[[Decision], bool]:
-    """Whether motion came through; it is never stopped without a word."""
+    """Whether motion passed; also checks that it is never stopped without an intervention."""
 
     def judge(decision: Decision) -> bool:
         if decision.twist == ZERO:
@@ -194,7 +194,7 @@ def passes() -> Callable[[Decision], bool]:
 
 @pytest.fixture(scope="session")
 def fly(make_touch: Callable[..., Touch], make_arm: Callable[..., ArmState]) -> Callable[..., dict]:
-    """Move a finger in free air as a strategy wants, by small Euler steps."""
+    """Move a finger in free air as a strategy commands, by small Euler steps."""
 
     def run(
         strategy: Strategy,
@@ -235,7 +235,7 @@ def fly(make_touch: Callable[..., Touch], make_arm: Callable[..., ArmState]) -> 
 
 @pytest.fixture
 def lab(tmp_path: Path) -> Iterator[ReachdLab]:
-    # Imported here: the mutation run starts these tests thousands of times without a lab.
+    # Imported here because the mutation run starts these tests thousands of times without a lab.
     from tests.support.reachd_lab import ReachdLab
 
     made = ReachdLab(tmp_path)

@@ -1,4 +1,4 @@
-"""One cycle of control on virtual time: arming, reaching, standing still, ending."""
+"""The controller on virtual time: arming, reaching, stalls and ending."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""reachd as it is run, with what goes wrong round it: rows of the fault table, one by one."""
+"""reachd as a real process with faults around it: rows of the fault table."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ Until = Callable[..., None]
 
 
 def stopped(lab: Any) -> bool:
-    """Whether the arm has been told to stand still for good: ten commands in a row."""
+    """Whether the arm has been commanded to stand still: by ten commands in a row."""
     last = lab.arm.heard[-10:]
     return len(last) == 10 and all(h.still for h in last)
 
 
 def test_frozen_arm_state_latches_the_gate(lab: Any) -> None:
-    """Stamps and sequence go on, values do not: the arm moves, and nobody could see it."""
+    """Stamps and sequence advance, values do not: the arm moves unobserved."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--no-log")
     lab.wait_until_moving(program)
@@ -37,7 +37,7 @@ def test_frozen_arm_state_latches_the_gate(lab: Any) -> None:
     assert "does not change although the arm is told to move" in program.said
     assert "arm_frozen" in lab.codes("intervention")
     lab.wait_until_told_to_stop()
-    # Told to move on for 0.3 s and what a busy machine adds, at 4 cm/s: not far.
+    # It moves on for 0.3 s, plus delays of a busy machine, at 4 cm/s.
     assert arm.travelled < 0.2
 
 
@@ -45,7 +45,7 @@ def test_frozen_arm_state_latches_the_gate(lab: Any) -> None:
 def test_system_clock_step_changes_nothing(
     hours: int, lab: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Row 17: the processes' wall clocks step while the arm moves; only they, not the machine's."""
+    """Row 17: the wall clocks of the processes step while the arm moves (not the machine's)."""
     (lab.folder / "sitecustomize.py").write_text(
         "import time\n"
         "start, seconds, nanoseconds = time.monotonic(), time.time, time.time_ns\n"
@@ -58,7 +58,7 @@ def test_system_clock_step_changes_nothing(
     program = lab.reachd(*NEAR, "--log", "trial.mcap")
     assert program.wait() == 0, program.said
     assert arm.travelled > 0.03
-    # A busy machine makes inputs old and cycles late; by a clock they would be so by an hour.
+    # On a busy machine inputs may be old and cycles late; a clock step would make that an hour.
     assert set(lab.codes("intervention")) <= {"not_armed", "features_lost", "features_stale",
                                               "arm_stale", "arm_lost", "arm_limits", "loop_late",
                                               "acceleration", "slow_down", "commander",
@@ -77,7 +77,7 @@ def test_system_clock_step_changes_nothing(
 
 @pytest.mark.parametrize("side", ["board", "arm"])
 def test_silent_network_stops_the_arm(side: str, lab: Any) -> None:
-    """Row 19: nobody's session ends and every liveliness token stands; age alone tells."""
+    """Row 19: no session ends and every liveliness token stays; only the age shows it."""
     arm = lab.arm
     wire = lab.wire(lab.reachd_at if side == "board" else lab.arm_at)
     lab.board(via=wire.endpoint if side == "board" else None)
@@ -86,7 +86,7 @@ def test_silent_network_stops_the_arm(side: str, lab: Any) -> None:
     wire.cut()
     if side == "board":
         wait_until(lambda: stopped(lab))
-    else:  # nor can reachd's zero reach it: its commands expire
+    else:  # reachd's zero twist cannot reach it either: its commands expire
         wait_until(lambda: not arm.moving)
     assert program.wait() == 1, program.said
     assert "NOT REACHED (held)" in program.said
@@ -97,7 +97,7 @@ def test_silent_network_stops_the_arm(side: str, lab: Any) -> None:
 
 
 def test_short_network_silence_is_survived(lab: Any) -> None:
-    """What comes late, all at once, is old: it is not acted on before it is new again."""
+    """Delayed data that come all at once are old, and are not acted on."""
     arm = lab.arm
     wire = lab.wire(lab.reachd_at)
     lab.board(via=wire.endpoint)
@@ -114,7 +114,7 @@ def test_short_network_silence_is_survived(lab: Any) -> None:
 
 
 def test_load_at_the_limit_stops_motion_against_it(lab: Any) -> None:
-    """Row 25, judged on the arm's own state: the features see nothing."""
+    """Row 25, from the arm's own state: the features show no contact."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--no-log")
     lab.wait_until_moving(program)
@@ -144,7 +144,7 @@ def test_timed_out_target_ends_in_zero(lab: Any) -> None:
 
 
 def test_second_reachd_on_the_bus_is_refused(lab: Any) -> None:
-    """Row 35 where no lock is shared, as between two machines."""
+    """Row 35 without a shared lock, as between two machines."""
     arm, _ = lab.arm, lab.board()
     first = lab.reachd("--serve", "--strategy", "straight", "--no-log")
     wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
@@ -161,7 +161,7 @@ def test_second_reachd_on_the_bus_is_refused(lab: Any) -> None:
 
 
 def test_second_reachd_seeing_only_the_arm_is_refused(lab: Any) -> None:
-    """Row 35 by the arm itself: no lock is shared, and no link but that to the arm."""
+    """Row 35 by the arm itself: no shared lock, and no link except to the arm."""
     arm, _ = lab.arm, lab.board()
     lab.reachd("--serve", "--strategy", "straight", "--no-log")
     wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
@@ -181,7 +181,7 @@ def test_second_reachd_seeing_only_the_arm_is_refused(lab: Any) -> None:
 
 
 def test_restarted_arm_driver_is_claimed_again(lab: Any) -> None:
-    """Row 45: latched meanwhile; whoever stopped commanding for long has to ask anew, too."""
+    """Row 45: the gate latches meanwhile, and the arm must be claimed again."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd("--serve", "--strategy", "straight", "--no-log")
     wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
@@ -201,7 +201,7 @@ def test_restarted_arm_driver_is_claimed_again(lab: Any) -> None:
 
 @pytest.mark.parametrize("delay", [0.25, 0.07])
 def test_commands_delayed_in_transit_latch(delay: float, lab: Any) -> None:
-    """Row 37: states come undelayed; the arm drops what is too old, and reachd sees it."""
+    """Row 37: states come without delay; the arm drops old commands, and reachd notices."""
     arm, _ = lab.arm, lab.board()
     wire = lab.wire(lab.arm_at)
     program = lab.reachd(*FAR, "--no-log", via=wire.endpoint)
@@ -233,7 +233,7 @@ def test_arm_deviating_from_commands_latches(how: str, lab: Any) -> None:
 
 
 def test_operator_messages_are_shown(lab: Any) -> None:
-    """Checks that are off and limits beyond the caps: at the start, in the status, in the log."""
+    """Checks that are off and limits beyond the caps are shown at the start, in status and log."""
     _, _ = lab.arm, lab.board()
     config = lab.folder / "reach.toml"
     config.write_text('[parameters.safety]\ndisabled = ["skin_overload"]\nforce = 45.0\n')

@@ -1,4 +1,4 @@
-"""The way home: out of the cupboard first, then straight to the pose."""
+"""Homing: out of the cupboard first, then straight to the pose."""
 
 from __future__ import annotations
 

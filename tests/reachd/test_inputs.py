@@ -1,4 +1,4 @@
-"""What is believed of what arrives: one publisher, fresh, whole, stamped by a known clock."""
+"""Inputs are used only from one publisher, intact, in order, and stamped by a known clock."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_forger_with_the_same_id_is_detected_by_order() -> None:
 
 
 def test_forged_sequence_number_does_not_lock_out_the_publisher() -> None:
-    """It is told, and once what it set has grown old the first publisher is heard again."""
+    """It is reported, and after the takeover time the first publisher is accepted again."""
     pin = SourcePin(TAKEOVER)
     pin.judge(sample(10), at(0.0))
     pin.judge(sample(2**60, data=b"forged"), at(0.001))
@@ -160,14 +160,14 @@ def test_arbitrary_bytes_never_raise(received: list[tuple[bytes, int]]) -> None:
 def test_remote_clock_is_mapped_by_the_fastest_message() -> None:
     clock, apart = RemoteClock(), 3_600 * NS_PER_S
     assert clock.here(at(0.0) - apart, at(0.005)) == at(0.005)
-    # 2 ms quicker: the first was 2 ms old when it came, which was not to be known.
+    # 2 ms faster: so the first was 2 ms old when it came, which could not be known then.
     assert clock.here(at(0.1) - apart, at(0.103)) == at(0.103)
     late = clock.here(at(0.2) - apart, at(0.5))
     assert (at(0.5) - late) / NS_PER_S == pytest.approx(0.297, abs=1e-3)
 
 
 def test_growing_queue_shows_as_age() -> None:
-    """Row 21: data that come ever later, without a gap."""
+    """Row 21: data come later and later, without a gap."""
     source = touch_input(remote=True)
     for n in range(200):
         sent = n * 0.01

@@ -1,4 +1,4 @@
-"""One reachd an arm (row 35)."""
+"""One reachd per arm (row 35)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said on the bus, the log and the system clock end neither reachd nor its log (42, 43)."""
+"""Neither bus messages nor log or clock faults end reachd or its log (rows 42, 43)."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_no_reach_starts_without_the_requested_log(lab: Any) -> None:
     wait_until(lab.arms)
     logs: Path = lab.folder / "logs"
     logs.rename(lab.folder / "gone")
-    logs.touch()  # where there was a folder: no file can be opened there
+    logs.touch()  # a file in place of the folder, so that no log can be opened
     wait_until(lambda: lab.ask("status")["log"]["state"] == "io_error")
     with pytest.raises(ServiceError, match=r"is not being written \(io_error.*--no-log"):
         lab.ask("goal", {"x": 0.36, "y": 0.0})
@@ -89,7 +89,7 @@ def test_reach_runs_at_any_system_time(
 @pytest.mark.parametrize("topic", [FEATURES, ARM_STATE], ids=["features", "arm"])
 @pytest.mark.parametrize("remote", [False, True])
 def test_inputs_survive_any_bytes_and_stamps(topic: Any, remote: bool) -> None:
-    """Fifty thousand damaged messages, each by a publisher that is heard for the first time."""
+    """Fifty thousand damaged messages, each from a new publisher."""
     rng = random.Random(42)
     make: Any = make_touch if topic is FEATURES else make_arm_state
     taken: Input[Any] = Input(topic, make, 0.2, remote=remote)

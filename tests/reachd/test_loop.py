@@ -1,4 +1,4 @@
-"""The control loop's deadlines, and what it does when something in it fails."""
+"""The control loop's deadlines, and its behaviour on failures."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def controller() -> Controller:
 
 
 class Rig:
-    """A loop with its surroundings."""
+    """A loop with stand-ins for inputs, arm and reports."""
 
     def __init__(self, sense: Callable[[Instant], Inputs] | None = None) -> None:
         self.sent: list[Twist] = []

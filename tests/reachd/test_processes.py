@@ -1,4 +1,4 @@
-"""reachd as it is run: a real process, a real bus, an arm that obeys, signals."""
+"""reachd as a real process: a real bus, an arm that obeys, signals."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Until = Callable[..., None]
 
 
 def stopped(lab: Any) -> bool:
-    """Whether the arm has been told to stand still for good: ten commands in a row."""
+    """Whether the arm has been commanded to stand still: by ten commands in a row."""
     last = lab.arm.heard[-10:]
     return len(last) == 10 and all(h.still for h in last)
 
@@ -50,7 +50,7 @@ def test_complete_reach_is_held_in_one_log_file(lab: Any, hardware_limits: ArmLi
     assert outcome["distance"] <= 0.0075
     assert (outcome["strategy"], outcome["set"], outcome["seed"]) == ("straight", "hardware", 1)
     assert "REACHED: " in program.said
-    # Limits were set and confirmed before anything moved, and every command kept them.
+    # Limits were set and confirmed before anything moved, and every command obeyed them.
     assert arm.limits.f_max == hardware_limits.f_max
     assert all(abs(h.omega) <= 0.1 + 1e-9 for h in arm.heard)
     assert all((h.vx**2 + h.vy**2) ** 0.5 <= arm.limits.v_max + 1e-9 for h in arm.heard)
@@ -127,7 +127,7 @@ def test_sigterm_stops_arm_before_closing_log(lab: Any, number: signal.Signals) 
 
 
 def test_kill_9_stops_the_arm_and_a_new_reachd_starts(lab: Any) -> None:
-    """Rows 15 and 29: nothing of it stays in the way."""
+    """Rows 15 and 29: nothing left of it blocks a restart."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd(*FAR, "--log", "trial.mcap")
     lab.wait_until_moving(program)
@@ -152,14 +152,14 @@ def test_sigstop_and_sigcont_do_not_resume_motion(lab: Any) -> None:
     count = len(arm.heard)
     program.signal(signal.SIGCONT)
     assert program.wait() == 1, program.said
-    # Whichever was noticed first: that the loop stood still, or that its inputs are old.
+    # Whichever was noticed first: the stalled loop or its old inputs.
     assert "stood still" in program.said or "features_lost" in program.said, program.said
-    # What was under way when it was stopped may still come; after that nothing but zero.
+    # A command that was on its way when it was stopped may still arrive; then only zero.
     assert sum(not h.still for h in arm.heard[count:]) <= 1
 
 
 def test_goals_are_served_over_the_bus(lab: Any) -> None:
-    """Goals, refusals, rows 22, 26 and 35, in the life of one daemon."""
+    """Goals, refusals, and rows 22, 26 and 35, with one daemon."""
     arm, _ = lab.arm, lab.board()
     program = lab.reachd("--serve", "--strategy", "straight", "--no-log")
     wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
@@ -216,7 +216,7 @@ def test_goals_are_served_over_the_bus(lab: Any) -> None:
 
 
 def test_without_features_or_arm_no_reach_starts(lab: Any) -> None:
-    """Row 23 as well: a replay is nobody."""
+    """Row 23 as well: a replay does not count as a board."""
     lab.board(prefix="replay")
     program = lab.reachd(*NEAR, "--no-log", "--wait", "1")
     assert program.wait() == 3
@@ -290,11 +290,11 @@ def test_failing_or_hanging_strategy_stops_the_arm(lab: Any) -> None:
     hung = lab.reachd("--strategy", "own:Hung", *target)
     assert hung.wait() == 1
     assert "stuck" in hung.said
-    wait_until(lambda: arm.heard[-1].still)  # it may still be on its way when the process is gone
+    wait_until(lambda: arm.heard[-1].still)  # the last twist may still be on its way
 
 
 def test_forged_bytes_never_crash_the_daemon(lab: Any) -> None:
-    """Row 22: what is no message, or too large, is counted and not acted on."""
+    """Row 22: invalid or oversized messages are counted and not acted on."""
     lab.arm, lab.board()
     program = lab.reachd("--serve", "--no-log")
     wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
@@ -311,7 +311,7 @@ def test_forged_bytes_never_crash_the_daemon(lab: Any) -> None:
     wait_until(lambda: lab.ask("status")["features"]["accepted"] > before + 20)
     status = lab.ask("status")
     assert program.process.poll() is None
-    # None of them says who it is, so none is even read.
+    # None of them has a publisher's id, so none is even decoded.
     assert status["features"]["malformed"] == 0
     assert status["held"] is not None
 

@@ -1,4 +1,4 @@
-"""The outcome as it is told."""
+"""Texts and JSON of an outcome."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is asked of reachd, from flags and file, and what is refused before anything is opened."""
+"""Settings of reachd from flags and file; refusals come before anything is opened."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""reachd tells its service manager: ready, alive as long as the control loop runs, stopping."""
+"""reachd notifies its service manager: ready, alive while the control loop runs, stopping."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_control_loop_feeds_the_watchdog_only_while_running(lab: Any, tmp_path: 
                 pass
             return said
 
-        assert lab.arm is not None  # somebody must answer for it
+        assert lab.arm is not None  # the arm must grant its command
         lab.board()
         program = lab.reachd(
             "--serve", "--no-log",
@@ -31,7 +31,7 @@ def test_control_loop_feeds_the_watchdog_only_while_running(lab: Any, tmp_path: 
         program.signal(signal.SIGSTOP)
         manager.settimeout(0.2)
         quiet = 0.0
-        while quiet < 1.0:  # beats that were on their way, then none
+        while quiet < 1.0:  # beats sent before, then none
             before = time.monotonic()
             try:
                 manager.recv(4096)

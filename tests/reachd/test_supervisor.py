@@ -58,7 +58,7 @@ class Bench:
 
     def arm(self) -> ArmState:
         limits = self.p.safety.arm_limits
-        force = self.force or (-5.0 if self.stuck else 0.0)  # what does not move is pressed
+        force = self.force or (-5.0 if self.stuck else 0.0)  # a stuck finger is under load
         return ArmState(
             self.now, self.now, self.x, self.y, self.heading, self.twist, force, 0.0, 0.0,
             self.mode, limits.v_max, limits.omega_max, limits.f_max, limits.m_max,
@@ -115,7 +115,7 @@ def test_complete_trial_from_homing_to_success() -> None:
     assert outcome.reason is Reason.REACHED
     assert outcome.distance <= 0.0075
     assert math.hypot(bench.tip[0] - 0.1, bench.tip[1] - 0.03) < 0.0085
-    # 14.5 cm less the circle at 4.5 cm/s, a moment to start, half speed in the last 2.5 mm.
+    # 14.5 cm minus the circle at 4.5 cm/s, a moment to start, half speed in the last 2.5 mm.
     assert outcome.time == pytest.approx((0.1451 - 0.01) / 0.045 + 0.0025 / 0.0225, abs=0.15)
     bench.run(1.0)
     assert bench.twist == ZERO, "it waits, holding still, to be reset"
@@ -152,7 +152,7 @@ def test_trial_resets_automatically_when_configured() -> None:
 
 
 def test_unreachable_target_times_out_with_the_reason() -> None:
-    """Row 36: zero at t_tot, and says so."""
+    """Row 36: zero at t_tot, with the reason."""
     bench = Bench()
     bench.stuck = True
     bench.go(time_limit=2.0)

@@ -1,4 +1,4 @@
-"""Boards of a few lines for the links, and real processes on a bus for the daemon."""
+"""Scripted boards for the links, and real processes on a bus for the daemon."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def lab(tmp_path: Path) -> Iterator[TactiledLab]:
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TactiledLab, Program, Any]]:
-    """A finger and an AnySkin board under one daemon, for tests that only ask and listen."""
+    """A finger and an AnySkin board with one daemon, for tests that only query and listen."""
     with tactiled_lab(tmp_path_factory.mktemp("running")) as lab:
         lab.boards("--pty", "board0", "--seed", "1", link="board0")
         lab.boards("--pty", "skin0", "--board", "anyskin", "--seed", "2", link="skin0")
@@ -69,7 +69,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Tactiled
 
 @pytest.fixture
 def ask() -> Callable[..., Any]:
-    """``ask(session, service)``: what the service of a board answers."""
+    """``ask(session, service)``: returns the answer of a board's service."""
 
     def question(
         session: zenoh.Session,

@@ -1,4 +1,4 @@
-"""Boards without a clock: numbering and stamps from arrivals alone."""
+"""Boards without a clock: numbers and stamps from arrivals alone."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_frames_read_in_one_chunk_keep_their_order() -> None:
 def read_in_chunks(
     sent: list[float], reads: list[float], clock: ArrivalClock | None = None
 ) -> list[tuple[float, Arrival]]:
-    """Each frame when it was sent, and what became of it; the host reads at ``reads``."""
+    """Send time and `Arrival` of each frame, for a host that reads at ``reads``."""
     clock, out, waiting = clock or ArrivalClock(), [], list(sent)
     for read in reads:
         chunk = [departure for departure in waiting if departure <= read]

@@ -1,4 +1,4 @@
-"""A link and a scripted board in lockstep on virtual time."""
+"""The link of one board, with a scripted board in lockstep on virtual time."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ STEP = 0.001
 
 @dataclass
 class Rig:
-    """Link and board joined by a wire that takes no time but may lose what the host says."""
+    """Link and board connected without delay; messages of the host may be lost."""
 
     link: BoardLink
     board: Any

@@ -1,4 +1,4 @@
-"""``tactile tare`` and ``tactile status`` as their users meet them, on real daemons."""
+"""``tactile tare`` and ``tactile status`` on real daemons."""
 
 from __future__ import annotations
 

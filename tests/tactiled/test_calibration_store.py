@@ -1,4 +1,4 @@
-"""Which calibration belongs to a board, and when a board is refused rather than misjudged."""
+"""The choice of a calibration for a board, and refusals."""
 
 from __future__ import annotations
 

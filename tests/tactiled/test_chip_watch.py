@@ -1,4 +1,4 @@
-"""Masked chips are named in the log, with since when and what to do, and not too often."""
+"""Masked chips are reported in the log with duration and remedy, without flooding it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HZ = 40
 def watch(
     faults: Callable[[int], dict[int, Fault]], seconds: int, chips: ChipWatch | None = None
 ) -> tuple[ChipWatch, list[tuple[int, int, str]]]:
-    """The watch after so long, and what it said: second, level, text."""
+    """Run a watch; returns it with its reports: second, level and text."""
     chips = chips or ChipWatch(anyskin())
     lines = []
     for k in range(seconds * HZ):

@@ -1,4 +1,4 @@
-"""The clock map against simulated oscillators: its error stays within what it publishes."""
+"""The clock map with simulated oscillators: its error stays within the published bound."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ START = 3_600 * NS_PER_S
 
 @dataclass
 class Oscillator:
-    """Board clock with a rate error that drifts; host time in s since START."""
+    """Board clock with a drifting rate error; host time is in s since START."""
 
     error: float = 0.0
     drift: float = 0.0  # 1/s
@@ -35,7 +35,7 @@ def at(host: float) -> Instant:
 
 
 def poll(clock: ClockMap, board: Oscillator, token: int, t: float, out: float, back: float) -> bool:
-    """One poll sent at t; ``out`` and ``back`` are the delays of the two ways in s."""
+    """Send one poll at ``t`` s; ``out`` and ``back``: delays of the two directions, s."""
     clock.polled(token, at(t))
     turnaround = 50e-6
     reply = ClockReply(token, board.ticks(t + out), board.ticks(t + out + turnaround))
@@ -43,7 +43,7 @@ def poll(clock: ClockMap, board: Oscillator, token: int, t: float, out: float, b
 
 
 def worst(clock: ClockMap, board: Oscillator, rng: np.random.Generator, seconds: float) -> float:
-    """Drives polls with random delays; the largest error as a multiple of the uncertainty."""
+    """Poll with random delays; returns the largest error as a multiple of the uncertainty."""
     ratio, previous, token = 0.0, 0, 0
     for step in range(round(seconds * 100)):
         t = step / 100

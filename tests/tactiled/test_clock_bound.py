@@ -1,7 +1,7 @@
-"""Attempts to break the bound of a board's clock: the truth is within it, for every sample.
+"""The bound of a board's clock holds for every sample under adverse conditions.
 
-Board and host are simulated: an oscillator as wrong as may be, that jumps or begins anew; a line
-that is slow one way, loses polls and is read in bursts. Bytes keep their order on the line.
+Board and host are simulated: an oscillator with the largest error, that jumps or restarts; a line
+that is slow in one direction, loses polls and is read in bursts. Bytes keep their order.
 """
 
 from __future__ import annotations
@@ -49,19 +49,19 @@ def described(tick_hz: int) -> Descriptor:
 
 @dataclass
 class Line:
-    """Delays of a line, s: the least each way, what jitter adds, and how often nothing is read."""
+    """Delays of a line, s: least delay each way, jitter, and stalls of the host."""
 
     there: float = 0.5e-3
     back: float = 0.5e-3
     jitter: float = 0.0
     lost: float = 0.0
     stalls: tuple[tuple[float, float], ...] = ()
-    """From when to when the host reads nothing."""
+    """Begin and end of times in which the host reads nothing."""
 
 
 @dataclass
 class Simulation:
-    """One board on one line. ``jumps``: (when, by how many s of its own time the clock jumps)."""
+    """One board on one line. ``jumps``: (when, by how many s of board time the clock jumps)."""
 
     rng: np.random.Generator
     line: Line
@@ -73,7 +73,7 @@ class Simulation:
     conversion: float = 1e-3
     reset_at: float = 1e9
     reset_tick_hz: int = 0
-    told: bool = True  # of the reset, by the descriptor that it sends
+    told: bool = True  # whether the board sends its descriptor after a reset
     blocks: list[tuple[float, SampleBlock]] = field(default_factory=list)
     events: list[Any] = field(default_factory=list)
 
@@ -125,7 +125,7 @@ class Simulation:
             stalled = any(begin <= now < end for begin, end in line.stalls)
             while not stalled and to_host and to_host[0][0] <= now:
                 arrival, message, truth = to_host.pop(0)
-                # A host that was away stamps when it reads.
+                # A host that was stalled stamps when it reads.
                 ends = [end for begin, end in line.stalls if begin <= arrival < end]
                 read = max([arrival, *ends])
                 happened = link.receive(message, at(read))
@@ -140,7 +140,7 @@ class Simulation:
         return link
 
     def worst(self) -> float:
-        """By how many s the truth lies outside the bound, at worst."""
+        """Largest distance of the truth from the bound, s; negative if always inside."""
         return max(
             abs(block.captured - at(truth)) / NS_PER_S - block.uncertainty
             for truth, block in self.blocks

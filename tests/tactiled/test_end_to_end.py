@@ -1,4 +1,4 @@
-"""A simulated board's bytes through line, link, clock and pipeline in lockstep on virtual time."""
+"""A simulated board's bytes through line, link, clock and pipeline, on virtual time."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def welcome(node: int, identity: Identity) -> Refusal | None:
 def drive(
     board: Any, line: Any, pipeline: BoardPipeline, at: At, seconds: float
 ) -> list[tuple[Instant, Cycle]]:
-    """Board and host in steps of 2 ms; every cycle with the instant at which it came out."""
+    """Run board and host in steps of 2 ms; returns every cycle with the instant it was made."""
     out: list[tuple[Instant, Cycle]] = []
     line.connect(at(0.0))
     for step in range(round(seconds * 500)):
@@ -52,7 +52,7 @@ def drive(
 
 
 def press(seconds: float) -> list[Contact]:
-    """3 N on the left side from 2 s on."""
+    """3 N on the left side after 2 s."""
     if seconds < 2.0:
         return []
     left = build_skin("finger", SEED).geometry.arrays[0]
@@ -98,7 +98,7 @@ def test_every_cycle_arrives_once_and_stamped_within_uncertainty(
     assert board.counters["cycles"] - len(numbers) <= 2
     for came, cycle in cycles:
         assert cycle.captured <= cycle.received <= came
-    # The conversion takes its time before the samples leave: captured is that much earlier.
+    # Conversion takes time before the samples are sent; the capture time is earlier by that.
     late = cycles[-100:]
     assert all(c.uncertainty < 0.01 for _, c in late)
     spacing = np.diff([c.captured for _, c in late]) / NS_PER_S
@@ -131,7 +131,7 @@ def test_corrupted_wire_loses_cycles_but_never_invents_one(instant: At) -> None:
         total = tracker.accepted + tracker.late + tracker.missing
         assert sent - 3 <= total <= sent
         assert tracker.missing > 0
-    # Samples are sound or absent: no force without a press.
+    # Samples are correct or missing: there is no force without a press.
     settled = [c for _, c in cycles if c.features.valid][50:]
     assert max(c.features.normal_force for c in settled) < 1.0
 

@@ -1,4 +1,4 @@
-"""How the daemon ends, whatever it is doing, and what clock and log do to it (rows 34, 43)."""
+"""How the daemon ends under various conditions, and faults of clock and log (rows 34, 43)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_closed_publisher_publishes_nothing() -> None:
         try:
             while not going.is_set() or publisher.late < 1000:
                 publisher.send(LOG, "b0", log_message(1, 20, "b0", "x"), 1)
-        except BaseException as error:  # noqa: BLE001 - what a thread dies of is what is tested
+        except BaseException as error:  # noqa: BLE001 - the test checks what ended the thread
             failed.append(error)
 
     threads = [threading.Thread(target=produce) for _ in range(3)]
@@ -110,7 +110,7 @@ def test_tactiled_runs_at_any_system_time(
     monkeypatch.delenv("PYTHONPATH")
     session = lab.listen()
     features = FeatureListener(session).wait(30)
-    assert (features.header.stamp.sec == 0) == (wall_s > 0)  # no stamp rather than a wrong one
+    assert (features.header.stamp.sec == 0) == (wall_s > 0)  # zero instead of a wrong stamp
     assert says in ask(session, "status").get("clock_problem", "")
     daemon.process.send_signal(signal.SIGTERM)
     assert daemon.wait() == 0, daemon.said
@@ -128,7 +128,7 @@ def test_failed_log_gives_a_failing_exit_status(lab: Any) -> None:
     listener = FeatureListener(lab.listen())
     listener.wait(10)
     (lab.folder / "logs").rename(lab.folder / "gone")
-    (lab.folder / "logs").touch()  # where there was a folder: no file can be opened there
+    (lab.folder / "logs").touch()  # a file in place of the folder, so that no log can be opened
     daemon.wait_for_text("deleted or moved")
     listener.wait(20)
     daemon.process.send_signal(signal.SIGTERM)
@@ -151,7 +151,7 @@ def test_changed_symlink_is_followed_until_a_board_is_found(lab: Any) -> None:
         listener = FeatureListener(session)
         listener.wait(10)
         assert "board leads to another device now" in daemon.said
-        # With a board found, the port is that board's: the path is not looked at any more.
+        # Once a board is found the port belongs to it, and the path is not checked any more.
         _relink(link, os.ttyname(slave))
         listener.wait(100, after=listener.heard[-1][0])
         assert daemon.process.poll() is None

@@ -1,6 +1,6 @@
-"""A board that sends whatever it likes: each item costs itself at most, counted (rows 42 and 44).
+"""A board that sends arbitrary messages: each costs at most itself, and is counted (rows 42, 44).
 
-Every frame has a right CRC, so all of it reaches link, pipeline and log. Time is the test's own.
+Every frame has a correct CRC, so all of them reach link, pipeline and log. Time is virtual.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ BOARD = Descriptor(1, 0, bytes(7) + b"\xaa", "pad", "1", TICK_HZ, 493_000, (arra
 
 
 class Ends:
-    """Where a session's messages go, without a bus: encoded, kept by topic, and into a log."""
+    """Sink without a bus: encodes messages, keeps them by topic, and logs them."""
 
     def __init__(self, recorder: Recorder | None = None) -> None:
         self.wall = WallClock(1_700_000_000 * NS_PER_S)
@@ -102,7 +102,7 @@ class Ends:
 
 
 class Asked(RecordedSource):
-    """Keeps what the host says to the board."""
+    """Keeps the host's messages to the board."""
 
     def __init__(self) -> None:
         super().__init__("p", Medium.SERIAL)
@@ -114,7 +114,7 @@ class Asked(RecordedSource):
 
 
 class Rig:
-    """A board on a line, with its port and session, in time of its own."""
+    """A board on a line with its port and session, on virtual time."""
 
     def __init__(
         self, descriptor: Descriptor = BOARD, recorder: Recorder | None = None, settle: bool = True
@@ -145,7 +145,7 @@ class Rig:
         return self.ends.at * TICK_HZ // NS_PER_S % (1 << 32)
 
     def send(self, *messages: Any, seconds: float = 0.0) -> None:
-        """What the board says, worked off."""
+        """Process messages from the board."""
         self.ends.at = after(self.ends.at, seconds)
         data = b"".join(m if isinstance(m, bytes) else encode_serial(m) for m in messages)
         for at in range(0, len(data), READ_LIMIT):
@@ -159,7 +159,7 @@ class Rig:
             self.session.each_second(self.ends.at)
 
     def cycle(self, press: float = 0.0, seconds: float = 0.01) -> None:
-        """One sampling cycle, and answers to what the host asked; ``press``: counts along z."""
+        """One sampling cycle, and answers to the host; ``press``: counts along z."""
         self.ends.at = after(self.ends.at, seconds)
         answers: list[Any] = []
         for data in self._asked():
@@ -200,7 +200,7 @@ def recorder(tmp_path: Path) -> Iterator[Recorder]:
 
 
 def hostile(rng: random.Random, rig: Rig) -> Any:
-    """One item: whatever a board may send under a right CRC, or bytes that are no frame."""
+    """A random item: any message with a correct CRC, or bytes that are not a frame."""
     ticks = rng.choice((0, 1, 2**31, 2**32 - 1, rng.randrange(2**32), rig.ticks()))
     kind = rng.randrange(9)
     if kind == 0:
@@ -242,13 +242,13 @@ def test_pipeline_and_log_survive_many_hostile_items(
             rig.cycle()
     rig.send(b"\0", seconds=60.0)
     before = rig.session.sent
-    for _ in range(600):  # the board as it was at first
+    for _ in range(600):  # a normal board again
         rig.cycle()
     assert rig.session.sent > before + 300
     assert rig.session.features is not None
     assert rig.session.features.valid, rig.session.features.reasons
     drops = rig.session.drops() | rig.port.drops()
-    # All of it is of a known kind: nothing went wrong that nobody foresaw.
+    # All losses are of known kinds: there was no unexpected error.
     lost = {reason for reason, n in drops.items() if n}
     assert not {reason for reason in lost if reason.startswith(("unsent", "spoilt"))}, drops
     assert drops["texts_held_back"] > ITEMS // 100
@@ -259,7 +259,7 @@ def test_pipeline_and_log_survive_many_hostile_items(
     assert told.whole
     counts = {c.topic: c.messages for c in told.channels}
     assert counts["/tactile/b0/features"] == rig.ends.sent["features"]
-    # Nobody's flood fills a disk: some 4,000 s of time, at the rates that the limits give.
+    # A flood cannot fill a disk: some 4,000 s at the rates of the limits.
     seconds = (rig.ends.at - 1000 * NS_PER_S) / NS_PER_S
     assert counts["/tactile/b0/log"] < 200 + 12 * seconds
     assert (tmp_path / "a.mcap").stat().st_size < 30_000_000
@@ -282,7 +282,7 @@ def test_largest_boards_work_with_every_other_taxel_pressed(
     assert len(codec().decode(FORCES, rig.ends.last["forces"][-1]).force) == count * 128 * 3
     geometry = codec().decode(GEOMETRY, rig.ends.last["geometry"][-1])
     assert len(geometry.position) == len(geometry.normal) == count * 128 * 3
-    # What does not fit is left out by name: places on the unrolled skin, for pictures only.
+    # The unrolled skin, which is for pictures only, is left out when it does not fit.
     assert len(geometry.surface) == (0 if count == 16 else count * 128 * 2)
     assert any("unrolled skin" in text for text in rig.ends.texts) == (count == 16)
     parts = [codec().decode(CONTACTS, data).markers for data in rig.ends.last["contacts"]]
@@ -439,4 +439,4 @@ def test_throttle_passes_a_burst_then_its_rate() -> None:
     assert sum(passed) == 3 + 19  # 9.9 s at 2 a second
     assert throttle.take_held() == 100 - 22
     assert throttle.take_held() == 0
-    assert not throttle.allow(Instant(0))  # a clock that goes back gives nothing
+    assert not throttle.allow(Instant(0))  # a clock that goes back allows nothing

@@ -1,4 +1,4 @@
-"""Between reader and pipeline: bounded, oldest first out, news of the port never lost."""
+"""The queue between reader and pipeline: bounded; drops the oldest chunks, never port events."""
 
 from __future__ import annotations
 

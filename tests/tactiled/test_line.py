@@ -1,4 +1,4 @@
-"""Ports on virtual time: kinds found out, trouble named, boards on a bus told apart."""
+"""Lines on virtual time: detection of kinds, diagnosis, and several boards on a bus."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def of(events: list[LineEvent], kind: type) -> list[Any]:
 
 
 def serve(line: SerialLine, board: Any, at: At, seconds: float, start: float = 0.0) -> list[Any]:
-    """Line and scripted board in steps of 1 ms; the line's bytes reach it decoded by its codec."""
+    """Run line and scripted board in steps of 1 ms; the board gets decoded messages."""
     decoder, events = SerialDecoder(), []
     for step in range(round(seconds * 1000)):
         now = start + step / 1000
@@ -163,7 +163,7 @@ def test_replugged_board_continues_where_it_stopped(board: Any, instant: At) -> 
 
 
 class Bus:
-    """Scripted boards on a CAN bus, each with the codec of a real one."""
+    """Scripted boards on a CAN bus, each with a real board's codec."""
 
     def __init__(self, line: CanLine, boards: dict[int, Any], at: At) -> None:
         self.line, self.boards, self.at = line, boards, at

@@ -1,4 +1,4 @@
-"""Boards and adapters as they are, with real processes: simulated here, found or declared there."""
+"""Other boards and adapters, with real processes: simulated, then detected or declared."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_text_board_declared_board_and_silent_adapter_stream_and_replay(lab: Any
     for geometry in shapes:
         assert geometry.array_columns.tolist() == [5, 5]
         assert geometry.array_posed.tolist() == [False, False]
-    # The log says how the board was read, so that a replay reads it the same way.
+    # The log states how the board was read, so that a replay reads it the same way.
     replay = lab.tactiled(
         "--mcap", "run.mcap", "--name", "pad", "--speed", "inf", "--log", "a.mcap"
     )

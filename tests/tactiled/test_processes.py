@@ -1,4 +1,4 @@
-"""The daemon as users run it: real processes, pseudo-terminals, signals and a real bus."""
+"""The daemon as a real process: pseudo-terminals, signals and a real bus."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_ctrl_c_leaves_a_complete_log_that_replays_on_its_own_keys(lab: Any) -> 
     replay = lab.tactiled("--mcap", "run.mcap", "--speed", "inf", "--log", "again.mcap")
     assert replay.wait() == 0, replay.said
     again = {c.topic: c.messages for c in info(lab.folder / "again.mcap").channels}
-    # All of it again, and at most the cycles that were in hand when Ctrl-C came.
+    # Everything again, plus at most the cycles that were being processed at Ctrl-C.
     ahead = again["/tactile/board0/features"] - logged["/tactile/board0/features"]
     assert 0 <= ahead <= 3
     live, replayed = FeatureListener(session), FeatureListener(session, prefix="replay")
@@ -173,7 +173,7 @@ def test_non_board_device_is_named_with_a_remedy(lab: Any) -> None:
         assert daemon.wait() == 3
     assert "sends text, not taxel frames: 'T=21.5 C'" in daemon.said
     assert "Traceback" not in daemon.said
-    # What it said is in the log all the same.
+    # Its bytes are in the log all the same.
     assert {c.topic for c in info(lab.folder / "run.mcap").channels} >= {"/tactile/board0/raw"}
 
 
@@ -187,7 +187,7 @@ def test_unwritable_log_is_refused_before_anything_runs(lab: Any) -> None:
 
 @contextmanager
 def chattering(data: bytes) -> Iterator[str]:
-    """A terminal on which some device says the same thing over and over."""
+    """A terminal on which a device sends the same bytes repeatedly."""
     ours, theirs = pty.openpty()
     tty.setraw(theirs)
     os.set_blocking(ours, False)

@@ -1,4 +1,4 @@
-"""Cycles as messages: every figure where a reader of the message looks for it."""
+"""Messages made from cycles: every value is in its field."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def cycle(instant: Callable[[float], Instant]) -> Cycle:
 
 
 def through(topic: Any, message: Any) -> Any:
-    """What a subscriber sees."""
+    """Encode and decode ``message``, as for a subscriber."""
     return codec().decode(topic, codec().encode(topic, message))
 
 
@@ -110,7 +110,7 @@ def test_forces_and_field_messages_match_the_pipeline(
     maker = MessageMaker(calibration, WALL)
     forces = through(FORCES, maker.forces(cycle))
     assert forces.array_taxels.tolist() == [32, 32, 16]
-    assert np.isnan(forces.force).all()  # unhealthy is never shown as zero force
+    assert np.isnan(forces.force).all()  # unhealthy taxels never show zero force
     assert len(forces.force) == 240
     assert not forces.compensated
     field = through(FIELD, maker.field(cycle))
@@ -131,7 +131,7 @@ def test_geometry_message_matches_the_calibration(calibration: BoardCalibration)
     assert seen.array_side.tolist() == [1, 2, 3]
     positions = seen.position.reshape(-1, 3)
     assert positions.shape == (80, 3)
-    assert (positions[:32, 1] > 0).all()  # the left side is to the left
+    assert (positions[:32, 1] > 0).all()  # left is +y
     np.testing.assert_allclose(np.linalg.norm(seen.normal.reshape(-1, 3), axis=1), 1, rtol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""Boards from 0.5 Hz to 1 kHz: found, served and watched at their pace, without false alarms."""
+"""Boards from 0.5 Hz to 1 kHz are detected, served and watched without false alarms."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def floats(rng: np.random.Generator, cut: int = 0) -> bytes:
 
 
 def play_floats(line: SerialLine, at: At, rate: float, frames: int, until: float) -> list[Any]:
-    """A float board that is heard from in the middle of a frame on; looked at every 10 ms."""
+    """Run a float board whose first frame is cut; the line ticks every 10 ms."""
     rng, events, sent = np.random.default_rng(0), [], 0
     line.connect(at(0.0))
     step = min(0.01, 1 / rate)
@@ -140,7 +140,7 @@ def test_own_protocol_board_is_served_at_any_rate(
     events = play_board(SerialLine("p", welcome), board, instant, seconds, min(0.005, 1 / rate))
     assert len([e for e in events if isinstance(e, Sampled)]) >= 2 * (seconds * rate * 0.8 - 2)
     assert not [e for e in events if isinstance(e, Reset)]
-    if says != "another rate":  # what it says is believed until it is seen not to be so
+    if says != "another rate":  # the reported rate is used until the actual one is measured
         assert not [e for e in events if isinstance(e, FellSilent | Resumed)]
 
 

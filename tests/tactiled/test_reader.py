@@ -1,4 +1,4 @@
-"""The reader's thread against a transport that does as told."""
+"""The reader's thread with a scripted transport."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tactiled.transports import (
 
 
 class ScriptedTransport:
-    """Reads come from a queue: chunks, or errors to raise; openings likewise."""
+    """Takes the results of reads, and of openings, from queues of chunks or errors to raise."""
 
     name = "scripted"
     medium = Medium.SERIAL
@@ -62,7 +62,7 @@ class ScriptedTransport:
 
 
 class RawLog:
-    """Stands in for the publisher: keeps what a reader logs."""
+    """Stand-in for the publisher that keeps what a reader logs."""
 
     def __init__(self) -> None:
         self.chunks: list[Chunk] = []

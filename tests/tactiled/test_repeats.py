@@ -1,4 +1,4 @@
-"""News that repeat are few lines; what they come to is told."""
+"""Repeated messages give few lines, with a summary."""
 
 from __future__ import annotations
 

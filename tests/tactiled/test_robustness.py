@@ -1,4 +1,4 @@
-"""Whatever comes, at whatever time: links never raise, and stamps keep their promises."""
+"""Links never raise on any input at any time, and stamps stay monotonic."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_chunks_dropped_on_overflow_are_counted_as_gaps(
     inbox = Inbox(Wake(), limit=10)
     for k in range(60):
         if k in (20, 40):
-            # The pipeline gets to work only now and then.
+            # The pipeline runs only now and then.
             work_off(line, inbox)
         frames = [encode_serial(board.sample(a.array, k / 100)) for a in board.descriptor.arrays]
         board.sequence += 1
@@ -127,7 +127,7 @@ def test_chunks_dropped_on_overflow_are_counted_as_gaps(
     assert isinstance(link, BoardLink)
     assert inbox.dropped == 30
     missing = [array.tracker.missing for array in link.arrays.values()]
-    # The first ten dropped came before anything was used: nobody can miss those.
+    # The first ten were dropped before any was used, so they do not count as missing.
     assert missing == [20, 20]
 
 

@@ -1,4 +1,4 @@
-"""Every frame of an array is accounted for, whatever the wire does to their order."""
+"""Every frame of an array is accounted for, in any order of arrival."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_after_silence_lower_numbers_restart_and_higher_leave_a_gap() -> None:
 def test_sent_is_accepted_plus_late_plus_missing(
     first: int, fates: list[tuple[bool, int, int]]
 ) -> None:
-    """Each frame may be lost, sent several times, and held up by up to eight others."""
+    """Each frame may be lost, repeated, or overtaken by up to eight others."""
     arrivals: list[tuple[int, int]] = []
     for n, (lost, copies, hold) in enumerate(fates):
         if not lost:

@@ -1,4 +1,4 @@
-"""A daemon with two boards as those on the bus meet it: what it publishes and what it answers."""
+"""Topics and services of a daemon with two boards."""
 
 from __future__ import annotations
 

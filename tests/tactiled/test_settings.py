@@ -1,4 +1,4 @@
-"""Flags and file to settings, and every refusal with what was given and what is allowed."""
+"""Settings from flags and file; refusals say what was given and what is allowed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What people see of a board."""
+"""The status lines of boards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the service manager hears, alarms, and `tactile health`."""
+"""Notifications to the service manager, alarms, and `tactile health`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.support.waiting import wait_until
 
 
 class Manager:
-    """Hears what a service manager would."""
+    """Receives notifications like a service manager."""
 
     def __init__(self, place: str) -> None:
         self._end = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -37,12 +37,12 @@ class Manager:
         self._end.settimeout(30)
 
     def wait(self, wanted: str) -> None:
-        """Until ``wanted`` is a line of what is said."""
+        """Wait until the line ``wanted`` is received."""
         while wanted not in self._end.recv(4096).decode().splitlines():
             pass
 
     def said_within(self, seconds: float) -> list[str]:
-        """What is said in that time."""
+        """Lines received in that time."""
         said, end = [], time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             self._end.settimeout(left)
@@ -78,7 +78,7 @@ def test_service_manager_hears_each_line_and_may_be_absent(
     assert supervision.notify("READY=1")
     abstract.wait("READY=1")
     abstract.close()
-    assert not supervision.notify("READY=1")  # it has gone
+    assert not supervision.notify("READY=1")  # the manager is gone
     monkeypatch.delenv(supervision.SOCKET_VARIABLE)
     assert not supervision.notify("READY=1")
 
@@ -123,7 +123,7 @@ def test_tactiled_notifies_ready_alive_and_stopping(manager: Manager, tmp_path: 
 
 
 def test_stuck_pipeline_thread_stops_the_watchdog(manager: Manager, tmp_path: Path) -> None:
-    """All other threads go on: a watchdog fed by one of them would see nothing."""
+    """All other threads continue: a watchdog fed by one of them would not notice."""
     words = ["--port", str(tmp_path / "none"), "--wait", "--no-log"]
     words += ["--listen", f"unixsock-stream/{tmp_path}/t.sock"]
     daemon = Daemon(make_settings(make_parser().parse_args(words)))
@@ -138,7 +138,7 @@ def test_stuck_pipeline_thread_stops_the_watchdog(manager: Manager, tmp_path: Pa
 
         daemon._call(stick)
         assert reached.wait(30)
-        manager.said_within(0.1)  # beats that were on their way
+        manager.said_within(0.1)  # beats sent before
         assert "WATCHDOG=1" not in manager.said_within(1.0)
         free.set()
         manager.wait("WATCHDOG=1")

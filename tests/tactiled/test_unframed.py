@@ -1,4 +1,4 @@
-"""Boards without a protocol on a serial line: found, declared, or named for what they send."""
+"""Boards without a protocol on a serial line: detected, declared, or described by their bytes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def welcome(node: int, identity: Identity) -> Refusal | None:
 
 
 def frames(layout: str, count: int, seed: int = 0) -> list[bytes]:
-    """What a still board writes."""
+    """Frames of a board at rest."""
     parsed = Layout.parse(layout)
     rng = np.random.default_rng(seed)
     rest = rng.uniform(-1500, 1500, (parsed.chips, 3))
@@ -136,7 +136,7 @@ def test_baud_rate_is_never_blamed_on_usb(data: list[bytes], instant: At) -> Non
 
 
 def test_declared_board_is_not_second_guessed(instant: At) -> None:
-    """Twelve floats are four chips if the user says so, whatever they look like."""
+    """Twelve floats are four chips if the user declares so."""
     line = SerialLine("p", welcome, "floats:4xyz")
     line.connect(instant(0.0))
     sent = [
@@ -186,7 +186,7 @@ def test_unknown_kind_lists_available_kinds(text: str) -> None:
 
 
 def test_boards_of_one_controller_are_separate_arrays(instant: At) -> None:
-    """The link knows of one array; the calibration says how it is shared."""
+    """The link sees one array; the calibration splits it."""
     line = SerialLine("p", welcome)
     line.connect(instant(0.0))
     blocks = [
@@ -207,7 +207,7 @@ def test_boards_of_one_controller_are_separate_arrays(instant: At) -> None:
 
 
 def test_arrays_without_poses_share_no_ambient_field(instant: At) -> None:
-    """A field that changes over both is taken off each by what it sees itself."""
+    """A field that changes on both is removed from each by its own fit."""
     calibration = nominal("anyskin", "unknown", 10)
     assert not any(a.geometry.posed for a in calibration.arrays)
     pipeline = BoardPipeline(calibration)

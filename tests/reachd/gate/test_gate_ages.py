@@ -1,4 +1,4 @@
-"""The gate's eyes: how old what it sees is, from which time, and whether the arm is alive.
+"""Age limits of the gate's inputs, and detection of a frozen arm state.
 
 Rows 4, 14 and 24 of the fault table.
 """
@@ -35,7 +35,7 @@ FEATURE_AGES = [
 def test_motion_ends_before_features_are_200_ms_old(
     age: int, moves: bool, rig: Callable, passes: Callable
 ) -> None:
-    """A period and 8 ms early: the next command would otherwise still move beyond 200 ms."""
+    """A period and 8 ms early; otherwise the next command would still move after 200 ms."""
     r = rig()
     decision = aged(r, r.fresh_touch(), age)
     assert passes(decision) == moves
@@ -45,7 +45,7 @@ def test_motion_ends_before_features_are_200_ms_old(
 
 
 def aged(r: Any, touch: Touch, age: int) -> Decision:
-    """Cycles until ``touch``, captured at T0, is ``age`` ns old; the last cycle's decision."""
+    """Run until ``touch``, captured at T0, is ``age`` ns old; returns the last decision."""
     while r.now + r.period < T0 + age:
         r.step(touch=touch)
     return r.step(touch=touch, passed=T0 + age - r.now)
@@ -83,7 +83,7 @@ def test_only_valid_features_renew_touch(spoil: dict, rig: Callable, passes: Cal
     moved = 0
     for _ in range(30):
         moved += passes(r.step(touch=replace(r.fresh_touch(), **spoil)))
-    # Half of the last 200 ms, the last good features among them.
+    # Half of the last 200 ms, including the last valid features.
     assert moved == 10
     r = rig(Check.FEATURES_SPARSE)
     moved = 0
@@ -154,7 +154,7 @@ def test_motion_ends_before_arm_state_is_50_ms_old(
     age: int, moves: bool, rig: Callable, codes: Callable, passes: Callable
 ) -> None:
     for captured, received in ((age, 0), (0, age), (age, age)):
-        # Its stamps go back from those of the state before, which is a fault of its own.
+        # Its stamps also go back, which is another fault.
         r = rig(Check.CLOCK_BACKWARDS)
         off = rig(Check.ARM_STALE, Check.CLOCK_BACKWARDS)
         for one, expected in ((r, moves), (off, True)):
@@ -209,12 +209,12 @@ STEP = Twist(0.04, 0.0, 0.0)
 
 
 def still(r: Any, cycles: int, wanted: Twist = STEP, **values: object) -> list[Decision]:
-    """Cycles in which the arm, told to move, reports the same values with fresh stamps."""
+    """Run cycles in which the arm, commanded to move, reports constant values, fresh stamps."""
     return [r.step(wanted, arm=r.fresh_arm(-r.period, **values)) for _ in range(cycles)]
 
 
 def test_frozen_arm_state_latches(rig: Callable, passes: Callable) -> None:
-    """Once the state is 300 ms old in which nothing had moved yet."""
+    """300 ms after the last state in which nothing had moved yet."""
     r = rig()
     held = [d.held for d in still(r, 33)]
     assert held.index(Check.ARM_FROZEN) <= 32

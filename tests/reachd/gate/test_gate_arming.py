@@ -1,4 +1,4 @@
-"""How the gate is armed, latched and armed again.
+"""Arming, latching and arming again.
 
 Rows 22, 26 and 27 of the fault table.
 """
@@ -187,7 +187,7 @@ def test_arming_twice_changes_nothing(rig: Callable, passes: Callable) -> None:
 
 
 def test_motion_after_arming_starts_from_rest(rig: Callable) -> None:
-    """Not from what was last sent before the latch: 0.5 m/s² is 5 mm/s a cycle."""
+    """And not from the last twist before the latch: 0.5 m/s² is 5 mm/s per cycle."""
     r = rig()
     for _ in range(20):
         r.step(Twist(0.04, 0.0, 0.0))

@@ -1,4 +1,4 @@
-"""The arithmetic of limits: what offends is taken away, and nothing is added."""
+"""The arithmetic of limits: only violating motion is removed, and none is added."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tactile_core.types import Instant
 T0 = Instant(5_000_000_000)
 L = 0.158
 HORIZON = math.e * (0.05 + 0.06)
-"""s: e times the greatest age of the state and life of a command."""
+"""s, e times the greatest age of a state plus the expiry of a command."""
 
 
 def speed(twist: Twist) -> float:
@@ -52,7 +52,7 @@ def test_retreat_along_a_slant_allows_turning() -> None:
 
 
 def test_rounding_does_not_end_motion() -> None:
-    """What is left of a component that was taken away is not a reason to stop."""
+    """Rounding error left of a removed component is not a reason to stop."""
     for k in range(100):
         a = 0.1 + 0.06 * k
         wall = Constraint(math.cos(a), math.sin(a), 0.0, 0.0)
@@ -63,7 +63,7 @@ def test_rounding_does_not_end_motion() -> None:
 
 
 def test_narrow_wedge_leaves_zero_velocity() -> None:
-    """Taking one component after the other would send the arm back out of the wedge."""
+    """Removing one component after the other would send the arm back out of the wedge."""
     wedge = [Constraint(math.cos(a), math.sin(a), 0.0, 0.0) for a in (1.0, 2.0)]
     assert speed(constrained(Twist(0.0, 1.0, 0.0), wedge)) == pytest.approx(0.0, abs=1e-12)
     blunt = [Constraint(math.cos(a), math.sin(a), 0.0, 0.1) for a in (0.5, 2.6)]
@@ -74,7 +74,7 @@ def test_narrow_wedge_leaves_zero_velocity() -> None:
 
 
 def test_contradicting_constraints_scale_the_whole_twist() -> None:
-    """Less turning takes the room that a velocity had: then all of it is scaled."""
+    """Less turning leaves less room for the velocity, so the whole twist is scaled."""
     rules = [Constraint(1.0, 0.0, -1.0, 0.0), Constraint(0.0, 0.0, 1.0, 0.1)]
     got = constrained(Twist(0.2, 0.1, 0.2), rules)
     assert got == ZERO
@@ -134,7 +134,7 @@ def test_constrained_obeys_every_rule_and_adds_nothing(
 def test_workspace_constraints_limit_point_velocities(
     x: float, y: float, heading: float, vx: float, vy: float, omega: float
 ) -> None:
-    """Checked against the distance that tip and pivot really go in a microsecond."""
+    """Compared with the distance that tip and pivot move in a microsecond."""
     s = HARDWARE.safety
     arm = ArmState(T0, T0, x, y, heading, ZERO, 0, 0, 0, "ready", 1, 1, 1, 1)
     rules = workspace_constraints(arm, s)

@@ -1,4 +1,4 @@
-"""The gate judges whose commands the arm obeys, and how late they come into force."""
+"""The gate checks whose commands the arm obeys, and how late they take effect."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MS = 1_000_000
 
 
 class Way:
-    """Commands that take ``delay`` ms to the arm, whose states tell which is in force."""
+    """Commands reach the arm after ``delay`` ms; its states echo the one in effect."""
 
     def __init__(self, rig: Any) -> None:
         self.rig = rig
@@ -55,7 +55,7 @@ def test_short_echo_delay_is_ignored(delay: float, way: Way) -> None:
 
 @pytest.mark.parametrize("delay", [60.0, 100.0, 250.0])
 def test_long_echo_delay_stops_at_once_and_latches(delay: float, way: Way) -> None:
-    """Row 37: within 100 ms after the echo lags by 50."""
+    """Row 37: within 100 ms after the echo is 50 ms late."""
     way.delay = delay
     seen = [way.step() for _ in range(30)]
     stopped = [k for k, d in enumerate(seen) if d.twist == ZERO]

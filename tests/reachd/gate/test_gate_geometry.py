@@ -1,4 +1,4 @@
-"""Several limits at once leave the nearest there is; bounds of stillness to the last digit."""
+"""Several limits at once leave the nearest allowed velocity; exact thresholds of stillness."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PERIOD_S = 0.01
 
 
 def test_several_limits_leave_the_nearest_allowed_velocity() -> None:
-    """A point is the nearest of a convex region if what is missing is a sum of active normals."""
+    """A point of a convex region is nearest if the difference is a sum of active normals."""
     rng = np.random.default_rng(7)
     corners = 0
     for _ in range(3000):
@@ -52,7 +52,7 @@ def test_several_limits_leave_the_nearest_allowed_velocity() -> None:
 def test_border_distance_allows_for_the_slowest_chain(
     make_arm: Callable, settings: SafetySettings
 ) -> None:
-    """At 5 cm/s, with states a second old and commands that live 0.1 s, from 15 cm on."""
+    """At 5 cm/s, with states 1 s old and commands that expire after 0.1 s, from 15 cm."""
     slow = replace(settings, arm_age=1.0, arm_latch=2.0, command_expiry=0.1)
     horizon = math.e * 1.1
     edge = max(b.offset for b in slow.pivot_region.borders if b.nx == 1.0)
@@ -67,7 +67,7 @@ def test_border_distance_allows_for_the_slowest_chain(
 
 
 def frozen(gate: SafetyGate, wanted: Twist, make: tuple[Callable, Callable], **pose: float) -> bool:
-    """Whether the gate latches an arm that reports one pose, then ``pose`` for ever."""
+    """Whether the gate latches an arm that reports one pose, then always ``pose``."""
     make_touch, make_arm = make
     decision = None
     for cycle in range(1, 60):

@@ -1,4 +1,4 @@
-"""The gate's ears: the loop, the command, the arm's mode and the limits that it confirms.
+"""The gate's checks of the loop, the command, the arm's mode and the limits that it confirms.
 
 Rows 14, 16, 18, 26 and 28 of the fault table.
 """
@@ -19,7 +19,7 @@ from tactile_core.types import Instant
 MS = 1_000_000
 T0 = Instant(5_000_000_000)
 SLOWLY = Twist(0.001, 0.0, 0.0)
-"""So slow that one cycle's acceleration reaches it."""
+"""A twist slow enough to be reached in one cycle's acceleration."""
 
 
 def test_healthy_command_passes_unchanged(rig: Callable) -> None:
@@ -91,7 +91,7 @@ def test_non_finite_command_latches(index: int, value: float, rig: Callable) -> 
 
 
 def test_overflow_in_the_gate_latches(rig: Callable, codes: Callable) -> None:
-    """With the speed limit off, a slanted border takes a huge number beyond the range."""
+    """With the speed limit off, a slanted border makes a huge number overflow."""
     slanted = Region(((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)))
     off = (Check.SPEED, Check.TURN_RATE, Check.ACCELERATION)
     r = rig(*off, tip_region=slanted)

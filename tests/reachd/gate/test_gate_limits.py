@@ -1,6 +1,6 @@
-"""The gate's hands: speed, acceleration and the slow-down near the goal, at their boundaries.
+"""The gate's limits of speed and acceleration and the slow-down near the goal, at their boundaries.
 
-The limits of Table I.
+The limits are those of the paper's Table I.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def test_speed_is_limited(
     decision = send(wanted, Check.WORKSPACE)
     assert codes(decision) == (["speed"] if limited else [])
     assert speed(decision.twist) == pytest.approx(min(v, SPEED), rel=1e-9)
-    if limited:  # the same path, slower: all three parts by the same factor
+    if limited:  # the same path, slower: all three components by the same factor
         assert decision.twist.omega == pytest.approx(0.05 * SPEED / v)
         assert all(i.effect == "limited" for i in decision.interventions)
     assert send(wanted, Check.WORKSPACE, Check.SPEED).twist == wanted
@@ -110,7 +110,7 @@ def test_acceleration_is_bounded_each_cycle(send: Callable[..., Decision], codes
         (Twist(0.3, 0.4, 0.1), Twist(0.0, 0.0, 0.0), Twist(0.06, 0.08, 0.1)),
         (Twist(0.05, 0.0, 0.5), Twist(0.0, 0.0, 0.0), Twist(0.05, 0.0, 0.2)),
         (Twist(0.05, 0.0, -0.5), Twist(0.0, 0.0, 0.0), Twist(0.05, 0.0, -0.2)),
-        # Braking is as sudden as it is wanted; the other way begins with standing still.
+        # Braking is as sudden as commanded; a reversal begins with standing still.
         (Twist(-0.5, 0.0, 0.1), Twist(0.5, 0.0, 0.0), Twist(0.0, 0.0, 0.1)),
         (Twist(-0.5, 0.0, 0.1), Twist(0.1, 0.0, 0.0), Twist(0.0, 0.0, 0.1)),
         (Twist(-0.5, 0.0, 0.1), Twist(0.06, 0.0, 0.0), Twist(-0.04, 0.0, 0.1)),
@@ -120,7 +120,7 @@ def test_acceleration_is_bounded_each_cycle(send: Callable[..., Decision], codes
         (Twist(0.0, 0.0, -0.5), Twist(0.0, 0.0, 0.9), Twist(0.0, 0.0, 0.0)),
         (Twist(0.0, 0.0, -0.5), Twist(0.0, 0.0, 0.1), Twist(0.0, 0.0, -0.1)),
         (Twist(0.0, 0.0, 0.9), Twist(0.0, 0.0, 0.5), Twist(0.0, 0.0, 0.7)),
-        # A turn of the way is no braking, and nor is going on faster.
+        # Neither a change of direction nor a higher speed is braking.
         (Twist(0.0, 0.3, 0.0), Twist(0.3, 0.0, 0.0), Twist(0.3 - 0.1 / 2**0.5, 0.1 / 2**0.5, 0.0)),
         (Twist(0.6, 0.0, 0.0), Twist(0.3, 0.0, 0.0), Twist(0.4, 0.0, 0.0)),
     ],
@@ -135,7 +135,7 @@ def test_acceleration_scaling_keeps_the_bound(wanted: Twist, last: Twist, expect
 def test_acceleration_bound_never_violates_another_limit(
     make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
 ) -> None:
-    """A load from one state to the next: it brakes on its way, then slides off from standing."""
+    """A load appears from one state to the next: the arm brakes along its path, then slides off."""
     gate = make_gate(settings)
     for k in range(1, 12):
         now = Instant(T0 + k * 10_000_000)
@@ -168,7 +168,7 @@ def test_stop_is_not_delayed_by_acceleration_bound(
 def test_long_cycle_does_not_allow_a_jump(
     make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
 ) -> None:
-    """60 ms is the longest cycle that counts: 0.05 m/s² · 0.06 s, late loop or not."""
+    """At most 60 ms of a cycle count: 0.05 m/s² · 0.06 s, also when the loop is late."""
     for passed, expected in ((50, 0.0025), (60, 0.003), (600, 0.003), (-50, 0.0)):
         chosen = replace(
             settings,
@@ -193,7 +193,7 @@ def test_long_cycle_does_not_allow_a_jump(
 def test_gate_slows_near_the_goal(
     distance: float, near: bool, bearing: float, send: Callable[..., Decision], codes: Callable
 ) -> None:
-    """Half of the greatest speeds within 1 cm of the tip, whatever the strategy wants."""
+    """Half of the greatest speeds within 1 cm of the tip, whatever the strategy commands."""
     heading = 0.3
     x, y = 0.05 + L * math.cos(heading), L * math.sin(heading)
     goal = Goal(x + distance * math.cos(bearing), y + distance * math.sin(bearing), 0.0075, 40.0)
@@ -210,7 +210,7 @@ def test_gate_slows_near_the_goal(
 
 
 def test_slow_zone_excludes_its_border(send: Callable[..., Decision], codes: Callable) -> None:
-    """At exactly its radius nothing is slowed, just inside it is."""
+    """At exactly its radius motion is not slowed, just inside it is."""
     goal = Goal(0.3, 0.0, 0.0075, 40.0)
     radius = 0.3 - (0.05 + L)
     wanted = Twist(0.6 * SPEED, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Hard and repeated loads on the wrist, force on the skin, touch that rises."""
+"""Hard and repeated loads on the wrist, force on the skin, and rising touch."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_repeated_state_counts_once(rig: Callable) -> None:
 
 
 def passing(r: Any, times: int, every: int) -> int | None:
-    """Cycle in which it latches when the load passes its limit ``times``, once in ``every``."""
+    """Cycle of the latch when the load passes its limit ``times``, once per ``every`` cycles."""
     for k in range(times * every):
         if loaded(r, 1.0 if k % every == 0 else 0.5).held is not None:
             return k
@@ -144,7 +144,7 @@ def test_twice_the_skin_limit_latches(force: float, bound: float, rig: Callable)
     assert "its limit is 20 N" in decision.interventions[0].text
     off = rig(*SKIN, Check.SKIN_OVERLOAD, Check.SKIN_FORCE)
     assert feeling(off, 500.0).held is None
-    # Touch that is not valid says nothing new: the load is still there.
+    # Invalid touch does not clear the load.
     spoilt = replace(r.fresh_touch(-r.period), valid=False)
     assert r.step(touch=spoilt).interventions[0].code is Check.SKIN_OVERLOAD
     r.now = after(r.now, 0.01)
@@ -162,7 +162,7 @@ def touching(r: Any, force: float, side: Side, wanted: Twist, **values: Any) -> 
 
 
 def test_approach_is_slowed_by_touch(rig: Callable, codes: Callable) -> None:
-    """6 N slow it, 15 stop it, foreseen 10 ms ahead; what moves away is free."""
+    """6 N slow it, 15 N stop it, predicted 10 ms ahead; motion away is free."""
     for force, most in ((6.0, 0.045), (9.0, 0.0608 * 6 / 9), (12.0, 0.0608 / 3), (15.0, 0.0)):
         r = rig(*RISING)
         for _ in range(3):
@@ -205,7 +205,7 @@ def test_rising_force_is_extrapolated(rig: Callable) -> None:
     jumped = touching(r, 7.0, Side.TIP, AHEAD).twist.vx
     assert jumped == pytest.approx(0.0608 * (15.0 - 14.0) / 9.0, abs=1e-4)
     assert touching(r, 7.0, Side.TIP, AHEAD).twist.vx == 0.04, "it no longer rises"
-    # With nothing but the wrist to tell from where it pushes, that tells.
+    # Without a side of the skin, the wrist gives the direction of the push.
     r = rig(*RISING)
     for _ in range(3):
         touch = replace(r.fresh_touch(-r.period), total_force=15.0, normal_force_bound=0.0)

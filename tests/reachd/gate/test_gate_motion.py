@@ -1,4 +1,4 @@
-"""The gate judges what the arm does: its speed, its way beside what it was told, dead poses."""
+"""The gate's checks of the arm's motion: speed, deviation from the commanded path, frozen poses."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MS = 1_000_000
 
 
 class Plant:
-    """An arm that makes of each command what ``does`` makes of it, seen by a gate at 100 Hz."""
+    """An arm that moves with ``does(command)``, checked by a gate at 100 Hz."""
 
     def __init__(self, rig: Any, does: Callable[[Twist], Twist], **state: Any) -> None:
         self.rig, self.does, self.state = rig, does, state
@@ -47,7 +47,7 @@ class Plant:
         return decision
 
     def run(self, cycles: int, wanted: Twist = AHEAD) -> tuple[int | None, Any]:
-        """Cycle in which the gate latched, None for never, and the last decision."""
+        """Cycle in which the gate latched, or None, and the last decision."""
         for k in range(cycles):
             decision = self.step(wanted)
             if decision.held is not None:
@@ -125,7 +125,7 @@ def test_dead_noisy_pose_latches_within_half_a_second(
 
 
 def test_jammed_arm_may_tremble(rig: Callable) -> None:
-    """Its load explains that it stays; a twist far below what was told does not contradict it."""
+    """Its load explains that it stays; a twist far below the command does not contradict that."""
     for wanted, load, twist in (
         (Twist(0.0, 0.0, 0.1), {"mz": -2.0}, Twist(0.0, 0.0, 0.004)),
         (AHEAD, {"fx": -6.0}, Twist(0.002, 0.0, 0.0)),
@@ -191,7 +191,7 @@ def test_speed_is_checked_by_twist_and_pose(rig: Callable) -> None:
 
 
 def test_reset_pose_is_not_motion(rig: Callable) -> None:
-    """As after a reset of a simulated world: nothing is said of the way before it."""
+    """For instance after a reset of a simulated world: earlier motion is forgotten."""
     for jump in ({"x": 0.1}, {"heading": 0.5}):
         r = rig(*OFF)
         for _ in range(20):
@@ -237,7 +237,7 @@ def test_command_history_is_kept_and_cleared_on_backward_time(
 
 
 def test_command_without_successor_expired(settings: Any, make_arm: Callable) -> None:
-    """The loop stood still: the arm went on for the command's life, and no further."""
+    """The loop was stalled: the arm moves until the command expires, and no further."""
     for went, right in ((0.06, True), (0.17, False)):
         watch = MotionWatch(settings)
         t0 = Instant(5_000_000_000)
@@ -254,7 +254,7 @@ def test_command_without_successor_expired(settings: Any, make_arm: Callable) ->
 
 
 def test_thresholds_are_well_separated() -> None:
-    """What is asked of the arm is above what simulated arms do in every set, with room."""
+    """Thresholds exceed what simulated arms do in every set, with margin."""
     assert OFF_THE_WAY >= 1.5 * 0.0006
     assert 0 < DEAD < 0.5
     for one in SETS.values():
@@ -281,7 +281,7 @@ def test_an_arm_that_drifts_while_nothing_touches_it_latches(
         lambda t: Twist(t.vx + drift.vx, t.vy + drift.vy, t.omega + drift.omega),
     )
     when, decision = plant.run(250, told)
-    if not held or drift.omega * told.omega < 0.0:  # what falls short may lag, and is not drift
+    if not held or drift.omega * told.omega < 0.0:  # falling short is lag, not drift
         assert when is None
         return
     assert when is not None
@@ -306,7 +306,7 @@ def test_what_touches_the_arm_may_push_it(load: dict, rig: Callable) -> None:
 
 
 def test_an_arm_that_falls_short_does_not_drift(settings: Any, make_arm: Callable) -> None:
-    """Commands die on the way: it goes a part of the way, never beside it."""
+    """Commands are lost: it moves a part of the path, never beside it."""
     watch = MotionWatch(settings)
     t0 = Instant(5_000_000_000)
     x = 0.0
@@ -320,7 +320,7 @@ def test_an_arm_that_falls_short_does_not_drift(settings: Any, make_arm: Callabl
 
 @pytest.mark.parametrize("back", [1, 2, 5])
 def test_stamps_that_go_back_hide_no_motion(back: int, rig: Callable) -> None:
-    """Every second state is stamped before the one before it; the arm moves backwards."""
+    """Every second state has an older stamp than the one before; the arm moves backwards."""
     r = rig(*OFF)
     x, last = -0.2, ZERO
     for k in range(80):
@@ -355,7 +355,7 @@ def test_an_arm_that_is_mirrored_latches(axis: str, rig: Callable) -> None:
 
 
 def test_what_was_not_told_for_a_second_is_no_drift(settings: Any, make_arm: Callable) -> None:
-    """The arm was moved by somebody else before the first command."""
+    """The arm was moved otherwise before the first command."""
     watch = MotionWatch(settings)
     t0 = Instant(5_000_000_000)
     for k in range(150):

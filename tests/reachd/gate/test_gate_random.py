@@ -1,7 +1,7 @@
-"""Whatever comes in, what goes out is finite and within limits (row 18 of the fault table).
+"""For any input the gate's twist is finite and within limits (row 18 of the fault table).
 
-100,000 inputs in the ordinary run; `make gate-random` takes the million of the fault table and
-writes down what became of them.
+100,000 inputs in the ordinary run; `make gate-random` uses the million of the fault table and
+writes a report.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ODD = np.array([math.nan, math.inf, -math.inf, 1.7e308, -1.7e308, 5e-324, -0.0, 
 
 
 def numbers(rng: np.random.Generator, n: int, scale: float, odd: float) -> list[float]:
-    """Normal numbers over three decades, a part ``odd`` of them nasty."""
+    """Normal numbers over three decades, a fraction ``odd`` of them replaced by extreme ones."""
     values = rng.normal(0.0, scale, n) * 10.0 ** rng.uniform(-2, 1, n)
     nasty = rng.random(n) < odd
     values[nasty] = rng.choice(ODD, nasty.sum())
@@ -40,7 +40,7 @@ def numbers(rng: np.random.Generator, n: int, scale: float, odd: float) -> list[
 
 
 def ages(rng: np.random.Generator, n: int, usual: float) -> list[int]:
-    """ns: mostly fresh, some old, some from the future."""
+    """Ages, ns: mostly fresh, some old, some from the future."""
     values = rng.exponential(usual, n)
     values[rng.random(n) < 0.01] *= 100
     values[rng.random(n) < 0.005] *= -50
@@ -50,7 +50,7 @@ def ages(rng: np.random.Generator, n: int, usual: float) -> list[int]:
 def check(
     gate: SafetyGate, s: SafetySettings, arm: ArmState, twist: Twist, last: Twist, dt: float
 ) -> None:
-    """Every promise of a twist that went out."""
+    """Check everything that is guaranteed of a twist."""
     parts = (twist.vx, twist.vy, twist.omega)
     assert all(map(math.isfinite, parts))
     if twist == ZERO:
@@ -67,7 +67,7 @@ def check(
         inward = -(arm.fx * twist.vx + arm.fy * twist.vy) / force if force else 0.0
         assert inward <= 2 * ROUNDING
         assert -arm.mz * twist.omega <= 2 * ROUNDING * abs(arm.mz)
-    # Acceleration is bounded last, whatever else acted; only braking along the way is not.
+    # Acceleration is limited last, whatever else acted, except for braking along the path.
     step = math.hypot(twist.vx - last.vx, twist.vy - last.vy)
     before = math.hypot(last.vx, last.vy)
     across = abs(twist.vx * last.vy - twist.vy * last.vx)
@@ -142,14 +142,14 @@ def test_gate_invariants_hold_for_random_inputs(name: str, make_touch: Callable)
                 "moved": moved,
                 "latched": latches,
                 "interventions": dict(sorted(acted.items())),
-                "not_finite_or_beyond_a_limit": 0,  # one would have failed above
+                "not_finite_or_beyond_a_limit": 0,  # any would have failed above
                 "seconds": round(time.monotonic() - began, 1),
             },
         )
 
 
 def report(name: str, figures: dict[str, object]) -> None:
-    """Add the figures of one parameter set to the file that was asked for."""
+    """Add the figures of one parameter set to the requested file."""
     path = Path(str(REPORT))
     written = json.loads(path.read_text()) if path.exists() else {}
     path.write_text(json.dumps(written | {name: figures}, indent=1) + "\n")

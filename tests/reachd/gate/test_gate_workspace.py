@@ -1,4 +1,4 @@
-"""The borders of the workspace: tip and pivot stay inside, and the way back is open."""
+"""The borders of the workspace: tip and pivot stay inside, and motion back inside is allowed."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from tactile_core.types import Instant
 T0 = Instant(5_000_000_000)
 L = 0.158
 HORIZON = math.e * (0.05 + 0.06)
-"""s: e times the greatest age of the state and life of a command."""
+"""s, e times the greatest age of a state plus the expiry of a command."""
 
 
 def place(which: str, side: str, depth: float) -> tuple[dict, tuple[float, float]]:
-    """Pose that leaves tip or pivot ``depth`` m inside a border; and the border's normal."""
+    """Pose with tip or pivot ``depth`` m inside a border, and the border's normal."""
     region = HARDWARE.safety.tip_region if which == "tip" else HARDWARE.safety.pivot_region
     xs, ys = zip(*region.corners, strict=True)
     edge, normal = {
@@ -35,7 +35,7 @@ def place(which: str, side: str, depth: float) -> tuple[dict, tuple[float, float
     at[axis] = edge - depth * (normal[0] or normal[1])
     heading = 0.0
     if which == "tip":
-        # Turned so that the pivot is well inside its own region.
+        # The heading keeps the pivot well inside its own region.
         heading = {"front": math.pi, "back": 0.0, "right": -0.2, "left": 0.2}[side]
         at = [at[0] - L * math.cos(heading), at[1] - L * math.sin(heading)]
     elif side in ("left", "right"):
@@ -106,7 +106,7 @@ def test_both_borders_hold_in_a_corner(send: Callable[..., Decision]) -> None:
 def test_arm_comes_to_rest_before_the_border(
     make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
 ) -> None:
-    """State 37 ms old, commands kept for the whole of their life: it stays inside."""
+    """With states 37 ms old and commands followed until they expire, it stays inside."""
     gate = make_gate(settings)
     xs = [0.0] * 5  # tip 0.158 inside
     held = ZERO
@@ -115,7 +115,7 @@ def test_arm_comes_to_rest_before_the_border(
         seen = Instant(now - 37_000_000)
         arm = make_arm(seen, x=xs[-5])
         decision = gate.step(Twist(0.06, 0.0, 0.0), make_touch(now), arm, None, now)
-        if k % 6 == 0:  # five of six commands are lost; the arm goes on with the last
+        if k % 6 == 0:  # five of six commands are lost; the arm follows the last one
             held = decision.twist
         xs.append(xs[-1] + held.vx * 0.01)
     assert xs[-1] + L <= 0.378 + 1e-9
@@ -123,7 +123,7 @@ def test_arm_comes_to_rest_before_the_border(
 
 
 def test_workspace_and_wrench_limits_combine(send: Callable[..., Decision]) -> None:
-    """Neither may undo the other: at a border with something pressing, little is left."""
+    """Neither may undo the other: at a border and under load, little motion is left."""
     pose, _ = place("tip", "left", 0.0)
     pressed = {**pose, "fx": -10.0, "fy": 15.0}
     got = send(Twist(0.05, 0.01, 0.0), **pressed).twist

@@ -1,4 +1,4 @@
-"""The load on the arm: it slows what adds to it, stops it at the limit, and lets retreat.
+"""The load on the arm: motion that adds to it is slowed and stopped; retreat is allowed.
 
 Row 25 of the fault table.
 """
@@ -79,7 +79,7 @@ def test_torque_slows_stops_and_allows_turning_back(
 
 
 def test_tip_force_also_limits_turning(send: Callable[..., Decision]) -> None:
-    """15 N sideways at the tip are 2.4 N·m: far from the torque limit, but turning adds to them."""
+    """15 N sideways at the tip are 2.4 N·m: far from the torque limit, but turning adds load."""
     pressed = {"fy": -15.0, "mz": -15.0 * L, **INSIDE}
     assert send(Twist(0.0, 0.0, 0.1), **pressed).twist == ZERO
     assert send(Twist(0.0, 0.0, -0.1), **pressed).twist.omega == -0.1
@@ -97,9 +97,9 @@ def test_larger_load_fraction_counts(make_arm: Callable, settings: SafetySetting
 def test_inward_motion_ends_with_the_sample_at_the_limit(
     make_gate: Callable, make_touch: Callable, make_arm: Callable, settings: SafetySettings
 ) -> None:
-    """No filter and no delay: the very step that sees 15 N sends no inward motion (row 25)."""
+    """No filter and no delay: the step that sees 15 N sends no inward motion (row 25)."""
     gate = make_gate(settings)
-    touch = make_touch(T0)  # features come far more slowly than the arm's state
+    touch = make_touch(T0)  # features are far less frequent than the arm's state
     for k in range(1, 15):
         now = Instant(T0 + k * 10_000_000)
         force = 0.0 if k < 14 else -15.0

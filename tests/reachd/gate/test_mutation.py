@@ -1,4 +1,4 @@
-"""The mutation runner makes the changes it says, and tells a caught one from a missed one."""
+"""The mutation runner makes the stated changes, and tells killed mutants from survivors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The event-driven strategy: what it makes of touch, and when it excavates and which way."""
+"""The event-driven strategy: its reaction to touch, and when and in which direction it digs."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from tactile_core.types import Instant, after
 
 T0 = Instant(5_000_000_000)
 FAR = Goal(5.0, 0.0, 0.001, 20.0)
-"""So far that 20 s do not bring the finger near: progress is as good as straight ahead."""
+"""So far away that the finger does not get near in 20 s: progress is practically straight ahead."""
 
 
 class Driven:
-    """A strategy stepped by hand, the finger held where it is told."""
+    """A strategy stepped by hand, with the finger at a given place."""
 
     def __init__(self, strategy: Any, make_touch: Callable, make_arm: Callable) -> None:
         self.strategy, self.make_touch, self.make_arm = strategy, make_touch, make_arm
@@ -30,7 +30,7 @@ class Driven:
         strategy.start(FAR, T0)
 
     def step(self, x: float = -0.2, dt: float = 0.01, **touch: Any) -> str:
-        """One step with this touch; returns the activity."""
+        """Run one step with this touch; returns the activity."""
         arm = self.make_arm(self.now, x=x)
         self.twist = self.strategy.step(self.make_touch(self.now, **touch), arm, FAR, self.now)
         self.arm = arm
@@ -38,7 +38,7 @@ class Driven:
         return self.strategy.activity
 
     def until(self, seconds: float, x: float = -0.2, **touch: Any) -> float | None:
-        """Step until an excavation begins; its time in s since the start, None if none does."""
+        """Step until an excavation begins; returns its time in s since the start, or None."""
         end = after(self.now, seconds)
         while self.now < end:
             at = self.now
@@ -49,7 +49,7 @@ class Driven:
 
 @pytest.fixture
 def event(make_arm: Callable, make_touch: Callable) -> Callable[..., Driven]:
-    """Hybrid event strategy of a set, overridden as given, stepped by hand."""
+    """Hybrid event strategy of a set, with overrides, stepped by hand."""
 
     def make(name: str, seed: int = 0, **overrides: Any) -> Driven:
         p = parameters(name, overrides)
@@ -153,7 +153,7 @@ def test_progress_window_applies_wherever_progress_is_lost(event: Callable[..., 
 def test_progress_restarts_after_an_excavation(
     name: str, again: float, event: Callable[..., Driven]
 ) -> None:
-    """It ends 2 cm behind where it began: a head start only where progress counts from the end."""
+    """It ends 2 cm behind its start: an advantage only if progress counts from its end."""
     run = event(name)
     load = {"peak_force": 20.0, "total_force": 20.0}
     begun = run.until(10.0, x=0.02, **load)

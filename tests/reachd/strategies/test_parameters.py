@@ -1,4 +1,4 @@
-"""The two parameter sets hold what their sources say, and refuse what makes no sense."""
+"""The two parameter sets contain their sources' values, and refuse invalid ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The primitives against closed forms and the paper's equations in the paper's own axes."""
+"""The primitives: closed forms, and the paper's equations in the paper's own axes."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_straight_line_follows_equations_1_and_2() -> None:
     ahead = Aim(0.0, 0.0, 0.3, 0.6, 0.8, math.atan2(0.8, 0.6))
     twist = straight(ahead, 0.0, AUTHORS_SIM)
     assert (twist.vx, twist.vy, twist.omega) == pytest.approx((0.03, 0.04, 0.35))
-    # The tip is commanded on hardware: the pivot moves by −ω ẑ × L more.
+    # On hardware the tip is commanded: −ω ẑ × L is added to the pivot's velocity.
     twist = straight(ahead, 0.0, HARDWARE)
     assert (twist.vx, twist.vy, twist.omega) == pytest.approx((0.027, 0.036 - L * 0.1, 0.1))
     twist = straight(ahead, math.pi, HARDWARE)
@@ -121,7 +121,7 @@ def test_near_the_goal_each_primitive_halves_its_speeds() -> None:
 
 
 def test_straight_golden_trajectory(fly: Callable) -> None:
-    """Tip commanded: it runs down its line at v_max, then at half; the heading turns at ω_max."""
+    """The commanded tip moves along its line at v_max, then half; the heading turns at ω_max."""
     goal = goal_at(0.358, 0.12)
     flown = fly(Straight(HARDWARE, RNG), goal, 11.0, dt=0.001)
     start = np.array([-0.2 + L, 0.0])
@@ -145,7 +145,7 @@ def test_straight_golden_trajectory(fly: Callable) -> None:
 
 @pytest.mark.parametrize(("ratio", "fraction"), [(2.0, 0.643), (0.83 / 0.17, 0.385), (9.0, 0.253)])
 def test_burrow_advances_as_measured(ratio: float, fraction: float) -> None:
-    """The normalised law's mean forward fraction, as measured on the authors' simulator."""
+    """The normalised law's mean forward fraction equals that of the authors' simulator."""
     p = parameters(
         "authors_sim", {"burrow_amplitude": ratio / (1 + ratio), "burrow_frequency": 1.0}
     )
@@ -168,7 +168,7 @@ def test_burrow_as_printed_hardly_advances() -> None:
 
 @pytest.mark.parametrize("name", ["hardware", "authors_sim"])
 def test_burrow_golden_trajectory(name: str, fly: Callable) -> None:
-    """Equations (2) to (4) written anew in the paper's axes (x right, y forward) and integrated."""
+    """Equations (2) to (4), written in the paper's axes (x right, y forward) and integrated."""
     p = parameters(name)
     target_x, target_y = -0.02, 0.358  # paper axes
     tip_led = name == "hardware"
@@ -249,7 +249,7 @@ def test_excavation_ends_where_the_integrals_say(s: float, ccw: bool) -> None:
 
 
 def test_excavation_tip_speed_grows_as_in_the_paper() -> None:
-    """From v_max/s to v_max, whatever the turn rate, for the tip."""
+    """The tip's speed grows from v_max/s to v_max, whatever the turn rate."""
     for tau in np.linspace(0.0, 1.0, 21):
         twist = excavate(float(tau), 0.0, HARDWARE, ccw=True)
         speed = math.hypot(twist.vx, twist.vy + L * twist.omega)
@@ -257,7 +257,7 @@ def test_excavation_tip_speed_grows_as_in_the_paper() -> None:
 
 
 def test_excavate_golden_trajectory_with_the_current_heading() -> None:
-    """The rigid finger against equations (5) to (8) in the paper's axes."""
+    """The rigid finger follows equations (5) to (8) in the paper's axes."""
     p = HARDWARE
 
     def motion(tau_s: float, state: np.ndarray) -> list[float]:

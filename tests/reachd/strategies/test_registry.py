@@ -136,7 +136,7 @@ def test_missing_module_is_named() -> None:
 
 
 class Bad:
-    """A strategy that answers with what it was made with."""
+    """A strategy that returns or raises what it was made with."""
 
     def __init__(self, answer: Any, activity: Any = "bad") -> None:
         self.answer, self._activity = answer, activity

@@ -1,4 +1,4 @@
-"""The built-in strategies: what they do when, and that they are functions of their inputs."""
+"""The built-in strategies: what they do when, and that they depend only on their inputs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tactile_core.types import Instant, after
 
 T0 = Instant(5_000_000_000)
 FAR = Goal(5.0, 0.0, 0.001, 20.0)
-"""So far that 20 s do not bring the finger near: progress is as good as straight ahead."""
+"""So far away that the finger does not get near in 20 s: progress is practically straight ahead."""
 
 
 def rng(seed: int = 0) -> np.random.Generator:
@@ -31,7 +31,7 @@ def rng(seed: int = 0) -> np.random.Generator:
 
 
 def starts(activity: np.ndarray) -> list[int]:
-    """Where an excavation begins."""
+    """Indices at which an excavation begins."""
     digs = np.char.startswith(activity, "excavate")
     return np.flatnonzero(digs & ~np.concatenate([[False], digs[:-1]])).tolist()
 
@@ -48,7 +48,7 @@ def test_isolated_primitives_continue_indefinitely(name: str, fly: Callable) -> 
 def test_simulator_set_allows_one_excavation_per_trial(
     name: str, between: str, fly: Callable
 ) -> None:
-    """5 s, 5 s, 20 s and ≥ 5 s remaining: it begins after 5 s and the second never comes."""
+    """With 5 s, 5 s, 20 s and ≥ 5 s remaining, it begins after 5 s and there is no second one."""
     strategy: Any = load_strategy(name, AUTHORS_SIM, rng())
     flown = fly(strategy, FAR, 20.0)
     assert starts(flown["activity"]) == [501]
@@ -62,7 +62,7 @@ def test_simulator_set_allows_one_excavation_per_trial(
 
 
 def test_hardware_set_repeats_excavations_at_intervals(fly: Callable) -> None:
-    """No exception is made for the time that remains; the interval counts from the end."""
+    """The time that remains makes no difference; the interval counts from the end."""
     strategy = load_strategy("excavate", HARDWARE, rng())
     flown = fly(strategy, replace(FAR, time_limit=40.0), 36.1)
     assert starts(flown["activity"]) == [501, 1502, 2503, 3504]

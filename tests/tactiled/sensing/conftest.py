@@ -29,10 +29,11 @@ def board(
     nominal: bool = False,
     chip_yaw: float = 0.0,
 ) -> BoardCalibration:
-    """Left, right and tip arrays of 100 µT/N, pressed outward field rising; rest fields zero.
+    """Left, right and tip arrays of 100 µT/N, in which a press raises the outward field; rest
+    fields zero.
 
-    ``coupling``: share of a taxel's own field that a press makes on the nearest taxels of its
-    array, falling with the cube of the distance.
+    ``coupling``: field that a press causes at the nearest taxels of its array, as a share of its
+    own taxel's; falls with the cube of the distance.
     """
     parts = (
         ("left", Side.LEFT, (0.05, 0.03, 0.0), LEFT),
@@ -67,7 +68,8 @@ def board(
 
 
 def field_of(calibration: BoardCalibration, force: Float, ambient: Float | None = None) -> Float:
-    """(N, 3) µT in chip axes of ``force`` (N, 3) N in taxel axes and a uniform field in ee."""
+    """Field, (N, 3) µT in chip axes, of ``force`` (N, 3) N in taxel axes and a uniform ``ambient``
+    field in ee."""
     out = []
     for array, part in zip(calibration.arrays, calibration.geometry.slices, strict=True):
         n = array.geometry.taxels
@@ -92,7 +94,7 @@ class Stream:
 
     @property
     def now(self) -> Instant:
-        """When the cycle of the present sequence number is captured."""
+        """Capture time of the cycle with the present sequence number."""
         return Instant(self.sequence * PERIOD_NS)
 
     def block(
@@ -102,7 +104,7 @@ class Stream:
         status: NDArray[np.uint8] | None = None,
         temperature_c: float = 25.0,
     ) -> SampleBlock:
-        """Block of one array of the present cycle, from the field (N, 3) of the whole board."""
+        """Make the present cycle's block of one array from the field (N, 3) of the whole board."""
         part = self.parts[array]
         n = part.stop - part.start
         return SampleBlock(
@@ -123,7 +125,7 @@ class Stream:
         without: tuple[int, ...] = (),
         temperature_c: float = 25.0,
     ) -> list[Cycle]:
-        """Feed one cycle, arrays ``without`` left out, and go on to the next."""
+        """Feed one cycle without the arrays ``without``, and go on to the next."""
         out: list[Cycle] = []
         for array in range(len(self.parts)):
             if array not in without:

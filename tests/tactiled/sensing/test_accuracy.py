@@ -1,4 +1,4 @@
-"""The acceptance figures on the simulated skin, with margin, and a real board's recording."""
+"""Accuracy figures on the simulated skin, with margin, and on a recording of a real board."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_pipeline_benchmark_reports_its_figures():
 
 @pytest.mark.parametrize("method", ["off", "consensus"])
 def test_recorded_board_follows_its_load_cell(method):
-    """Nominal figures alone, no calibration: the summed normal force tracks 0–34 N."""
+    """With nominal figures only, the summed normal force tracks 0–34 N."""
     folder = RECORDINGS / "normal_force_20250401_014340"
     with gzip.open(folder / "sensor.csv.gz") as stream:
         sensor = np.genfromtxt(stream, delimiter=",")
@@ -79,10 +79,10 @@ def test_recorded_board_follows_its_load_cell(method):
             if cycle.features.valid:
                 force.append(cycle.features.normal_force)
                 at.append(row[0])
-    # a press that covers all chips for longer than some seconds makes the ambient field uncertain
+    # a press that covers all chips for more than some seconds makes the ambient field uncertain
     assert len(force) > (900 if method == "consensus" else 1400)
     read = states[np.isfinite(states[:, -1]) & (states[:, -1] != -1)]
     load = np.interp(at, read[:, 0], read[:, -1] * 9.80665e-3)
     assert np.corrcoef(load, force)[0, 1] > 0.97
     slope = np.polyfit(load, force, 1)[0]
-    assert 0.5 < slope < 2.0  # nominal: right to a factor of two
+    assert 0.5 < slope < 2.0  # nominal figures are accurate to within a factor of two

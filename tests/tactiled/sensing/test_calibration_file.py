@@ -13,7 +13,7 @@ from tactile_core.geometry import finger
 
 @pytest.fixture
 def measured(board):
-    """A calibration with awkward numbers in every field."""
+    """A calibration with unusual numbers in every field."""
     rng = np.random.default_rng(5)
     plain = board(coupling=0.03, chip_yaw=np.deg2rad(-90.0))
     arrays = tuple(

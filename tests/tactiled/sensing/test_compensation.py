@@ -1,4 +1,7 @@
-"""What the methods do over time: support lost and found, ageing, borrowing, periods; row 7."""
+"""Methods of compensation over time: losing and regaining support, ageing, borrowing, periods.
+
+Row 7 of the fault table.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ LATER = np.array([-15.0, 25.0, 35.0])
 
 
 class Scene:
-    """A board in a field, pressed at will, with noise."""
+    """A board in an ambient field, with noise, that tests can press."""
 
     def __init__(self, calibration, field_of, stream, **settings):
         self.calibration = calibration
@@ -41,7 +44,7 @@ def scene(board, field_of, stream):
 
 @pytest.fixture
 def lone(field_of, stream):
-    """A single array of five, rest known."""
+    """A single array of five with known rest field."""
     return lambda **settings: Scene(
         nominal("anyskin", "A"), field_of, stream, auto_tare=False, **settings
     )
@@ -86,11 +89,11 @@ def test_covered_array_is_marked_at_once_and_follows_the_others(scene):
     assert cycle.features.codes == ("compensation_borrowed:left",)
     assert cycle.features.valid
     assert cycle.ambient.age[0] == pytest.approx(0.01)
-    # the board turns while the array is covered: its forces stay right
+    # the board turns while the array is covered: its forces stay correct
     cycle = s.go(ambient=LATER, pressed=LEFT, cycles=40)
     assert cycle.ambient.age[0] == pytest.approx(0.41)
     np.testing.assert_allclose(cycle.force[:16], s.force[:16], atol=0.3)
-    # and the array is believed again as soon as it is free
+    # and its own fit is used again as soon as it is free
     cycle = s.go(ambient=LATER)
     assert cycle.ambient.valid.all()
     assert cycle.ambient.age[0] == 0
@@ -134,7 +137,7 @@ def test_five_taxels_hold_through_any_contact_for_some_seconds(lone):
     s = lone()
     assert s.go(cycles=30).ambient.valid.all()
     two = s.go(pressed=(0, 3), cycles=40)
-    assert two.ambient.valid.all()  # three free ones tell the field
+    assert two.ambient.valid.all()  # three free chips determine the field
     s.go(cycles=100)
     cycle = s.go(pressed=range(5), cycles=300)
     assert not cycle.ambient.valid.any()
@@ -157,7 +160,7 @@ def test_lost_support_between_fits_shows_in_the_same_cycle(scene):
     s = scene(compensation_rate_hz=2.0)
     assert s.go(cycles=3).ambient.valid.all()
     assert s.go(pressed=LEFT).ambient.valid.tolist() == [False, True, True]
-    assert not s.go(ambient=LATER).ambient.valid.any()  # turned away from what is held
+    assert not s.go(ambient=LATER).ambient.valid.any()  # the field differs from the held fit
 
 
 def test_disabled_compensation_removes_nothing(scene):
@@ -181,7 +184,7 @@ def test_ransac_finds_the_plane_at_its_period_and_is_repeatable(scene):
     age = [c.ambient.age[0] for c in cycles]
     fresh = [k for k, a in enumerate(age) if a == 0]
     assert fresh[0] == 0
-    # then one round in each period of a third of a second, its last surface near the period's end
+    # then one round in each period of a third of a second, which ends near the period's end
     assert [round(k * 3 / 100) for k in fresh] == [0, 2]
     assert all(later > earlier for earlier, later in pairwise(age) if later)
     again = run()

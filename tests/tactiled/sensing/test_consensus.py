@@ -1,4 +1,4 @@
-"""The robust fit against closed forms and its symmetries."""
+"""The robust fit: closed forms and symmetries."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tactiled.sensing.layout import Layout
 
 
 class Fitter:
-    """A consensus fit over a board, with fields made of planes and contacts."""
+    """A consensus fit of a board, and fields made of planes and contacts."""
 
     def __init__(self, calibration):
         self.layout = Layout(calibration.geometry)
@@ -29,7 +29,7 @@ class Fitter:
         return self.consensus.fit(field_ee, self.model.forces(taxel), healthy)
 
     def in_ee(self, flat):
-        """(A, 3, n) in ee axes of (N, 3) µT in taxel axes."""
+        """Convert (N, 3) µT in taxel axes to (A, 3, n) in ee axes."""
         padded = np.zeros(self.shape)
         for a in range(self.layout.arrays):
             n = self.layout.counts[a]
@@ -55,7 +55,7 @@ def fitter(request, board):
 
 
 def press(rng, fitter, field, share):
-    """Put 0.5–5 N with shear on a share of every array's taxels; returns which are free."""
+    """Press a share of every array's taxels with 0.5–5 N and shear; returns the free ones."""
     force = np.zeros(fitter.shape)
     free = fitter.layout.real.copy()
     for a, n in enumerate(fitter.layout.counts):
@@ -74,8 +74,8 @@ def press(rng, fitter, field, share):
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 0.45])
 def test_plane_is_recovered_under_contact(fitter, share):
-    """Exactly, but for what crosstalk leaves after two passes, and for the shrinkage of slopes that
-    the free taxels can hardly tell: both well below one sample's noise of 5 µT.
+    """Except for crosstalk left after two passes and the shrinkage of slopes that the free taxels
+    hardly determine: both are well below one sample's noise of 5 µT.
     """
     exact = share < 0.3 and not fitter.model.decouples
     rng = np.random.default_rng(1)
@@ -107,11 +107,11 @@ def test_added_uniform_field_is_removed_exactly(seed, share):
 
 
 def added_plane(seed, share):
-    """Fits of one field without and with a plane, and by how much they differ beyond it, µT.
+    """Difference, µT, of the fits with and without an added plane, minus that plane.
 
-    Proposals from more than three taxels have no slope, so another may win where a plane is
-    added, and three refinements do not quite forget where they began. With sixteen the fits agree
-    to the last digit, but neither is nearer to the truth than now (2.2 µT rms).
+    Proposals from more than three taxels have no slope, so another may win when a plane is added,
+    and three refinements still depend on their start. With sixteen refinements the fits agree to
+    the last digit, but are no closer to the truth (2.2 µT rms).
     """
     fitter = FITTER
     rng = np.random.default_rng(seed)
@@ -125,7 +125,7 @@ def added_plane(seed, share):
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.1]))
 def test_added_plane_is_removed_to_within_the_noise(seed, share):
-    """Of two samples, 5 µT rms each; the largest of 16,000 draws was 4.2 µT rms on one array."""
+    """The noise of two samples of 5 µT rms; the maximum of 16,000 draws was 4.2 µT rms."""
     plain, moved, away = added_plane(seed, share)
     assert np.sqrt((away**2).mean(axis=(1, 2))).max() < 10.0
     np.testing.assert_array_equal(moved.valid, plain.valid)
@@ -141,7 +141,7 @@ def test_added_plane_is_mostly_removed_to_a_fraction_of_the_noise():
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_fit_rotates_with_the_axes(seed):
-    """On an uncoupled board nothing prefers one axis of ee to another."""
+    """On an uncoupled board no axis of ee is special."""
     fitter = FITTER_UNCOUPLED
     rng = np.random.default_rng(seed)
     field = fitter.noise(rng)
@@ -160,8 +160,8 @@ def test_the_order_of_arrays_does_not_matter(seed, order):
     field = fitter.noise(rng)
     press(rng, fitter, field, 0.3)
     plain = fitter.fit(field)
-    # the three arrays have the same shape; only their axes in ee differ, which the fit of an
-    # uncoupled board does not see
+    # the three arrays have the same shape; only their axes in ee differ, on which the fit of an
+    # uncoupled board does not depend
     other = Fitter(PERMUTED[tuple(order)])
     swapped = other.fit(field[list(order)])
     np.testing.assert_allclose(swapped.theta, plain.theta[list(order)], atol=1e-6)
@@ -183,7 +183,7 @@ def test_forces_do_not_change_with_a_uniform_field(board, field_of):
 
 
 def test_fit_holds_with_half_an_array_in_one_patch(fitter):
-    """Two of four rows pressed: the slope across them cannot be told, the field still can."""
+    """Two of four rows are pressed: the slope across them is unknown, but not the field."""
     rng = np.random.default_rng(6)
     theta = np.zeros((3, 3, 3))
     theta[:, :, 0] = [30.0, -20.0, 25.0]
@@ -200,7 +200,7 @@ def test_fit_holds_with_half_an_array_in_one_patch(fitter):
 
 
 def test_uniform_press_is_distinguished_from_the_ambient_field(board):
-    """All of an array agrees on 100 µT more; the rest of the board does not."""
+    """One whole array reads 100 µT more; the rest of the board does not."""
     fitter = Fitter(board())
     rng = np.random.default_rng(9)
     ambient = np.array([10.0, 20.0, -30.0])
@@ -209,7 +209,7 @@ def test_uniform_press_is_distinguished_from_the_ambient_field(board):
     fit = fitter.fit(field)
     assert fit.valid.tolist() == [True, True, False]
     np.testing.assert_allclose(fit.common, ambient, atol=3)
-    # with two arrays under such a press it takes what the board saw before
+    # with two arrays under such a press, the earlier field of the board is used
     field[1, 1] -= 100.0
     assert fitter.consensus.fit(
         field, np.zeros_like(field), fitter.layout.real, Prior(ambient.tolist(), 50.0)
@@ -260,7 +260,7 @@ def test_array_without_healthy_taxels_is_invalid_alone(fitter):
 
 
 def test_few_taxels_get_a_constant_fit():
-    """A plane on five taxels takes 46 % of a contact's energy; this fit must take next to none."""
+    """A plane on five taxels absorbs 46 % of a contact's energy; this fit absorbs almost none."""
     fitter = Fitter(nominal("anyskin", "A"))
     rng = np.random.default_rng(5)
     kept = []

@@ -1,4 +1,4 @@
-"""Features against closed forms; hysteresis, patches, time in light contact."""
+"""Features: closed forms, hysteresis, patches, and time in light contact."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Feel:
 
 
 def presses(**newton):
-    """Forces (80, 3) with −z on the taxels named t<number>."""
+    """Forces (80, 3) with a press on the taxels named t<number>, N."""
     force = np.zeros((80, 3))
     for name, value in newton.items():
         force[int(name[1:]), 2] = -value
@@ -53,7 +53,7 @@ def test_untouched_board_has_no_contact():
 
 
 def test_wrench_of_a_known_press_is_exact():
-    """2 N straight onto a taxel of the left side, 0.5 N of drag towards the wrist."""
+    """2 N onto a taxel of the left side, and 0.5 N of drag towards the wrist."""
     taxel = 12
     force = np.zeros((80, 3))
     in_ee = np.array([-0.5, -2.0, 0.0])  # the left side's normal is +y
@@ -97,7 +97,7 @@ def test_patches_are_clusters_within_one_array_strongest_first():
 
 
 def test_touching_arrays_are_not_one_patch():
-    """Numbered one after the other, but 31 is the left's last and 32 the right's first."""
+    """Taxel 31 is the last of the left array and 32 the first of the right."""
     assert len(Feel()(presses(t31=1.0, t32=1.0)).patches) == 2
 
 
@@ -133,7 +133,7 @@ def test_contact_has_hysteresis_against_noise():
     assert feel(presses(t5=0.25)).taxels_in_contact == 0  # once above the threshold may be noise
     assert feel(presses(t5=0.0)).taxels_in_contact == 0
     assert feel(presses(t5=0.25)).taxels_in_contact == 0
-    assert feel(presses(t5=0.25)).taxels_in_contact == 1  # twice is not
+    assert feel(presses(t5=0.25)).taxels_in_contact == 1  # twice in a row is not
     assert feel(presses(t5=0.14)).taxels_in_contact == 1  # held above the release threshold
     assert feel(presses(t5=0.13)).taxels_in_contact == 0
     assert feel(presses(t5=0.14)).taxels_in_contact == 0
@@ -141,7 +141,7 @@ def test_contact_has_hysteresis_against_noise():
 
 
 def test_no_false_contact_in_many_hours_of_noise(board, stream):
-    """2,000 cycles of 48 taxels at rest, normal noise as told: not one contact."""
+    """2,000 cycles of 48 taxels at rest, with normal noise of known size: no contact."""
     rng = np.random.default_rng(0)
     flow = stream(BoardPipeline(board(), PipelineSettings(noise_ut=(4.4, 4.4, 6.7))))
     for _ in range(2000):

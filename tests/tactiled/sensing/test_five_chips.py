@@ -1,7 +1,7 @@
-"""A board of five magnetometers, all of which feel a press: force, bound, rest; rows 5, 7 and 48.
+"""A board of five magnetometers that all respond to a press: force, bound and rest field.
 
-Fields are those of a recorded board's rest with what happens to it added, through the pipeline of
-an uncalibrated AnySkin in virtual time.
+Rows 5, 7 and 48 of the fault table. Fields are a recorded board's rest field plus simulated events,
+and go through the pipeline of an uncalibrated AnySkin in virtual time.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ PLACE = np.column_stack([ARRAY.surface, np.zeros(5)])
 
 
 class Owner:
-    """What an owner's board reads, frame by frame."""
+    """The readings of a user's board, frame by frame."""
 
     def __init__(self, hz: float = 100.0, seed: int = 1) -> None:
         self.hz = hz
@@ -58,7 +58,7 @@ class Owner:
         seconds: float,
         celsius_at: Callable[[float], float] = lambda _: 27.0,
     ) -> list[Cycle]:
-        """Cycles of ``seconds`` in which the chips read ``field_at(s)``, noise added."""
+        """Cycles of ``seconds`` in which the chips read ``field_at(s)`` plus noise."""
         out = []
         for k in range(round(seconds * self.hz)):
             t = k / self.hz
@@ -76,7 +76,7 @@ class Owner:
 
 
 def in_chips(field: Float) -> Float:
-    """(5, 3) µT in the skin's axes as each chip, mounted with its own yaw, reads it."""
+    """Convert (5, 3) µT in the skin's axes to chip axes: each chip is mounted with its own yaw."""
     c, s = np.cos(ARRAY.chip_yaw), np.sin(ARRAY.chip_yaw)
     x, y = field[:, 0], field[:, 1]
     return np.column_stack([c * x + s * y, -s * x + c * y, field[:, 2]])
@@ -99,7 +99,7 @@ def codes(cycles: list[Cycle]) -> set[str]:
 
 
 def honest(cycles: list[Cycle], newton: float) -> float:
-    """Share of the cycles whose bound holds a normal force of ``newton``."""
+    """Share of the cycles whose bound includes a normal force of ``newton``."""
     return float(
         np.mean(
             [abs(c.features.normal_force - newton) <= c.features.normal_force_bound for c in cycles]
@@ -122,9 +122,9 @@ def test_press_on_a_calibrated_board_reads_true_force(newton):
     read = np.mean([c.features.normal_force for c in late])
     assert read == pytest.approx(truth[-1], abs=max(0.25, 0.06 * truth[-1]))
     assert all(c.features.valid for c in late)
-    # a slight press may be off by as much throughout; over all presses it is 97 %, see the bench
+    # a single slight press may be off throughout; over all presses it is 97 %, see the bench
     assert honest(late, truth[-1]) > (0.95 if newton > 1.0 else 0.6)
-    # and is over when it is over
+    # and the force ends with the press
     _, after = board.run(lambda _: np.zeros((5, 3)), lambda _: np.eye(3), 1.0)
     assert after[-1].features.normal_force < 0.25
 

@@ -11,7 +11,7 @@ from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 
 @pytest.fixture
 def flow(board, stream):
-    """A stream into a pipeline without compensation, and still taxels of no interest."""
+    """A stream into a pipeline without compensation and without the check for frozen taxels."""
     return stream(BoardPipeline(board(), PipelineSettings(method="off", frozen_after_s=None)))
 
 
@@ -54,7 +54,7 @@ def test_duplicates_and_late_blocks_are_counted_and_ignored(flow):
     assert flow.pipeline.feed(first) == []
     assert flow.pipeline.counters.duplicate_blocks == 1
     flow.cycle(FIELD, without=(0,))
-    assert flow.pipeline.feed(first) == []  # its cycle is complete and out
+    assert flow.pipeline.feed(first) == []  # its cycle has been completed already
     assert flow.pipeline.counters.duplicate_blocks == 2
     (cycle,) = flow.cycle(FIELD)
     assert cycle.sequence == 1

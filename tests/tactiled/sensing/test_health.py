@@ -1,4 +1,4 @@
-"""Rows 5 and 7 of the fault table as far as one taxel goes: flagged, masked, never zero force."""
+"""Rows 5 and 7 of the fault table for single taxels: flagged, masked, never zero force."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Readings that no chip makes, as the simulator plays them: on recordings and simulated boards."""
+"""Impossible readings, which the simulator adds to recordings and simulated boards."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tactiled.sensing.reasons import Fault
 from tests.support.paths import SHARED
 
 FRAMES = int(os.environ.get("RECORDED_FRAMES", "2500"))
-"""Of each recording; all of them with `make recordings`."""
+"""Frames of each recording that are played; all of them with `make recordings`."""
 RECORDINGS = SHARED / "data" / "eflesh"
 TICK_NS = 4_000_000
 
@@ -34,7 +34,7 @@ recorded = pytest.mark.skipif(
 
 
 def cycles(board: AnySkinBoard | ReplayBoard, seconds: float, chips: int) -> Iterator[Cycle]:
-    """What tactiled makes of the board's bytes, in virtual time."""
+    """Cycles that tactiled makes of the board's bytes, in virtual time."""
     line = SerialLine("virtual", lambda node, identity: None, "anyskin")
     pipeline = BoardPipeline(nominal("anyskin", "played", chips), PipelineSettings())
     line.connect(Instant(0))
@@ -67,7 +67,7 @@ PLAYED = [
 
 
 def check(found: list[tuple[Cycle, bool]], chips: list[int], faults: set[Fault]) -> None:
-    """Those chips are masked, for those reasons, and nothing is felt that was not there."""
+    """Check that these chips are masked for these faults, and that no false force appears."""
     seen: set[int] = set()
     where: set[int] = set()
     for cycle, touched in found:
@@ -124,7 +124,7 @@ def test_recorded_boards_are_never_masked(name) -> None:
 
 @pytest.mark.parametrize("rate", [14.0, 115.0, 900.0])
 def test_simulated_presses_mask_nothing(rate) -> None:
-    """Twenty newtons within a tenth of a second, at every chip, then gone."""
+    """Twenty newtons within a tenth of a second, at every chip, then release."""
     skin = build_skin("anyskin", 7)
     array = skin.geometry.arrays[0]
 

@@ -1,4 +1,4 @@
-"""Row 47 of the fault table: readings that no chip makes are masked, named, and never a force."""
+"""Row 47 of the fault table: impossible readings are masked, named, and never a force."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ REST = np.array(
     ],
     float,
 )
-"""µT, of a five-magnetometer finger of the usual make."""
+"""Rest field of a common five-magnetometer finger, µT."""
 FINE = np.array([0.15, 0.15, 0.242])
 COARSE = np.array([2.4, 2.4, 3.872])
 NOISE = np.array([3.7, 3.7, 5.8])
 HZ = 100
 UT_PER_N = 115.0
 STEADY = 150
-"""Cycle from which the board has been tared and its scale is known."""
+"""Cycle by which the board has been tared and its scale is known."""
 
 Spoil = Callable[[int, NDArray[np.int64], Float], None]
 
@@ -56,7 +56,7 @@ class Five:
         self.revived: list[tuple[int, int]] = []
 
     def run(self, cycles: int, press: Callable[[int], Float] | None = None) -> Iterator[Cycle]:
-        """Cycles; ``press``: µT to add to each chip, (5, 3) or less, by the cycle's number."""
+        """Yield cycles. ``press``: µT to add to the chips, up to (5, 3), by the cycle's number."""
         for k in range(cycles):
             field = self.rest + self.rng.normal(0, 1, self.rest.shape) * self.noise
             if press is not None:
@@ -76,19 +76,19 @@ class Five:
 
 
 def chip(number: int, ut: float, axis: int = 2) -> Float:
-    """(5, 3) µT on one axis of one chip."""
+    """(5, 3) µT, non-zero on one axis of one chip."""
     out = np.zeros((5, 3))
     out[number, axis] = ut
     return out
 
 
 def ramp(number: int, ut: float, begin: int = 200, length: int = 100) -> Callable[[int], Float]:
-    """A press that grows from ``begin`` on."""
+    """A press that grows from cycle ``begin``."""
     return lambda k: chip(number, ut * min(1.0, max(0.0, (k - begin) / length)))
 
 
 def no_force(cycle: Cycle) -> bool:
-    """Whether nothing is said to press."""
+    """Whether no contact is reported."""
     return cycle.features.taxels_in_contact == 0
 
 
@@ -140,7 +140,7 @@ def test_chip_that_comes_alive_is_reported_and_used() -> None:
     cycles = list(board.run(600, ramp(2, 800.0, 450, 50)))
     assert board.revived == [(300, 2)]
     assert cycles[310].fault[2] == Fault.UNRESTED
-    assert not any(cycle.fault.any() for cycle in cycles[400:])  # its rest has been taken
+    assert not any(cycle.fault.any() for cycle in cycles[400:])  # it has a rest field by now
     assert cycles[440].features.taxels_in_contact == 0
     assert cycles[-1].features.peak_force == pytest.approx(800 / UT_PER_N, rel=0.1)
 
@@ -166,7 +166,7 @@ def test_wrap_is_undone_when_continuity_proves_it(rest_z, by) -> None:
     flat = list(Five(rest=REST).run(400, ramp(2, by)))
     over = list(Five(rest=rest).run(400, ramp(2, by)))
     for k, (there, here) in enumerate(zip(flat, over, strict=True)):
-        crossing = here.fault[2] == Fault.RAIL  # the very last count is not told from a rail
+        crossing = here.fault[2] == Fault.RAIL  # the last count looks like a rail
         assert not here.fault.any() or crossing
         if k > STEADY and not crossing:
             assert here.force[2, 2] == pytest.approx(there.force[2, 2], abs=0.2)
@@ -235,7 +235,7 @@ def test_lasting_level_is_accepted_without_its_rest_field() -> None:
     assert board.revived
     assert all(no_force(cycle) for cycle in cycles)
     assert cycles[260].fault[1] == Fault.UNRESTED
-    assert not cycles[-1].fault.any()  # another rest, taken while still
+    assert not cycles[-1].fault.any()  # it has a new rest field, taken while still
 
 
 def test_chips_with_identical_bits_are_both_masked() -> None:
@@ -366,7 +366,7 @@ def test_nan_is_masked_without_numpy_warnings(value, which) -> None:
         assert no_force(cycle)
 
 
-# Whether what is left is enough
+# Whether the remaining chips are enough
 
 
 def dead_after_200(k: int, counts: NDArray[np.int64], temperature: Float) -> None:

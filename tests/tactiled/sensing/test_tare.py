@@ -9,7 +9,7 @@ from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
 
 
 class Bench:
-    """A board with rest fields of its own, on a table."""
+    """A board at rest with known rest fields."""
 
     def __init__(self, calibration, field_of, stream, **settings):
         self.calibration = calibration
@@ -120,7 +120,7 @@ def test_taxel_faulty_during_first_tare_stays_masked(unknown):
     status[12] = TaxelHealth.READ_FAILED
     bench.go(52, status=status)
     assert "1 unhealthy taxels stay masked" in bench.pipeline.tare_report.message
-    cycle = bench.go()  # it answers again, but what its rest is nobody knows
+    cycle = bench.go()  # it answers again, but its rest field is unknown
     assert cycle.health[12] == TaxelHealth.OUT_OF_RANGE
     assert np.isnan(cycle.force[12]).all()
     assert cycle.features.taxels_in_contact == 0
@@ -142,7 +142,7 @@ def test_tare_takes_enough_cycles_at_low_rates(unknown):
 def test_rest_field_follows_untouched_taxels_when_enabled(board, field_of, stream):
     bench = Bench(board(), field_of, stream, auto_tare=False, rest_tracking_s=0.5)
     bench.rest[:] = 0
-    bench.rest[7, 0] = 15.0  # 0.15 N of shear that is none
+    bench.rest[7, 0] = 15.0  # 0.15 N of false shear
     bench.go(300)
     tail = np.array([bench.go().force[7, 0] for _ in range(50)])
     assert abs(tail.mean()) < 0.03

@@ -31,7 +31,7 @@ def adapter(tmp_path: Path) -> Iterator[AdapterThread]:
 
 @pytest.fixture
 def adapter_of(tmp_path: Path) -> Iterator[Callable[[str], AdapterThread]]:
-    """``adapter_of(dialect)``: an adapter with that firmware."""
+    """``adapter_of(dialect)``: makes an adapter with that firmware."""
     made: list[AdapterThread] = []
 
     def make(dialect: str) -> AdapterThread:
@@ -44,7 +44,7 @@ def adapter_of(tmp_path: Path) -> Iterator[Callable[[str], AdapterThread]]:
 
 
 def read_payload(transport: Transport, wanted: int, seconds: float = PATIENCE_S) -> bytes:
-    """``wanted`` bytes, or what came in ``seconds``."""
+    """Read ``wanted`` bytes, or those that come within ``seconds``."""
     data = b""
     end = time.monotonic() + seconds
     while len(data) < wanted and time.monotonic() < end:
@@ -56,7 +56,7 @@ def read_payload(transport: Transport, wanted: int, seconds: float = PATIENCE_S)
 
 
 def read_frames(transport: Transport, wanted: int, seconds: float = PATIENCE_S) -> list[CanFrame]:
-    """``wanted`` frames, or what came in ``seconds``."""
+    """Read ``wanted`` frames, or those that come within ``seconds``."""
     frames: list[CanFrame] = []
     end = time.monotonic() + seconds
     while len(frames) < wanted and time.monotonic() < end:
@@ -92,7 +92,7 @@ def run_in_background() -> Iterator[Callable[[Callable[[], object]], Outcome]]:
 
 
 class Outcome:
-    """What a function in another thread returned or raised."""
+    """Result or error of a function run in another thread."""
 
     def __init__(self, function: Callable[[], object]) -> None:
         self._function = function

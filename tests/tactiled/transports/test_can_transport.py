@@ -1,4 +1,4 @@
-"""CAN buses as the daemon sees them: the simulated slcan adapter, python-can's virtual bus."""
+"""CAN transports: the simulated slcan adapter and python-can's virtual bus."""
 
 from __future__ import annotations
 
@@ -323,7 +323,7 @@ def test_silent_adapter_is_opened_and_reported(
 def test_late_answers_are_matched_to_their_command(
     adapter_of: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The refusal of closing a closed channel comes when the bit rate has long been sent."""
+    """The refusal to close a closed channel arrives long after the bit rate was sent."""
     adapter = adapter_of("late")
     transport = CanTransport(f"slcan:{adapter.port.pty.link}@1000000")
     transport.open()

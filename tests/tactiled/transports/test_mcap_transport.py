@@ -1,4 +1,4 @@
-"""Logs as ports: the same chunks at the same pace, also from files that were cut off."""
+"""Logs as transports: the same chunks at the same pace, also from truncated files."""
 
 from __future__ import annotations
 

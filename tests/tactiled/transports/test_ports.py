@@ -1,4 +1,4 @@
-"""The simulator's pseudo-terminals: they never wait, and leave nothing behind."""
+"""The simulator's pseudo-terminals never block, and leave nothing behind."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_unread_port_drops_oldest_messages_and_counts_them(pty: PtyPort, read_by
     lines = got.splitlines(keepends=True)
     assert [line for line in lines if line in set(messages)] == lines  # none is broken
     assert len(lines) == 1000 - lost
-    assert lines[0] == messages[0]  # it had already left
+    assert lines[0] == messages[0]  # it had been sent already
     assert lines[-1] == messages[-1]
     assert len(got) <= BACKLOG + PTY_ROOM + KERNEL_BUFFER
     host.close()

@@ -1,4 +1,4 @@
-"""Recordings: read exactly, refused precisely, sent again at their pace."""
+"""Recordings are read exactly, refused with the reason, and played at their pace."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_postponed_recording_keeps_its_spacing(tmp_path: Path) -> None:
 def test_real_recordings_decode_to_their_original_values(
     magnetometers: int, tmp_path: Path
 ) -> None:
-    """Ten: two recordings side by side."""
+    """With ten chips: two recordings side by side."""
     tables = []
     for name in NORMAL:
         with gzip.open(name, "rt") as file:

@@ -1,4 +1,4 @@
-"""Serial ports as the daemon sees them, on real pseudo-terminals."""
+"""Serial transports on real pseudo-terminals."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tactiled.transports.serial_port import SerialTransport
 from tests.support.waiting import becomes_true
 
 EVERY_BYTE = bytes(range(256))
-"""Holds XON, XOFF, CR, LF, NUL, INTR and EOF: a terminal not in raw mode changes some of them."""
+"""Includes XON, XOFF, CR, LF, NUL, INTR, EOF: a terminal not in raw mode changes some of them."""
 
 
 @pytest.fixture
@@ -206,7 +206,7 @@ def test_non_terminal_is_refused(tmp_path: Path) -> None:
 def test_forbidden_port_names_group_and_udev_rule(
     pty: PtyPort, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Root may open everything, so the refusal of the system is played.
+    # Root may open everything, so the refusal of the system is simulated.
     def refuse(*args: object, **options: object) -> None:
         raise serial_port.serial.SerialException(13, "could not open port: Permission denied")
 
@@ -223,7 +223,7 @@ def test_invalid_arguments_are_refused(port: str, baud: int) -> None:
 
 @pytest.fixture
 def usb(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
-    """USB ports as pyserial lists them; a test puts them in and moves them."""
+    """USB ports as pyserial lists them; tests add and move them."""
     ports: list[SimpleNamespace] = []
     monkeypatch.setattr(listing.pyserial_ports, "comports", lambda: list(ports))
     return ports

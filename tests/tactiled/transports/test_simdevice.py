@@ -1,4 +1,4 @@
-"""The command ``simdevice`` as a user meets it: real processes, real signals, bad input."""
+"""The command ``simdevice``: real processes, signals and bad input."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from tactiled.transports.serial_port import SerialTransport
 from tests.support.waiting import wait_until
 
 BOOT = 0.3
-"""s a board needs from power-on until it answers, and more."""
+"""s, more than a board needs from power-on until it answers."""
 
 
 class Launched(subprocess.Popen[str]):
-    """The command, and the lines it said at its start."""
+    """The command, and the lines it printed at its start."""
 
     announced: list[str]
 
@@ -64,7 +64,7 @@ def launch(tmp_path: Path) -> Iterator[Launch]:
 def hear(
     transport: Transport, decoder: Any, enough: Callable[[list[Any]], bool], ask: Any = None
 ) -> list[Any]:
-    """What a board says until it is ``enough``; ``ask`` makes the question of every half second."""
+    """Messages of a board until ``enough``; ``ask`` makes the question sent every half second."""
     messages: list[Any] = []
     end = time.monotonic() + 60
     again = 0.0
@@ -209,7 +209,7 @@ def test_calibration_command_describes_the_simulated_board(launch: Launch, tmp_p
     host.open()
     received = hear(host, AnySkinDecoder(), lambda m: len(m) >= 20)
     host.close()
-    # The rest field of this seed, not of another: mounting tolerances alone differ by hundreds.
+    # The rest field of this seed: mounting tolerances of different seeds differ by hundreds of µT.
     rest = calibration.arrays[0].rest_ut
     field = received[-1].message.field_ut.astype(float)
     yaw = calibration.arrays[0].geometry.chip_yaw
@@ -218,7 +218,7 @@ def test_calibration_command_describes_the_simulated_board(launch: Launch, tmp_p
     assert abs(field - rest).max() < 150
     assert main(["calibration", "--out", str(tmp_path / "o.toml"), "--board", "anyskin"]) == 0
     assert abs(field - load(tmp_path / "o.toml").arrays[0].rest_ut).max() > 150
-    # Again over itself: yes. Over another's: no, unless told so.
+    # It overwrites its own file, but another board's only when told to.
     assert main(make) == 0
     assert main([*make[:-1], "8"]) == 2
     assert load(out).serial_number == calibration.serial_number

@@ -1,4 +1,4 @@
-"""slcan text against lines written by hand from the LAWICEL manual and the Linux slcan driver."""
+"""slcan: lines written by hand from the LAWICEL manual and the Linux slcan driver."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_noise_neither_raises_nor_accumulates(noise: bytes) -> None:
     adapter = opened()
     adapter.feed(noise * 3)
     assert len(adapter.take_output()) <= MAX_OUTPUT
-    # After noise, empty lines bring both ends back, as a host does it on opening.
+    # After noise, empty lines resynchronise both ends, as a host does on opening.
     adapter.feed(b"\r\rC\r")
     adapter.feed(b"C\r" if adapter.is_open else b"")
     adapter.take_output()
