@@ -68,7 +68,7 @@ def _run(shutdown: Shutdown, options: argparse.Namespace) -> int:
         with StatusLine(console, daemon.loop, daemon.recorder, cautions) as line:
             code = session.run(line)
         if code == FAILED:
-            session.say_why()
+            session.print_reason()
         return code
 
     return serve(daemon, shutdown, "disarmed", work)
@@ -94,7 +94,7 @@ class _Session:
         self._shutdown_requested = shutdown.requested
         self._outcome: Outcome | None = None
         self._beat = 0
-        self._looks = 0
+        self._idle_checks = 0
 
     def run(self, line: StatusLine) -> int:
         """Reach once, or serve until told to stop; returns the exit status."""
@@ -105,7 +105,7 @@ class _Session:
                 daemon.reach(settings.goal)
         while not self._ended():
             self._shutdown_requested.wait(REFRESH_S)
-            self._look(line)
+            self._check(line)
             if not settings.serve and not daemon.moving:
                 break
         daemon.cancel("reachd was told to stop")
@@ -114,7 +114,7 @@ class _Session:
             return DONE
         return DONE if self._outcome is not None and self._outcome.success else FAILED
 
-    def say_why(self) -> None:
+    def print_reason(self) -> None:
         """Print why there was no reach."""
         if self._outcome is None and self._daemon.failure is None:
             cycle = self._daemon.loop.last
@@ -124,15 +124,15 @@ class _Session:
     def _ended(self) -> bool:
         return self._shutdown_requested.is_set() or self._daemon.done.is_set()
 
-    def _look(self, line: StatusLine) -> None:
+    def _check(self, line: StatusLine) -> None:
         self._note_outcome()
         self._daemon.check_arm()
         line.show()
         self._daemon.watch()
         beat = self._daemon.loop.lateness.cycles
-        self._looks = self._looks + 1 if beat == self._beat else 0
+        self._idle_checks = self._idle_checks + 1 if beat == self._beat else 0
         self._beat = beat
-        if self._looks >= HUNG:
+        if self._idle_checks >= HUNG:
             self._daemon.fail(
                 RuntimeError("the control loop is stuck, in the strategy most likely")
             )

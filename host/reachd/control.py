@@ -180,7 +180,7 @@ LAST_ZEROS = 3
 R = TypeVar("R")
 
 
-def ask_real_time(priority: int) -> bool:
+def request_real_time(priority: int) -> bool:
     """Give the calling thread, and those it starts, real-time priority; False when refused.
 
     Python's interpreter lock has no priorities: a thread that holds it while other programs use the
@@ -310,7 +310,7 @@ class ControlLoop:
     def _run(self) -> None:
         try:
             if self.real_time:
-                ask_real_time(self._priority)
+                request_real_time(self._priority)
             schedule = Schedule(self._period, monotonic_now())
             while not self._stopping:
                 remaining = seconds_between(monotonic_now(), schedule.deadline)

@@ -23,13 +23,13 @@ from typing import Any
 import zenoh
 
 from reachd.arms import Arm, ArmError, BusArm
-from reachd.control import Controller, ControlLoop, Cycle, Inputs, ask_real_time
+from reachd.control import Controller, ControlLoop, Cycle, Inputs, request_real_time
 from reachd.gate.gate import SafetyGate
 from reachd.gate.settings import Check, SafetySettings
 from reachd.inputs import TouchInput
 from reachd.interfaces import Goal, Strategy
 from reachd.lock import ArmLock, LockError
-from reachd.publish import Listener, Reporter, as_json
+from reachd.publish import Reporter, TopicLogger, as_json
 from reachd.services import OperatorRequests, ReachServices, RefusedError
 from reachd.settings import Settings
 from reachd.trial import Outcome, State, Supervisor
@@ -78,7 +78,7 @@ class Daemon(Service):
         self._arm: Arm | None = None
         self._touch: TouchInput | None = None
         self._reporter: Reporter | None = None
-        self._listener: Listener | None = None
+        self._topic_logger: TopicLogger | None = None
         self._services: ReachServices | None = None
         self._requests: OperatorRequests | None = None
         self._tokens: list[zenoh.LivelinessToken] = []
@@ -123,7 +123,7 @@ class Daemon(Service):
         self._lock.acquire(settings.name)
         sys.setswitchinterval(SWITCH_INTERVAL)
         if settings.priority > 1:
-            self.loop.real_time = ask_real_time(settings.priority - 1)
+            self.loop.real_time = request_real_time(settings.priority - 1)
         codec()
         self._session = session = open_session(settings.bus)
         self._claim(session)
@@ -131,7 +131,7 @@ class Daemon(Service):
             self.recorder = recorder = self._open_log(settings.log)
             self._disk = DiskWatch(lambda: Path(recorder.stats.path).parent)
             self._disk.start()
-            self._listener = Listener(
+            self._topic_logger = TopicLogger(
                 session, self.recorder, self._wall, settings.board, settings.arm
             )
         self._touch = TouchInput(
@@ -198,7 +198,7 @@ class Daemon(Service):
         while not (stopping.is_set() or self.done.is_set()):
             self.check_arm()
             cycle = self.loop.last
-            if cycle is not None and _fit(cycle, safety):
+            if cycle is not None and _inputs_ready(cycle, safety):
                 return
             if time.monotonic() >= deadline:
                 raise StartError(self._missing())
@@ -259,9 +259,9 @@ class Daemon(Service):
                 level = logging.INFO if stats.state == "recording" else logging.ERROR
                 log.log(level, "log %s: %s %s", stats.path, stats.state, stats.last_error)
         cycle, now = self.loop.last, monotonic_now()
-        if self._listener is not None and cycle is not None and cycle.inputs.touch is not None:
+        if self._topic_logger is not None and cycle is not None and cycle.inputs.touch is not None:
             try:
-                self._listener.ask_geometry()
+                self._topic_logger.ask_geometry()
             except zenoh.ZError as error:  # the log only lacks a picture
                 log.debug("the geometry of the board cannot be asked for: %s", error)
         if not self.moving and seconds_between(self._collected, now) > COLLECT_EVERY:
@@ -291,8 +291,8 @@ class Daemon(Service):
             self._disk.stop()
         if self._services is not None:
             self._services.close()
-        if self._listener is not None:
-            self._listener.close()
+        if self._topic_logger is not None:
+            self._topic_logger.close()
         if self._reporter is not None:
             clean &= self._reporter.close()
         if self.recorder is not None:
@@ -424,7 +424,7 @@ class Daemon(Service):
         return "; ".join(problems) or "features and arm come too seldom to start"
 
 
-def _fit(cycle: Cycle, safety: SafetySettings) -> bool:
+def _inputs_ready(cycle: Cycle, safety: SafetySettings) -> bool:
     """Whether both inputs are present, valid and fresh."""
     touch = cycle.inputs.touch
     return (
@@ -432,13 +432,13 @@ def _fit(cycle: Cycle, safety: SafetySettings) -> bool:
         and touch.valid
         and cycle.inputs.arm is not None
         and all(i.code is not Check.FEATURES_SPARSE for i in cycle.decision.interventions)
-        and (cycle.inputs.arm.echo is None or _obeys(cycle.inputs.arm.echo))
+        and (cycle.inputs.arm.echo is None or _has_obeyed(cycle.inputs.arm.echo))
         and -safety.future <= cycle.touch_age < safety.features_age
         and -safety.future <= cycle.arm_age < safety.arm_age
     )
 
 
-def _obeys(echo: Echo) -> bool:
+def _has_obeyed(echo: Echo) -> bool:
     """Whether the arm has obeyed one of our commands."""
     return echo.own and echo.sequence > 0
 

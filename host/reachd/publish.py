@@ -53,7 +53,7 @@ ANSWER = 5.0
 """s for the board's answer."""
 
 
-class Listener:
+class TopicLogger:
     """Logs all streams of ``board``, the state of ``arm``, frames, and the objects of every world.
 
     ``refused``: count of samples with topics or names that are not logged.

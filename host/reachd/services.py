@@ -195,7 +195,8 @@ class OperatorRequests:
         try:
             return future.result(LOOP_TIMEOUT)
         except FutureTimeoutError:
-            raise RefusedError("the control loop does not answer") from None
+            busy = f"reachd is busy and did not answer within {LOOP_TIMEOUT:g} s"
+            raise RefusedError(f"{busy}; it may still do it") from None
 
 
 def same_limits(state: ArmState, limits: ArmLimits) -> bool:

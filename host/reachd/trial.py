@@ -146,7 +146,7 @@ class Trial:
     excavations: list[Excavation] = field(default_factory=list)
     onsets: Onsets = field(default_factory=Onsets)
 
-    def see(self, touch: Touch | None, arm: ArmState, distance: float) -> None:
+    def add_cycle(self, touch: Touch | None, arm: ArmState, distance: float) -> None:
         """Add one cycle; numbers that are not finite do not change the peaks."""
         self.distance = distance
         self.closest = min(self.closest, distance)
@@ -156,7 +156,7 @@ class Trial:
         if touch is not None and touch.valid and touch.peak_force > self.peak_force:
             self.peak_force = touch.peak_force
 
-    def hear(self, events: Iterable[StrategyEvent]) -> None:
+    def add_events(self, events: Iterable[StrategyEvent]) -> None:
         """Add events of the strategy."""
         for event in events:
             if event.kind == "excavation_start":
@@ -380,7 +380,7 @@ class Supervisor:
         elapsed = seconds_between(trial.began, now)
         if arm is not None:
             distance = aim(arm, goal, p.tip_length).distance
-            trial.see(touch, arm, distance)
+            trial.add_cycle(touch, arm, distance)
             judged = p.success_during_excavation or not self._activity.startswith("excavate")
             if distance <= goal.radius and judged:
                 text = f"reached within {distance * 1e3:.1f} mm after {elapsed:.2f} s"
@@ -394,5 +394,5 @@ class Supervisor:
             return Command(ZERO, goal)
         answer = ask(self._strategy, touch, arm, goal, now)
         self._activity = answer.activity
-        trial.hear(answer.events)
+        trial.add_events(answer.events)
         return Command(answer.twist, goal, answer.failure, answer.events)

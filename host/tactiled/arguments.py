@@ -155,7 +155,7 @@ def make_parser() -> argparse.ArgumentParser:
     add(
         "--compensation",
         choices=METHODS,
-        help="how the earth's field is taken off (default consensus)",
+        help="how the earth's field is removed (default consensus)",
     )
     add(
         "--compensation-rate",

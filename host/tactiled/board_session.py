@@ -52,6 +52,7 @@ STATE_EVERY = 10
 """s between records of a rest field that tracks the drift."""
 
 FIRMWARE_LEVELS = (10, 20, 30, 40)
+"""Levels of ``rcl_interfaces/Log``: debug, info, warning, error."""
 
 FIRMWARE_RATE, FIRMWARE_BURST = 10.0, 50
 """Texts of a board's firmware passed on per second, and at once; the bytes of the others are in the
@@ -192,13 +193,13 @@ class BoardSession:
             try:
                 self.pipeline.restore_rest(seed)
             except ValueError as error:
-                self._say(logging.WARNING, f"{error}: tared anew")
+                self._announce(logging.WARNING, f"{error}: tared anew")
         self._maker = MessageMaker(calibration, self._sink.wall)
         self._picture = SkinPicture(calibration.geometry)
         self.chips = ChipWatch(calibration.geometry)
         if self.recorder is not None:
             self._attach_calibration(self.recorder, calibration, identity)
-            self._note_state()
+            self._record_state()
         self.send_geometry()
 
     def describe_to(self, recorder: Recorder | None) -> None:
@@ -218,7 +219,7 @@ class BoardSession:
             {"model": identity.model, "firmware": identity.firmware} | summary,
         )
 
-    def _note_state(self) -> None:
+    def _record_state(self) -> None:
         """Write into every later file of the log what is needed to reprocess it by itself."""
         if self.recorder is not None and self.identity is not None:
             state = None if self.pipeline is None else self.pipeline.rest_to_record()
@@ -226,15 +227,15 @@ class BoardSession:
             self.recorder.metadata(f"{STATE_PREFIX}{self.name}", table)
             self._state_age = 0
 
-    def _warn(self) -> None:
+    def _warn_of_calibration(self) -> None:
         """Warn once about the calibration, and about a board too large to describe whole."""
         choice = self.choice
         if self._maker is not None and not self._maker.whole:
             text = "so many taxels that their geometry goes without the unrolled skin"
-            self._say(logging.WARNING, text, "geometry")
+            self._announce(logging.WARNING, text, "geometry")
         if choice is not None and choice.warning and choice.warning != self._warned:
             self._warned = choice.warning
-            self._say(logging.WARNING, choice.warning)
+            self._announce(logging.WARNING, choice.warning)
 
     def send_geometry(self) -> None:
         """Publish where the taxels are; does nothing before a board has been identified."""
@@ -258,43 +259,43 @@ class BoardSession:
                 self._unplugged = False
                 version = f", firmware {identity.firmware}" if identity.firmware else ""
                 written = f", read as {identity.layout}" if identity.layout else ""
-                self._say(logging.INFO, f"{identity}{version} found{written}", "found")
-                self._warn()
+                self._announce(logging.INFO, f"{identity}{version} found{written}", "found")
+                self._warn_of_calibration()
             case Streaming(rate):
                 self.state = "streaming"
                 text = f"streaming at {rate:g} Hz" if rate else "streaming"
-                self._say(logging.INFO, text, "streaming")
+                self._announce(logging.INFO, text, "streaming")
             case Refused(refusal):
                 self.refusal, self.state = refusal, "refused"
                 text = f"refused: {refusal.problem}; {refusal.remedy}"
-                self._say(logging.ERROR, text, "refused")
+                self._announce(logging.ERROR, text, "refused")
             case FellSilent(seconds):
                 self.state = "silent"
                 self.counters["silences"] += 1
                 said = self._silences.fell(seconds, self._sink.now())
                 if said is not None:
-                    self._say(logging.WARNING, said)
+                    self._announce(logging.WARNING, said)
             case Resumed(seconds):
                 self.state = "streaming"
                 said = self._silences.ended(seconds)
                 if said is not None:
-                    self._say(logging.INFO, said)
+                    self._announce(logging.INFO, said)
             case ClockJudged(trouble):
                 if trouble:
                     text = (
                         f"clock unusable: {trouble}; features stay invalid until it is right: "
                         "check the tick rate in the board's descriptor, and its oscillator"
                     )
-                    self._say(logging.WARNING, text, "clock")
+                    self._announce(logging.WARNING, text, "clock")
                 else:
-                    self._say(logging.INFO, "the board's clock can be used again", "clock")
+                    self._announce(logging.INFO, "the board's clock can be used again", "clock")
             case Reset(reason):
                 self.counters["resets"] += 1
                 if self.pipeline is not None:
                     self.pipeline.reset()
-                self._say(logging.WARNING, f"the board restarted: {reason}", "restart")
+                self._announce(logging.WARNING, f"the board restarted: {reason}", "restart")
             case BoardLog(level, captured, text):
-                self._pass_on(level, captured, text)
+                self._publish_firmware_text(level, captured, text)
             case Reported(status):
                 self.board_status = {
                     "overruns": status.overruns,
@@ -314,7 +315,7 @@ class BoardSession:
         self.state = "unplugged"
         self._unplugged = True
         self._silences.gone()
-        self._say(logging.WARNING, f"{reason}; waiting for it to come back", "lost")
+        self._announce(logging.WARNING, f"{reason}; waiting for it to come back", "lost")
 
     def await_answer(self, request: int) -> Future[Event]:
         """Return a future for the board's answer to a request, given by its number."""
@@ -356,14 +357,14 @@ class BoardSession:
         """Work out rate and latency; report repeated messages and masked chips."""
         self._measure_rate(now)
         for level, text in self._repeats.due(now):
-            self._say(level, text)
+            self._announce(level, text)
         said = self._silences.due(now)
         if said is not None:
-            self._say(logging.WARNING, said)
+            self._announce(logging.WARNING, said)
         if self.chips is not None:
             for level, text in self.chips.each_second(now):
-                self._say(level, text)
-        self._tell_of_floods(now)
+                self._announce(level, text)
+        self._report_floods(now)
         if self._latencies:
             ordered = sorted(self._latencies)
             last = len(ordered) - 1
@@ -373,7 +374,7 @@ class BoardSession:
             self.latency = Latency()
         self._state_age += 1
         if self._settings.rest_tracking_s is not None and self._state_age >= STATE_EVERY:
-            self._note_state()  # a tracked rest field moves all the time
+            self._record_state()  # a tracked rest field moves all the time
 
     def _measure_rate(self, now: Instant) -> None:
         """Cycles per second over the shortest span that holds enough of them."""
@@ -422,12 +423,12 @@ class BoardSession:
         doubt = pipeline.rest_reason
         if doubt is not self._doubt:
             if doubt is not None and (self._doubt is None or self._doubt.code != doubt.code):
-                self._say(logging.WARNING, doubt.text, "rest field in doubt")
+                self._announce(logging.WARNING, doubt.text, "rest field in doubt")
             self._doubt = doubt
         report = pipeline.tare_report
         if report is not None and report is not before:
             level = logging.INFO if report.accepted else logging.WARNING
-            self._say(level, report.message, "" if report.accepted else "tare refused")
+            self._announce(level, report.message, "" if report.accepted else "tare refused")
             result = {
                 "accepted": report.accepted,
                 "message": report.message,
@@ -439,7 +440,7 @@ class BoardSession:
                 future.set_result(result)
             self._tares.clear()
             if report.accepted:
-                self._note_state()
+                self._record_state()
 
     def _send(self, cycle: Cycle) -> None:
         maker, sink = self._maker, self._sink
@@ -458,9 +459,9 @@ class BoardSession:
         self.features, self.last = cycle.features, cycle
         self.sent += 1
         if self._picture is not None:
-            self._show(self._picture, cycle, stamp_ns)
+            self._publish_picture(self._picture, cycle, stamp_ns)
 
-    def _show(self, picture: SkinPicture, cycle: Cycle, stamp_ns: int) -> None:
+    def _publish_picture(self, picture: SkinPicture, cycle: Cycle, stamp_ns: int) -> None:
         """Send a picture when one is due; it is for viewers only, so a failure is just counted."""
         try:
             parts = picture.draw(cycle, stamp_ns) if picture.due(cycle.captured) else []
@@ -482,19 +483,19 @@ class BoardSession:
         if self._throttle(UNSENT + kind).allow(self._sink.now()):
             log.error("%s: a message of %s cannot be sent: %s", self.name, kind, error)
 
-    def spoilt(self, error: Exception) -> None:
+    def event_failed(self, error: Exception) -> None:
         """Count an event lost to an error; reset the pipeline, whose state may be inconsistent."""
         self.counters["spoilt_events"] += 1
         if self._throttle("spoilt").allow(self._sink.now()):
-            log.error("%s: an event could not be worked off", self.name, exc_info=error)
+            log.error("%s: an event could not be processed", self.name, exc_info=error)
         if self.pipeline is not None:
             self.pipeline.reset()
 
-    def say_of_log(self, level: int, text: str) -> None:
+    def announce_log_state(self, level: int, text: str) -> None:
         """Announce a change of the log that this board's messages go to."""
-        self._say(level, text)
+        self._announce(level, text)
 
-    def _pass_on(self, level: int, captured: Instant, text: str) -> None:
+    def _publish_firmware_text(self, level: int, captured: Instant, text: str) -> None:
         """Publish and log a text of the firmware, unless there have been too many."""
         now = self._sink.now()
         if not self._firmware.allow(now):
@@ -505,24 +506,24 @@ class BoardSession:
             self.counters["texts_without_time"] += 1
             captured, text = now, f"{text} (when is not known: its clock says {age:.0f} s ago)"
         known = max((n for n in FIRMWARE_LEVELS if n <= level), default=10)
-        self._speak(known, text, f"{self.name} firmware", captured)
+        self._publish_text(known, text, f"{self.name} firmware", captured)
 
-    def _say(self, level: int, text: str, kind: str = "") -> None:
+    def _announce(self, level: int, text: str, kind: str = "") -> None:
         """Announce ``text``; one with a ``kind`` only when the last of that kind is a while ago."""
-        if not kind or self._repeats.tell(kind, text, level, self._sink.now()):
-            self._speak(level, text)
+        if not kind or self._repeats.should_report(kind, text, level, self._sink.now()):
+            self._publish_text(level, text)
         else:
             self.counters["texts_held_back"] += 1
 
-    def _tell_of_floods(self, now: Instant) -> None:
+    def _report_floods(self, now: Instant) -> None:
         """Say how many texts of the firmware were held back, once the limit allows it."""
         firmware = self._firmware
         if firmware.held and firmware.ready(now):
             held = firmware.take_held()
             firmware.allow(now)
-            self._speak(logging.WARNING, f"{held} texts held back, too many: firmware")
+            self._publish_text(logging.WARNING, f"{held} texts held back, too many: firmware")
 
-    def _speak(
+    def _publish_text(
         self, level: int, text: str, firmware: str = "", captured: Instant | None = None
     ) -> None:
         try:

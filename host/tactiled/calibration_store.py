@@ -114,7 +114,7 @@ def _nominal(identity: Identity) -> Choice | Refusal:
                 f"{'+'.join(map(str, default_arrays(count)))}",
             )
         calibration = nominal(identity.model, serial or UNNUMBERED, count, arrays)
-    warning = f"no calibration for {identity}: nominal figures, forces right to a factor of two"
+    warning = f"no calibration for {identity}: nominal figures, forces accurate to a factor of two"
     return Choice(calibration, None, warning)
 
 

@@ -191,7 +191,7 @@ class Daemon(Service):
         if self._prefix:
             # Replays offer no services.
             return board
-        if _is_taken(session, name):
+        if _name_in_use(session, name):
             return Trouble(
                 f"another tactiled publishes for the name {name!r} already",
                 "stop that one, or give this board another --name",
@@ -292,17 +292,17 @@ class Daemon(Service):
                 if all(port.ended for port in self.ports):
                     self.done.set()
             for port in self.ports:
-                self._part(port)
+                self._stop_boards(port)
             self._abandon_requests()
         except BaseException as error:  # noqa: BLE001 - thread boundary: the daemon must end loudly
             self.fail(error)
 
-    def _part(self, port: Port) -> None:
+    def _stop_boards(self, port: Port) -> None:
         """Stop a port's boards; an error at one port must not keep the others running."""
         try:
             port.stop_streaming(monotonic_now())
-        except Exception as error:
-            log.error("%s: it could not be told to stop", port.name, exc_info=error)
+        except Exception as error:  # of any kind: the other ports must still be stopped
+            log.error("%s: its boards could not be stopped", port.name, exc_info=error)
 
     def _call(self, work: Callable[[], Any]) -> Future[Any]:
         """Have the pipeline's thread run ``work``."""
@@ -323,7 +323,7 @@ class Daemon(Service):
                 future.set_result(work())
             except (ValueError, ServiceError, CalibrationError) as error:
                 future.set_exception(error)
-            except Exception as error:
+            except Exception as error:  # of any kind: the pipeline must go on
                 log.error("a request failed", exc_info=error)
                 future.set_exception(ServiceError(f"{type(error).__name__}: {error}"))
 
@@ -353,13 +353,13 @@ class Daemon(Service):
         for port in self.ports:
             for node, board in port.boards.items():
                 try:
-                    self._sum_up(publisher, port, node, board, now)
+                    self._publish_diagnostics(publisher, port, node, board, now)
                 except Exception as error:  # noqa: BLE001 - an account of the data, not the data
-                    board.spoilt(error)
+                    board.event_failed(error)
         self._watch_log()
         self._collector.each_second()
 
-    def _sum_up(
+    def _publish_diagnostics(
         self, publisher: MessagePublisher, port: Port, node: int, board: BoardSession, now: Instant
     ) -> None:
         board.each_second(now)
@@ -382,7 +382,7 @@ class Daemon(Service):
         good = stats.state == "recording"
         text = f"log {stats.path}: {stats.state}" + (f" ({stats.last_error})" if not good else "")
         for board in self.boards:
-            board.say_of_log(logging.INFO if good else logging.ERROR, text)
+            board.announce_log_state(logging.INFO if good else logging.ERROR, text)
 
 
 def _as_recorded(
@@ -408,6 +408,6 @@ def _make_transport(port: PortSettings, speed: float) -> Transport:
     return SerialTransport(port.spec, port.baud)
 
 
-def _is_taken(session: zenoh.Session, name: str) -> bool:
+def _name_in_use(session: zenoh.Session, name: str) -> bool:
     replies = session.liveliness().get(alive_key(name), timeout=NAME_TIMEOUT)
     return any(reply.ok is not None for reply in replies)

@@ -105,6 +105,7 @@ class Alarms:
 
 
 OK, WARNING, ERROR, STALE = range(4)
+"""Levels of ``diagnostic_msgs/DiagnosticStatus``."""
 
 LEVELS = {
     "streaming": OK,

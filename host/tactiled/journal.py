@@ -85,7 +85,7 @@ class Journal:
         self._after = Instant(0)
         self._said: Instant | None = None
 
-    def worked(self, received: Instant) -> None:
+    def processed(self, received: Instant) -> None:
         """Note that the chunk received then has been processed."""
         self._after = received
 

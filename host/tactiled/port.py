@@ -21,7 +21,7 @@ from tactiled.transports.base import Transport
 
 log = logging.getLogger(__name__)
 
-TURN = 64
+CHUNKS_PER_TURN = 64
 """Most chunks processed in one turn, so that a port that lags does not hold up the others."""
 
 
@@ -104,31 +104,31 @@ class Port:
         ``stopping``: asked between chunks; when true the rest is left. Never raises: chunks that
         cannot be processed are counted and reported.
         """
-        for _ in range(TURN):
+        for _ in range(CHUNKS_PER_TURN):
             item = None if stopping() else self.inbox.take()
             if item is None:
                 break
             if isinstance(item, Chunk) and self.inbox.skipped:
                 self.note(kinds.SKIPPED, now, until=item.received)
             try:
-                self.work(item, now)
+                self.process(item, now)
             except Exception as error:  # noqa: BLE001 - one chunk must not end the others
-                self._spoilt(error)
+                self._note_failure(error)
         try:
             # A recording runs on the time of its chunks; at high speed that is ahead of ours.
             self.tick(now if self._live else self._clock)
             if self._journal is not None:
                 self._journal.progress(now)
         except Exception as error:  # noqa: BLE001 - one port must not end the others
-            self._spoilt(error)
+            self._note_failure(error)
 
-    def work(self, item: Item, now: Instant) -> None:
+    def process(self, item: Item, now: Instant) -> None:
         """Process one item: a chunk, or that the port opened, was lost or ended."""
         if isinstance(item, Chunk):
             self._clock = item.received
             self._handle(self.line.receive(item))
             if self._journal is not None:
-                self._journal.worked(item.received)
+                self._journal.processed(item.received)
         elif isinstance(item, PortOpened):
             self._clock = now
             self.note(kinds.OPENED, now, value=item.byte_time, text=item.usb_serial)
@@ -213,19 +213,19 @@ class Port:
         """Whether any board of this port has ever identified itself."""
         return any(board.identity is not None for board in list(self.boards.values()))
 
-    def _spoilt(self, error: Exception) -> None:
+    def _note_failure(self, error: Exception) -> None:
         self.spoilt += 1
         if self._complaints.allow(monotonic_now()):
-            log.error("%s: data could not be worked off", self.name, exc_info=error)
+            log.error("%s: data could not be processed", self.name, exc_info=error)
 
-    def _hand_over(self, board: BoardSession, event: Event) -> None:
+    def _dispatch(self, board: BoardSession, event: Event) -> None:
         if not self._live:
             board.handle(event)  # no error may be hidden: a rerun must reproduce the recording
             return
         try:
             board.handle(event)
         except Exception as error:  # noqa: BLE001 - one event must not end the others
-            board.spoilt(error)
+            board.event_failed(error)
 
     def _handle(self, events: list[LineEvent]) -> None:
         for happened in events:
@@ -233,7 +233,7 @@ class Port:
             if happened.node is not None:
                 board = self.boards.get(happened.node)
                 if board is not None:
-                    self._hand_over(board, event)
+                    self._dispatch(board, event)
             elif isinstance(event, Found):
                 for node, name in self._names(event.nodes, event.late).items():
                     self.add_board(node, name)

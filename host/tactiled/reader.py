@@ -208,7 +208,7 @@ class PortReader:
                 raise
             log.warning("%s; waiting for it", error)
         else:
-            self._tell_opened()
+            self._put_opened()
 
     def start(self) -> None:
         """Begin to read."""
@@ -229,7 +229,7 @@ class PortReader:
                     self._read_until_lost()
                 except EndOfLog:
                     raise
-                except Exception as error:
+                except Exception as error:  # of any kind: a failing driver counts as a lost port
                     log.error("%s failed", self.transport.name, exc_info=error)
                     self._inbox.put(PortLost(f"{self.transport.name} failed: {error}"))
                 self._reopen()
@@ -296,10 +296,10 @@ class PortReader:
                 wait = min(2 * wait, REOPEN_SLOWEST)
             else:
                 self.reopened += 1
-                self._tell_opened()
+                self._put_opened()
                 return
 
-    def _tell_opened(self) -> None:
+    def _put_opened(self) -> None:
         transport = self.transport
         if isinstance(transport, SerialTransport):
             serial = transport.usb_serial or ""

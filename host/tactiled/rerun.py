@@ -125,7 +125,7 @@ def recorded_port(name: str, values: Mapping[str, str]) -> RecordedPort:
             arrays=None if arrays is None else tuple(int(n) for n in arrays),
         )
     except (KeyError, ValueError, AttributeError, TypeError) as error:
-        raise RecordedError(f"the log's record of port {name!r} is spoilt: {error}") from error
+        raise RecordedError(f"the log's record of port {name!r} is damaged: {error}") from error
 
 
 HELD = 32_768
@@ -274,7 +274,7 @@ class Rerun:
         match event.kind:
             case kinds.OPENED:
                 port = port or self._open()
-                port.work(PortOpened(event.text, event.value), now)
+                port.process(PortOpened(event.text, event.value), now)
             case kinds.SKIPPED:
                 while self._held and self._held[0].received < event.until_ns:
                     self._held.popleft()
@@ -290,7 +290,7 @@ class Rerun:
         board = port.boards.get(event.node)
         match event.kind:
             case kinds.LOST:
-                port.work(PortLost(event.text), now)
+                port.process(PortLost(event.text), now)
             case kinds.TICK if self._follow:
                 port.tick(now)
             case kinds.TARE if board is not None:
@@ -316,14 +316,14 @@ class Rerun:
             port = self._open(chunk)
             self._introduce(port, chunk)
         self.chunks += 1
-        port.work(chunk, chunk.received)
+        port.process(chunk, chunk.received)
         if not self._follow:
             port.tick(chunk.received)
 
     def _introduce(self, port: Port, first: Chunk) -> None:
         """Open the port with the boards' recorded descriptors: the boards do not repeat them."""
         floats = [s.serial_number for s in self._states.values() if s.descriptor is None]
-        port.work(PortOpened(floats[0] if len(floats) == 1 else ""), first.received)
+        port.process(PortOpened(floats[0] if len(floats) == 1 else ""), first.received)
         for state in self._states.values():
             if state.descriptor is None:
                 continue
@@ -332,7 +332,7 @@ class Rerun:
                 payload = encode_serial(state.descriptor)
             else:
                 payload = CanEncoder(state.node, self._recorded.fd).encode(state.descriptor)
-            port.work(Chunk(first.received, payload), first.received)
+            port.process(Chunk(first.received, payload), first.received)
 
     def _open(self, first: Chunk | None = None) -> Port:
         recorded, listen_only = self._recorded, not self._follow

@@ -200,7 +200,8 @@ class BoardServices:
         return result
 
     def _do(self, work: Callable[[], Any]) -> Any:
-        return self._await(self._run(work), PIPELINE_TIMEOUT, "the pipeline does not answer")
+        busy = f"tactiled is busy and did not answer within {PIPELINE_TIMEOUT:g} s"
+        return self._await(self._run(work), PIPELINE_TIMEOUT, f"{busy}; it may still do it")
 
     def _await(self, future: Future[Any], timeout: float, otherwise: str) -> Any:
         try:

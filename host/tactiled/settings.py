@@ -105,7 +105,7 @@ if TYPE_CHECKING:
 else:
     CompensationTable = table_of(
         "CompensationTable",
-        "``[compensation]``: how the ambient field is taken off.",
+        "``[compensation]``: how the ambient field is removed.",
         PipelineSettings,
         only=("method", "compensation_rate_hz"),
         rename={"compensation_rate_hz": "rate"},

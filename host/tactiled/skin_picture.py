@@ -26,6 +26,7 @@ METRES_PER_N = 0.01
 """Length of an arrow: the paper's threshold of 10 N is as long as the finger's side."""
 
 TAXEL_M, SHAFT_M, LETTERS_M = 0.003, 0.002, 0.01
+"""Sizes of a taxel's sphere, an arrow's shaft and letters."""
 
 LIST_MAX = 1024
 """Most taxels in one marker, 40 B each."""

@@ -45,7 +45,7 @@ SIDES = ((Side.LEFT, "left"), (Side.RIGHT, "right"), (Side.TIP, "tip"))
 
 
 @dataclass(frozen=True, slots=True)
-class Glimpse:
+class BoardSummary:
     """What is shown of a board. ``forces``: normal force of the contacts on each side, N.
 
     ``bound``: 95 % bound of the error of their sum, N; inf where unknown. ``rate``: Hz.
@@ -65,7 +65,7 @@ class Glimpse:
     alarms: tuple[str, ...] = ()
 
 
-def glimpse(board: BoardSession, now: Instant) -> Glimpse:
+def summarise(board: BoardSession, now: Instant) -> BoardSummary:
     """Collect what is shown of a board at ``now``."""
     cycle, limit = board.last, STALE_AFTER
     if board.rate > 0:
@@ -83,7 +83,7 @@ def glimpse(board: BoardSession, now: Instant) -> Glimpse:
             arrays = board.choice.calibration.geometry.arrays
             forces = side_forces(features, list(dict.fromkeys(a.side for a in arrays)))
     drops = sum(board.summary.get("drops", {}).values())
-    return Glimpse(
+    return BoardSummary(
         board.name, board.state, forces, valid, reasons, board.rate, drops,
         board.latency.p50, bound, tuple(board.summary.get("alarms", ())),
     )  # fmt: skip
@@ -99,7 +99,7 @@ def side_forces(features: Features, sides: Sequence[Side]) -> dict[Side, float]:
     }
 
 
-def line(seen: Glimpse, width: int = WIDTH, name_width: int = 0) -> Text:
+def line(seen: BoardSummary, width: int = WIDTH, name_width: int = 0) -> Text:
     """Format at most ``width`` columns: name, force or why there is none, then the rest.
 
     ``name_width``: columns of the longest name, to align the lines.
@@ -161,13 +161,13 @@ class StatusLines(LiveLines):
         table, now, boards = Table.grid(), monotonic_now(), self._boards()
         names = max((len(board.name) for board in boards), default=0)
         for board in boards:
-            table.add_row(line(glimpse(board, now), self._console.width, names))
+            table.add_row(line(summarise(board, now), self._console.width, names))
         return table
 
     def lines(self) -> list[str]:
         """A line for each board."""
         now = monotonic_now()
-        return [line(glimpse(board, now)).plain.rstrip() for board in self._boards()]
+        return [line(summarise(board, now)).plain.rstrip() for board in self._boards()]
 
 
 def _duration(seconds: float) -> str:

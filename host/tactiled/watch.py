@@ -44,7 +44,7 @@ class Repeats:
     def __init__(self) -> None:
         self._windows: dict[str, _Window] = {}
 
-    def tell(self, kind: str, text: str, level: int, now: Instant) -> bool:
+    def should_report(self, kind: str, text: str, level: int, now: Instant) -> bool:
         """Whether to report ``text`` now; if not, it is counted. ``level``: logging level."""
         window = self._windows.get(kind)
         if window is not None and window.told < FEW:

@@ -52,19 +52,19 @@ def test_unplugged_board_is_not_also_called_silent(instant: At) -> None:
 def test_first_few_of_a_kind_are_reported_and_the_rest_counted(instant: At) -> None:
     repeats, told = Repeats(), 0
     for k in range(50):
-        told += repeats.tell("restart", f"restart {k}", logging.WARNING, instant(k * 0.1))
+        told += repeats.should_report("restart", f"restart {k}", logging.WARNING, instant(k * 0.1))
     assert told == FEW
-    assert repeats.tell("other", "once", logging.INFO, instant(5.0))
+    assert repeats.should_report("other", "once", logging.INFO, instant(5.0))
     assert repeats.due(instant(9.9)) == []
     assert repeats.due(instant(10.0)) == [(logging.WARNING, "47 times more in 10 s: restart 49")]
-    assert not repeats.tell("restart", "restart 50", logging.WARNING, instant(11.0))
+    assert not repeats.should_report("restart", "restart 50", logging.WARNING, instant(11.0))
     assert repeats.due(instant(20.0)) == [(logging.WARNING, "once more in 10 s: restart 50")]
     assert repeats.due(instant(40.0)) == []
-    assert repeats.tell("restart", "restart 51", logging.WARNING, instant(41.0))
+    assert repeats.should_report("restart", "restart 51", logging.WARNING, instant(41.0))
 
 
 def test_memory_for_kinds_of_messages_is_bounded(instant: At) -> None:
     repeats = Repeats()
     for k in range(10 * KINDS):
-        assert repeats.tell(f"kind {k}", "text", logging.INFO, instant(0.0))
+        assert repeats.should_report(f"kind {k}", "text", logging.INFO, instant(0.0))
     assert len(repeats._windows) == KINDS

@@ -14,7 +14,7 @@ from tactile_core.cli import drops_text
 from tactile_core.geometry import Side
 from tactiled.boards.line import bus_names
 from tactiled.cli import can_networks
-from tactiled.status import BAR, SIDES, Glimpse, bar, line
+from tactiled.status import BAR, SIDES, BoardSummary, bar, line
 
 
 def test_force_bar_saturates() -> None:
@@ -24,7 +24,7 @@ def test_force_bar_saturates() -> None:
     assert shown[-2:] == [len(BAR) - 1] * 2
 
 
-def a_glimpse(**values: object) -> Glimpse:
+def a_summary(**values: object) -> BoardSummary:
     usual: dict[str, object] = {
         "name": "board0",
         "state": "streaming",
@@ -35,24 +35,24 @@ def a_glimpse(**values: object) -> Glimpse:
         "drops": 0,
         "latency": 0.0017,
     }
-    return Glimpse(**(usual | values))  # type: ignore[arg-type]
+    return BoardSummary(**(usual | values))  # type: ignore[arg-type]  # values of any type
 
 
 def test_status_shows_force_then_rate_latency_and_losses() -> None:
-    shown = line(a_glimpse()).plain
+    shown = line(a_summary()).plain
     assert " ".join(shown.split()) == "board0 2.35 N ▂ 99.9 Hz 0 dropped latency 1.7 ms"
-    bounded = line(a_glimpse(bound=0.25)).plain
+    bounded = line(a_summary(bound=0.25)).plain
     assert "2.35 ± 0.25 N" in bounded
-    several = line(a_glimpse(forces={Side.LEFT: 1.0, Side.RIGHT: 0.0, Side.TIP: 11.0})).plain
+    several = line(a_summary(forces={Side.LEFT: 1.0, Side.RIGHT: 0.0, Side.TIP: 11.0})).plain
     assert several.index("left") < several.index("right") < several.index("tip 11.0█ N")
     assert several.endswith("latency 1.7 ms")
     assert cell_len(several) <= 80
-    longest = a_glimpse(name="n" * 64, forces=dict.fromkeys(Side, 99.9), drops=123_456)
+    longest = a_summary(name="n" * 64, forces=dict.fromkeys(Side, 99.9), drops=123_456)
     assert "123456 dropped" in line(longest).plain
 
 
 def test_invalid_force_is_replaced_by_its_reason() -> None:
-    shown = line(a_glimpse(valid=False, reasons=("taring: leave the skin untouched",))).plain
+    shown = line(a_summary(valid=False, reasons=("taring: leave the skin untouched",))).plain
     assert " N " not in shown
     assert "not valid" in shown
     assert "taring: leave" in shown
@@ -60,7 +60,7 @@ def test_invalid_force_is_replaced_by_its_reason() -> None:
 
 @pytest.mark.parametrize("state", ["waiting", "silent", "unplugged", "refused"])
 def test_idle_board_shows_its_state(state: str) -> None:
-    shown = line(a_glimpse(state=state, drops=1234)).plain
+    shown = line(a_summary(state=state, drops=1234)).plain
     assert state in shown
     assert " N " not in shown
     assert " Hz" not in shown
@@ -80,7 +80,7 @@ def test_idle_board_shows_its_state(state: str) -> None:
 )
 @settings(max_examples=100, deadline=None)
 def test_status_line_fits_its_width(width: int, **values: object) -> None:
-    shown = line(a_glimpse(**values), width)
+    shown = line(a_summary(**values), width)
     assert shown.cell_len <= width
 
 

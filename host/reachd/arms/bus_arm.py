@@ -148,7 +148,7 @@ class BusArm:
 
     def request_limits(self, limits: ArmLimits) -> ArmLimits:
         """Call the arm's ``limits`` service."""
-        reply = self._ask("limits", limits_fields(limits))
+        reply = self._call_service("limits", limits_fields(limits))
         try:
             return msgspec.convert(reply, ArmLimits)
         except msgspec.ValidationError as error:
@@ -156,7 +156,7 @@ class BusArm:
 
     def request_clear(self) -> str:
         """Call the arm's ``clear`` service; returns its mode."""
-        reply = self._ask("clear")
+        reply = self._call_service("clear")
         return str(reply.get("mode", "")) if isinstance(reply, dict) else ""
 
     def counters(self) -> dict[str, int]:
@@ -169,7 +169,7 @@ class BusArm:
         self._closing.set()
         if self._signer is not None:
             with suppress(ArmError):
-                self._ask("release", timeout=RELEASE_TIMEOUT)
+                self._call_service("release", timeout=RELEASE_TIMEOUT)
             self._signer = None
         for tap in self._taps:
             tap.close()
@@ -181,7 +181,7 @@ class BusArm:
             self._publisher.close()
             self._publisher = None
 
-    def _ask(
+    def _call_service(
         self,
         service: str,
         fields: Mapping[str, object] = MappingProxyType({}),
@@ -190,15 +190,15 @@ class BusArm:
         """Call a service that the arm reserves for its commander; `ArmError` when it fails."""
         signer = self._signer
         if signer is None:
-            raise ArmError(f"arm {self.name!r} has not granted its command: {self._why()}")
+            raise ArmError(f"arm {self.name!r} has not granted its command: {self._denial()}")
         with self._signing:
             request = signer.sign(service, **fields)
         try:
             return call(self._session, service_key(self.name, service, "arm"), request, timeout)
         except ServiceError as error:
-            raise ArmError(f"arm {self.name!r} does not take {service}: {error}") from error
+            raise ArmError(f"arm {self.name!r} refuses {service}: {error}") from error
 
-    def _why(self) -> str:
+    def _denial(self) -> str:
         return self._denied or "is its driver running, and is it of this version?"
 
     def _make_state(self, message: Any, captured: Instant, received: Instant) -> ArmState:
@@ -218,31 +218,31 @@ class BusArm:
     def _claim(self) -> None:
         """Request the arm's command whenever we do not have it."""
         while not self._closing.wait(CLAIM_AGAIN):
-            if self._signer is not None and self._ours():
+            if self._signer is not None and self._is_granted():
                 continue
             try:
-                self._ask_for_it()
+                self._request_grant()
             except (ServiceError, zenoh.ZError) as error:
                 if isinstance(error, ServiceError) and not isinstance(error, NoAnswerError):
                     self._denied = str(error)
                     self._denied_since = self._denied_since or monotonic_now()
                 log.debug("arm %s: %s", self.name, error)
 
-    def _ours(self) -> bool:
+    def _is_granted(self) -> bool:
         """Whether the arm's state names us as commander; after a grant it has time to show it."""
         state, now = self._input.value, monotonic_now()
         if seconds_between(self._granted_at, now) < GRANT_SHOWN or state is None:
             return True
         return state.echo is not None and state.echo.own
 
-    def _ask_for_it(self) -> None:
+    def _request_grant(self) -> None:
         request = ClaimRequest(self._reach, clock_domain())
         key = service_key(self.name, "claim", "arm")
         try:
             grant = msgspec.convert(call(self._session, key, request, ANSWER_TIMEOUT), Grant)
             signer = Signer(grant)
         except (msgspec.ValidationError, ValueError) as error:
-            text = f"arm {self.name!r} grants its command in other words: {error}"
+            text = f"arm {self.name!r} sends a grant that cannot be read: {error}"
             raise ServiceError(text) from error
         self._granted_at = monotonic_now()
         self._signer = signer

@@ -18,9 +18,9 @@ from reachd.gate.limits import (
     braked,
     constrained,
     fastest_point,
-    felt,
     finite,
     force_constraints,
+    largest_skin_force,
     load,
     squeeze_constraints,
     touch_constraints,
@@ -162,15 +162,15 @@ class SafetyGate:
             text = f"the request to arm is {age:.3f} s old, or older than what it is to clear"
             refusals.append(Intervention(Check.REQUEST_STALE, "refused", text))
         self._motion.restart()  # earlier motion is the operator's responsibility
-        faults, stops, _ = self._inputs(touch, arm, now, duplicate)
+        faults, stops, _ = self._check_inputs(touch, arm, now, duplicate)
         # An arm that stopped by itself resumes with the zero commands that follow.
         refusals += [
             Intervention(i.code, "refused", i.text)
             for i in (*faults, *stops)
             if i.code is not Check.ARM_STOPPED
         ]
-        if arm is not None and self._on(Check.FREE_AIR) and (free_air or not self._proven):
-            refusals += self._biased(arm)
+        if arm is not None and self._enabled(Check.FREE_AIR) and (free_air or not self._proven):
+            refusals += self._check_free_air(arm)
         if not refusals:
             self._hold = None
             self._proven = True
@@ -201,7 +201,7 @@ class SafetyGate:
         decision = self._decide(
             wanted, touch, arm, goal, now, lateness, duplicate, rivalled, failure
         )
-        self._motion.told(decision.twist, now)
+        self._motion.add_command(decision.twist, now)
         return decision
 
     def _decide(
@@ -217,12 +217,12 @@ class SafetyGate:
         failure: str | None,
     ) -> Decision:
         passed = 0.0 if self._stepped is None else seconds_between(self._stepped, now)
-        faults, stops, notes = self._inputs(touch, arm, now, duplicate)
-        if rivalled and self._on(Check.RIVAL_COMMANDS):
+        faults, stops, notes = self._check_inputs(touch, arm, now, duplicate)
+        if rivalled and self._enabled(Check.RIVAL_COMMANDS):
             text = "somebody else sends commands to the arm, which does not obey them"
             notes.append(Intervention(Check.RIVAL_COMMANDS, "ignored", text))
-        faults += self._command(wanted, failure)
-        stops += self._timing(passed, lateness)
+        faults += self._check_command(wanted, failure)
+        stops += self._check_timing(passed, lateness)
         self._stepped = now
         for fault in faults:
             self._latch(fault, now)
@@ -240,7 +240,7 @@ class SafetyGate:
         self._last = twist
         return Decision(twist, self._settings.command_expiry, tuple(notes), None)
 
-    def _on(self, check: Check) -> bool:
+    def _enabled(self, check: Check) -> bool:
         return check not in self._off
 
     def _latch(self, fault: Intervention, now: Instant) -> None:
@@ -253,7 +253,7 @@ class SafetyGate:
         self._last = ZERO
         return Decision(ZERO, self._settings.command_expiry, why, held)
 
-    def _command(self, wanted: Twist | None, failure: str | None) -> list[Intervention]:
+    def _check_command(self, wanted: Twist | None, failure: str | None) -> list[Intervention]:
         """Check the command itself."""
         if failure is not None or wanted is None:
             text = f"the strategy failed: {failure or 'it gave no command'}"
@@ -261,34 +261,34 @@ class SafetyGate:
         ok = finite(wanted.vx, wanted.vy, wanted.omega)
         return [] if ok else [_not_finite(wanted)]
 
-    def _timing(self, passed: float, lateness: float) -> list[Intervention]:
+    def _check_timing(self, passed: float, lateness: float) -> list[Intervention]:
         """Check the loop: its reported lateness, and the time since the last step."""
         s = self._settings
         found = []
-        if passed < 0.0 and self._on(Check.CLOCK_BACKWARDS):
+        if passed < 0.0 and self._enabled(Check.CLOCK_BACKWARDS):
             text = f"time went back by {-passed:.3f} s"
             found.append(Intervention(Check.CLOCK_BACKWARDS, "stopped", text))
         late = max(lateness, passed - s.period)
-        if not late <= s.lateness and self._on(Check.LOOP_LATE):
+        if not late <= s.lateness and self._enabled(Check.LOOP_LATE):
             text = f"the control loop is {late * 1e3:.1f} ms late, {s.lateness * 1e3:g} at most"
             found.append(Intervention(Check.LOOP_LATE, "stopped", text))
         return found
 
-    def _inputs(
+    def _check_inputs(
         self, touch: Touch | None, arm: ArmState | None, now: Instant, duplicate: bool
     ) -> tuple[list[Intervention], list[Intervention], list[Intervention]]:
         """Check the inputs; returns faults, which latch, then stops, then mere notes."""
         faults: list[Intervention] = []
         stops: list[Intervention] = []
         notes: list[Intervention] = []
-        if duplicate and self._on(Check.DUPLICATE_PUBLISHER):
+        if duplicate and self._enabled(Check.DUPLICATE_PUBLISHER):
             text = "a second publisher was seen on an input of control: end one of them"
             faults.append(Intervention(Check.DUPLICATE_PUBLISHER, "latched", text))
-        self._features(touch, now, faults, stops, notes)
-        self._arm_state(arm, now, faults, stops)
+        self._check_features(touch, now, faults, stops, notes)
+        self._check_arm(arm, now, faults, stops)
         return faults, stops, notes
 
-    def _features(
+    def _check_features(
         self,
         touch: Touch | None,
         now: Instant,
@@ -300,25 +300,25 @@ class SafetyGate:
         s = self._settings
         if touch is not None and usable(touch):
             ahead = seconds_between(now, max(touch.captured, touch.received))
-            if ahead > s.future and self._on(Check.FEATURES_FUTURE):
+            if ahead > s.future and self._enabled(Check.FEATURES_FUTURE):
                 text = f"features stamped {ahead:.3f} s ahead of now are not used"
                 notes.append(Intervention(Check.FEATURES_FUTURE, "ignored", text))
             else:
                 oldest = min(touch.captured, touch.received)
                 self._felt = oldest if self._felt is None else max(self._felt, oldest)
-                self._touch(touch)
-        self._squeezed(faults)
-        self._sparse(touch, now, stops)
+                self._keep_touch(touch)
+        self._check_skin_force(faults)
+        self._check_sparse(touch, now, stops)
         age = math.inf if self._felt is None else seconds_between(self._felt, now)
         if age <= s.features_age - s.period - FEATURES_ON_THE_WAY:
             return
         text = f"no valid features for {age:.3f} s"
-        if age > s.features_latch and self._on(Check.FEATURES_LOST):
+        if age > s.features_latch and self._enabled(Check.FEATURES_LOST):
             faults.append(Intervention(Check.FEATURES_LOST, "latched", text))
-        if self._on(Check.FEATURES_STALE):
+        if self._enabled(Check.FEATURES_STALE):
             stops.append(Intervention(Check.FEATURES_STALE, "stopped", text))
 
-    def _touch(self, touch: Touch) -> None:
+    def _keep_touch(self, touch: Touch) -> None:
         """Keep the newest usable touch, and the rate at which its force grew."""
         last = self._touched
         if last is not None and touch.captured <= last.captured:
@@ -330,16 +330,16 @@ class SafetyGate:
                 self._rising = max(0.0, touch.total_force - last.total_force) / passed
         self._touched = touch
 
-    def _squeezed(self, faults: list[Intervention]) -> None:
+    def _check_skin_force(self, faults: list[Intervention]) -> None:
         """Check for force on the skin far above its limit; the last touch counts until the next."""
-        if self._touched is None or not self._on(Check.SKIN_OVERLOAD):
+        if self._touched is None or not self._enabled(Check.SKIN_OVERLOAD):
             return
-        force, limit = felt(self._touched), self._settings.skin_force
+        force, limit = largest_skin_force(self._touched), self._settings.skin_force
         if force >= SKIN_LATCH * limit:
             text = f"the skin feels up to {force:.1f} N, its limit is {limit:g} N"
             faults.append(Intervention(Check.SKIN_OVERLOAD, "latched", text))
 
-    def _sparse(self, touch: Touch | None, now: Instant, stops: list[Intervention]) -> None:
+    def _check_sparse(self, touch: Touch | None, now: Instant, stops: list[Intervention]) -> None:
         """Check for touch that is valid now and then, but less than half of the time."""
         seen = self._seen
         if seen and now <= seen[-1][0]:
@@ -353,11 +353,11 @@ class SafetyGate:
         for at, good in seen:
             without += 0.0 if good else seconds_between(before, at)
             before = at
-        if without > SPARSE_OVER / 2 and self._on(Check.FEATURES_SPARSE):
+        if without > SPARSE_OVER / 2 and self._enabled(Check.FEATURES_SPARSE):
             text = f"the features were not valid for {without:.2f} of the last {SPARSE_OVER:g} s"
             stops.append(Intervention(Check.FEATURES_SPARSE, "stopped", text))
 
-    def _arm_state(
+    def _check_arm(
         self,
         arm: ArmState | None,
         now: Instant,
@@ -371,17 +371,17 @@ class SafetyGate:
             return
         age = seconds_between(min(arm.captured, arm.received), now)
         ahead = seconds_between(now, max(arm.captured, arm.received))
-        if ahead > s.future and self._on(Check.ARM_FUTURE):
+        if ahead > s.future and self._enabled(Check.ARM_FUTURE):
             text = f"arm state stamped {ahead:.3f} s ahead of now"
             stops.append(Intervention(Check.ARM_FUTURE, "stopped", text))
         if age > s.arm_age - s.period - ON_THE_WAY:
             text = f"no arm state for {age:.3f} s"
-            if age > s.arm_latch and self._on(Check.ARM_LOST):
+            if age > s.arm_latch and self._enabled(Check.ARM_LOST):
                 faults.append(Intervention(Check.ARM_LOST, "latched", text))
-            if self._on(Check.ARM_STALE):
+            if self._enabled(Check.ARM_STALE):
                 stops.append(Intervention(Check.ARM_STALE, "stopped", text))
         last, self._state_at = self._state_at, arm.captured
-        if last is not None and arm.captured < last and self._on(Check.CLOCK_BACKWARDS):
+        if last is not None and arm.captured < last and self._enabled(Check.CLOCK_BACKWARDS):
             text = f"the arm's stamps went back by {seconds_between(arm.captured, last):.3f} s"
             stops.append(Intervention(Check.CLOCK_BACKWARDS, "stopped", text))
         twist = arm.twist
@@ -394,25 +394,25 @@ class SafetyGate:
             faults.extend(
                 Intervention(check, "latched", text)
                 for check, text in self._motion.judge(arm)
-                if self._on(check)
+                if self._enabled(check)
             )
-            self._overload(arm, now, faults)
+            self._check_overload(arm, now, faults)
         if arm.echo is not None:
-            self._echo(arm.echo, arm.captured, faults, stops)
+            self._check_echo(arm.echo, arm.captured, faults, stops)
         if arm.mode == PAUSED_MODE:
-            if self._on(Check.ARM_STOPPED):
+            if self._enabled(Check.ARM_STOPPED):
                 text = "the arm stopped by itself because commands had ceased"
                 stops.append(Intervention(Check.ARM_STOPPED, "stopped", text))
-        elif arm.mode not in MOVING_MODES and self._on(Check.ARM_MODE):
+        elif arm.mode not in MOVING_MODES and self._enabled(Check.ARM_MODE):
             text = f"the arm is in mode {arm.mode!r}: clear it at the arm, then arm again"
             faults.append(Intervention(Check.ARM_MODE, "latched", text))
         limits = (arm.v_max, arm.omega_max, arm.f_max, arm.m_max)
-        if limits != self._confirmed and self._on(Check.ARM_LIMITS):
-            wrong = self._unconfirmed(arm)
+        if limits != self._confirmed and self._enabled(Check.ARM_LIMITS):
+            wrong = self._check_limits(arm)
             faults.extend(wrong)
             self._confirmed = () if wrong else limits
 
-    def _overload(self, arm: ArmState, now: Instant, faults: list[Intervention]) -> None:
+    def _check_overload(self, arm: ArmState, now: Instant, faults: list[Intervention]) -> None:
         """Check for a load far beyond its limit, or beyond it repeatedly.
 
         An impact lasts only one state, so it counts only from twice the overload.
@@ -423,7 +423,7 @@ class SafetyGate:
             self._loaded_at = arm.captured
             self._hard = self._hard + 1 if part >= s.overload else 0
         hard = self._hard >= HARD_STATES or part >= HARD_AT_ONCE * s.overload
-        if hard and self._on(Check.OVERLOAD):
+        if hard and self._enabled(Check.OVERLOAD):
             text = f"the load is {part:.0%} of its limit"
             faults.append(Intervention(Check.OVERLOAD, "latched", text))
         if part < s.soft_fraction:
@@ -433,7 +433,7 @@ class SafetyGate:
             self._passes.append(now)
         while self._passes and seconds_between(self._passes[0], now) > s.overload_within:
             self._passes.popleft()
-        if len(self._passes) >= s.overload_passes and self._on(Check.OVERLOAD_REPEATED):
+        if len(self._passes) >= s.overload_passes and self._enabled(Check.OVERLOAD_REPEATED):
             text = (
                 f"the load passed its limit {len(self._passes)} times within "
                 f"{s.overload_within:g} s"
@@ -441,7 +441,7 @@ class SafetyGate:
             faults.append(Intervention(Check.OVERLOAD_REPEATED, "latched", text))
             self._passes.clear()
 
-    def _echo(
+    def _check_echo(
         self,
         echo: Echo,
         captured: Instant,
@@ -458,10 +458,14 @@ class SafetyGate:
             return
         if self._own_since is None:
             self._own_since = captured
-        if echo.sequence and self._motion.after_all(echo.decided) and self._on(Check.ECHO_LOST):
+        if (
+            echo.sequence
+            and self._motion.is_after_all_commands(echo.decided)
+            and self._enabled(Check.ECHO_LOST)
+        ):
             text = "the arm echoes a command that was never sent: see what drives it"
             faults.append(Intervention(Check.ECHO_LOST, "latched", text))
-        due = self._motion.first_after(echo.decided)
+        due = self._motion.first_command_after(echo.decided)
         if due is not None and echo.sequence == 0:
             due = max(due, self._own_since)  # none has been obeyed yet
         # How long the command after the one in effect has been on its way, plus one period.
@@ -476,12 +480,12 @@ class SafetyGate:
             f"{s.echo_age * 1e3:g} ms are allowed"
         )
         lost = seconds_between(self._late_since, captured) >= ECHO_LOST
-        if lost and self._on(Check.ECHO_LOST):
+        if lost and self._enabled(Check.ECHO_LOST):
             faults.append(Intervention(Check.ECHO_LOST, "latched", text))
-        if self._on(Check.ECHO_LATE):
+        if self._enabled(Check.ECHO_LATE):
             stops.append(Intervention(Check.ECHO_LATE, "stopped", text))
 
-    def _unconfirmed(self, arm: ArmState) -> list[Intervention]:
+    def _check_limits(self, arm: ArmState) -> list[Intervention]:
         """Check the limits that the arm confirms; the text names both values."""
         ask = self._settings.arm_limits
         wrong = [
@@ -499,7 +503,7 @@ class SafetyGate:
         text = f"the arm does not confirm its limits: {'; '.join(wrong)}"
         return [Intervention(Check.ARM_LIMITS, "latched", text)]
 
-    def _biased(self, arm: ArmState) -> list[Intervention]:
+    def _check_free_air(self, arm: ArmState) -> list[Intervention]:
         """Check the wrench in free air, which reveals a bias or a wrong tool."""
         s = self._settings
         force = math.hypot(arm.fx, arm.fy)
@@ -522,7 +526,7 @@ class SafetyGate:
     ) -> Twist:
         """Apply all limits of motion; adds those that acted to ``notes``."""
         s = self._settings
-        twist = self._speed(wanted, notes)
+        twist = self._limit_speed(wanted, notes)
         fastest, fastest_turn = math.inf, math.inf
         if goal is not None and self._slows:
             tip_x = arm.x + s.tip_length * math.cos(arm.heading)
@@ -532,7 +536,7 @@ class SafetyGate:
                 fastest, fastest_turn = s.slow_fraction * s.speed, s.slow_fraction * s.turn_rate
                 twist = within_speed(twist, fastest, fastest_turn)
                 _note(notes, Check.SLOW_DOWN, before, twist, "the goal is near")
-        twist, rules = self._held_back(twist, arm, notes)
+        twist, rules = self._constrained(twist, arm, notes)
         if self._bounds_acceleration:
             dt = min(max(passed, 0.0), s.period + s.lateness)
             before, last = twist, self._last
@@ -546,7 +550,7 @@ class SafetyGate:
             _note(notes, Check.ACCELERATION, before, twist, "the command changes too fast")
         return twist
 
-    def _speed(self, wanted: Twist, notes: list[Intervention]) -> Twist:
+    def _limit_speed(self, wanted: Twist, notes: list[Intervention]) -> Twist:
         """Limit speed and turn rate by scaling the twist, which keeps the path."""
         s = self._settings
         twist = wanted
@@ -559,7 +563,7 @@ class SafetyGate:
             _note(notes, Check.TURN_RATE, before, twist, "the command turns too fast")
         return twist
 
-    def _held_back(
+    def _constrained(
         self, twist: Twist, arm: ArmState, notes: list[Intervention]
     ) -> tuple[Twist, list[Constraint]]:
         """Apply workspace, wrench and touch together, because each alone could undo the others.
@@ -581,16 +585,18 @@ class SafetyGate:
             text = f"the load is {part:.0%} of its limit: {left:.0%} of the approach is left"
             _note(notes, Check.WRENCH, twist, constrained(twist, held), text)
             rules = rules + held
-        rules = rules + self._of_touch(twist, arm, notes)
+        rules = rules + self._touch_rules(twist, arm, notes)
         return constrained(twist, rules) if rules else twist, rules
 
-    def _of_touch(self, twist: Twist, arm: ArmState, notes: list[Intervention]) -> list[Constraint]:
+    def _touch_rules(
+        self, twist: Twist, arm: ArmState, notes: list[Intervention]
+    ) -> list[Constraint]:
         """Rules from the force on the skin, now and as predicted from its growth."""
         s, touch = self._settings, self._touched
         if touch is None:
             return []
         rules: list[Constraint] = []
-        force = felt(touch)
+        force = largest_skin_force(touch)
         part = force / s.skin_force
         if part > s.soft_fraction and self._bounds_skin:
             left = approach_left(part, s.soft_fraction)

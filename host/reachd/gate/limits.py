@@ -169,7 +169,7 @@ def approach_left(part: float, soft: float) -> float:
     return min(1.0, max(0.0, (1.0 - part) / (1.0 - soft)))
 
 
-def felt(touch: Touch) -> float:
+def largest_skin_force(touch: Touch) -> float:
     """Largest force that may be on the skin, N: touch plus its bound.
 
     An unknown bound counts as large as the force: nominal forces of uncalibrated boards are

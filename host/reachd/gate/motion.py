@@ -88,7 +88,7 @@ Path = tuple[float, float, float, float, float]
 
 
 class MotionWatch:
-    """Checks the motion of one arm. Call `told` with every command and `judge` with every state."""
+    """Checks the motion of one arm; `add_command` takes every command, `judge` every state."""
 
     def __init__(self, settings: SafetySettings) -> None:
         self._s = settings
@@ -102,7 +102,7 @@ class MotionWatch:
         self._found: tuple[Finding, ...] = ()
         self._free_since: Instant | None = None  # since when the arm has been without load
 
-    def told(self, twist: Twist, at: Instant) -> None:
+    def add_command(self, twist: Twist, at: Instant) -> None:
         """Add a command sent at ``at``."""
         if self._told_at and at <= self._told_at[-1]:
             self._told_at.clear()  # time went back, so earlier commands are useless
@@ -110,7 +110,7 @@ class MotionWatch:
             self._told.clear()
             self._path[:] = [(0.0, 0.0, 0.0, 0.0, 0.0)]
         else:
-            self._path.append(self._gone(len(self._told_at) - 1, at))
+            self._path.append(self._path_until(len(self._told_at) - 1, at))
         self._told_at.append(at)
         self._told.append(twist)
         if len(self._told_at) > 2 * KEPT:
@@ -123,11 +123,11 @@ class MotionWatch:
         self._found = ()
         self._free_since = None
 
-    def after_all(self, decided: Instant) -> bool:
+    def is_after_all_commands(self, decided: Instant) -> bool:
         """Whether commands were sent, and ``decided`` is later than all of them."""
         return bool(self._told_at) and decided > self._told_at[-1]
 
-    def first_after(self, decided: Instant) -> Instant | None:
+    def first_command_after(self, decided: Instant) -> Instant | None:
         """When the first command after that of ``decided`` was sent; None if none was."""
         index = bisect_right(self._told_at, decided)
         return self._told_at[index] if index < len(self._told_at) else None
@@ -158,10 +158,10 @@ class MotionWatch:
 
     def _jumped(self, arm: ArmState) -> bool:
         """Whether the pose has jumped, as after a reset of a simulated world."""
-        dx, dy, dh = self._moved(-1, arm)
+        dx, dy, dh = self._motion_since(-1, arm)
         return math.hypot(dx, dy) > JUMP or abs(dh) > JUMP / self._s.tip_length
 
-    def _gone(self, index: int, at: Instant) -> Path:
+    def _path_until(self, index: int, at: Instant) -> Path:
         """Commanded path up to ``at``; ``index``: newest command before it."""
         x, y, h, length, turned = self._path[index]
         twist = self._told[index]
@@ -174,12 +174,12 @@ class MotionWatch:
             turned + abs(twist.omega) * dt,
         )
 
-    def _way(self, begin: Instant, end: Instant) -> Path:
+    def _commanded_path(self, begin: Instant, end: Instant) -> Path:
         """Path commanded between two instants; none before the first command."""
         ends = []
         for at in (begin, end):
             index = bisect_right(self._told_at, at) - 1
-            ends.append(self._gone(index, at) if index >= 0 else self._path[0])
+            ends.append(self._path_until(index, at) if index >= 0 else self._path[0])
         (x0, y0, h0, l0, t0), (x1, y1, h1, l1, t1) = ends
         return x1 - x0, y1 - y0, h1 - h0, l1 - l0, t1 - t0
 
@@ -188,11 +188,11 @@ class MotionWatch:
         index = bisect_right(self._seen_at, at - window_ns) - 1
         return index if index >= 0 else None
 
-    def _moved(self, index: int, arm: ArmState) -> tuple[float, float, float]:
+    def _motion_since(self, index: int, arm: ArmState) -> tuple[float, float, float]:
         old = self._seen[index]
         return arm.x - old.x, arm.y - old.y, math.remainder(arm.heading - old.heading, math.tau)
 
-    def _stays(self, index: int) -> bool:
+    def _pose_is_constant(self, index: int) -> bool:
         """Whether all poses from ``index`` on equal the newest to within `SAME`."""
         last = self._seen[-1]
         return all(
@@ -209,7 +209,7 @@ class MotionWatch:
         index = self._before(arm.captured, SPEED_OVER_NS)
         if index is not None:
             seconds = (arm.captured - self._seen_at[index]) / NS_PER_S
-            dx, dy, dh = self._moved(index, arm)
+            dx, dy, dh = self._motion_since(index, arm)
             speed = max(speed, (math.hypot(dx, dy) - POSE_NOISE) / seconds)
             turn = max(turn, (abs(dh) - POSE_NOISE / s.tip_length) / seconds)
         if speed > TOO_FAST * s.arm_v_max:
@@ -231,14 +231,14 @@ class MotionWatch:
             return None
         s = self._s
         begin, end = self._seen_at[index], arm.captured
-        moved = self._moved(index, arm)
+        moved = self._motion_since(index, arm)
         slack, twist_slack = OFF_THE_WAY, OFF_THE_WAY / s.tip_length
-        off, off_turn = _off(moved, self._way(begin, end))
+        off, off_turn = _deviation(moved, self._commanded_path(begin, end))
         if off <= slack and off_turn <= twist_slack:
             return None
         for delay in DELAYS_NS:
-            way = self._way(Instant(begin - delay), Instant(end - delay))
-            aside, turned = _off(moved, way)
+            way = self._commanded_path(Instant(begin - delay), Instant(end - delay))
+            aside, turned = _deviation(moved, way)
             off, off_turn = min(off, aside), min(off_turn, turned)
         if self._gives_way(index):
             seconds = (end - begin) / NS_PER_S
@@ -260,10 +260,10 @@ class MotionWatch:
         if index is None or self._told_at[0] > self._seen_at[index]:
             return None
         begin, lever = self._seen_at[index], self._s.tip_length
-        moved = self._moved(index, arm)
+        moved = self._motion_since(index, arm)
         least, least_turn = math.inf, math.inf
         for delay in (0, *DELAYS_NS):
-            x, y, h, _, _ = self._way(Instant(begin - delay), Instant(end - delay))
+            x, y, h, _, _ = self._commanded_path(Instant(begin - delay), Instant(end - delay))
             least = min(least, _astray(moved[0], moved[1], x, y))
             least_turn = min(least_turn, _astray(moved[2] * lever, 0.0, h * lever, 0.0))
             if least <= DRIFTS and least_turn <= DRIFTS:
@@ -289,14 +289,14 @@ class MotionWatch:
         if index is None or not self._told_at:
             return None
         begin, end = self._seen_at[index], arm.captured
-        moved = self._moved(index, arm)
-        way = self._way(begin, end)
+        moved = self._motion_since(index, arm)
+        way = self._commanded_path(begin, end)
         for differs in (self._translation_differs, self._turning_differs):
             told = differs(moved, way, end - begin)
             if told is None:
                 continue
             for delay in DELAYS_NS:
-                late = self._way(Instant(begin - delay), Instant(end - delay))
+                late = self._commanded_path(Instant(begin - delay), Instant(end - delay))
                 if differs(moved, late, end - begin) is None:
                     break
             else:
@@ -346,7 +346,7 @@ class MotionWatch:
         n, seconds = len(states), window_ns / NS_PER_S
         since = self._before(states[-1].captured, TRACK_NS) or 0
         lately, last = self._seen[since:], states[-1]
-        mx, my, mh = self._moved(since, last)
+        mx, my, mh = self._motion_since(since, last)
         if ux or uy:
             dx, dy = moved[0] - ux * length, moved[1] - uy * length
             pushed = sum(a.fx * dx + a.fy * dy for a in states) / (n * math.hypot(dx, dy))
@@ -373,7 +373,7 @@ class MotionWatch:
             )
         else:
             explained = aside or self._gives_way(index)
-        lies = reported >= REPORTED * pace or (_moving(lately) and self._stays(index))
+        lies = reported >= REPORTED * pace or (_moving(lately) and self._pose_is_constant(index))
         if explained and not (dead and lies):
             return None
         if dead:
@@ -407,7 +407,7 @@ def _astray(mx: float, my: float, x: float, y: float) -> float:
     return math.hypot(max(-along, along - length, 0.0), (my * x - mx * y) / length)
 
 
-def _off(moved: tuple[float, float, float], way: Path) -> tuple[float, float]:
+def _deviation(moved: tuple[float, float, float], way: Path) -> tuple[float, float]:
     """Distance (m) and angle (rad) of ``moved`` from the nearest point of ``way``, taken as
     straight."""
     mx, my, mh = moved

@@ -60,6 +60,7 @@ HISTORY = 64
 """Sequence numbers remembered behind the newest: far more than any medium reorders."""
 
 WRAP = 1 << 32
+"""Number of sequence numbers, which are 32 bits."""
 
 
 class Verdict(Enum):
@@ -456,22 +457,22 @@ class BoardLink:
         events: list[Event] = []
         in_service = self.state in (State.CONFIGURING, State.STREAMING)
         if in_service:
-            if message == self.descriptor and not self._has_ceased(now):
+            if message == self.descriptor and not self._has_stopped_streaming(now):
                 return []  # the answer to the keepalive or to another host
-            events = [Reset(self._what_is_new(message)), *self._drop_commands()]
-        identity = self._take_on(message, now, rebooted=in_service)
+            events = [Reset(self._describe_change(message)), *self._drop_commands()]
+        identity = self._put_into_service(message, now, rebooted=in_service)
         events.append(Identified(identity, rebooted=in_service))
         if self._listen_only:
             self.state, self._refusal, self._started = State.STREAMING, None, now
             events.append(Streaming(None))
         return events
 
-    def _has_ceased(self, now: Instant) -> bool:
+    def _has_stopped_streaming(self, now: Instant) -> bool:
         """Whether a board that still answers has stopped streaming, and is not just slow."""
         quiet = seconds_between(max(self._last_sample, self._started), now)
         return self._silent and (self._pace.period is not None or quiet >= self.relink_limit)
 
-    def _what_is_new(self, message: Descriptor) -> str:
+    def _describe_change(self, message: Descriptor) -> str:
         before = self.descriptor
         if message == before or before is None:
             return "it answers, but has ceased to stream"
@@ -507,7 +508,7 @@ class BoardLink:
             )
         return self._admit(identity)
 
-    def _take_on(self, message: Descriptor, now: Instant, rebooted: bool) -> Identity:
+    def _put_into_service(self, message: Descriptor, now: Instant, rebooted: bool) -> Identity:
         identity = Identity.of(message)
         self.descriptor, self.identity = message, identity
         if self.clock is None:

@@ -232,6 +232,7 @@ LOG_AGE_S = 60.0
 """s, oldest believable text of the firmware; an older one gets its arrival as stamp."""
 
 WRAP = 1 << 32
+"""Number of ticks after which the board's 32-bit count wraps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -435,7 +436,7 @@ class ClockMap:
             return self._refuse("contradiction")
         if self._doubt and sent >= self._doubted:
             if self._line is not None and self._least <= 2 * self._allowed(pair, self._line):
-                self._begin_with(pair)  # this poll is too wide to tell whether the clock jumped
+                self._restart_with(pair)  # this poll is too wide to tell whether the clock jumped
             self._doubt, self._least = 0.0, math.inf
         self._delays.confirm()
         self._keep(pair)
@@ -586,7 +587,7 @@ class ClockMap:
         if settled:
             self.counters["jump"] += 1
             self._jumps.append(received)
-            self._begin_with(pair)
+            self._restart_with(pair)
             self._delays = _Delays()
         return True
 
@@ -595,7 +596,7 @@ class ClockMap:
         """Largest difference of a pair and a line that are both correct, s."""
         return pair.half + line.error(pair.board)
 
-    def _begin_with(self, pair: _Pair) -> None:
+    def _restart_with(self, pair: _Pair) -> None:
         """Start over with this pair alone."""
         self._pairs.clear()
         self._pairs.append(pair)
@@ -889,9 +890,9 @@ class ArrivalClock:
             return False
         least = min(self._late)
         proven = self._envelope is not None and self._envelope.buckets >= PROVEN
-        return least <= LATE or not proven or self._lose(max(round(least), 1))
+        return least <= LATE or not proven or self._count_lost(max(round(least), 1))
 
-    def _lose(self, lost: int) -> bool:
+    def _count_lost(self, lost: int) -> bool:
         """Count lost frames; False when losses are so frequent that the period must be wrong."""
         while self._losses and self._losses[0] < self._index - BUCKET * BUCKETS:
             self._losses.popleft()

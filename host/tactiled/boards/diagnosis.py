@@ -158,7 +158,7 @@ class Diagnosis:
         baud = f"the baud rate may be wrong (--baud, now {self._baud}), or " if self._uart else ""
         return Diagnosed(
             f"{port} sends {self._total} bytes in {asked} and no valid frame among them",
-            f"{baud}the device speaks something else than our protocol or AnySkin's: declare it "
+            f"{baud}the device speaks neither our protocol nor AnySkin's: declare it "
             f"with --kind (see tactiled --help){kind}",
         )
 

@@ -28,6 +28,7 @@ BACKLOG_GAP = 1e-3
 port was opened has been read: no such board is faster than 500 Hz."""
 
 BACKLOG_GAPS = 3
+"""Such gaps in a row that are needed."""
 
 LONE_GAP = 0.1
 """s before a single frame that show the same: a backlog is read without pauses."""

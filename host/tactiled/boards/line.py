@@ -114,7 +114,7 @@ class SerialLine:
         self._link: Link | None = None
         self._diagnosis = Diagnosis(port, baud, kind)
         if self._declared is not None:
-            self._adopt(self._declared)
+            self._use_layout(self._declared)
         self._diagnose_from = Instant(0)
         self._byte_ns = 0.0
         self._up = False
@@ -236,10 +236,10 @@ class SerialLine:
                 self._link = self._float
                 self._board.disconnect()
         elif not self._settled:
-            self._look(data, now)
+            self._survey_bytes(data, now)
         return found
 
-    def _look(self, data: bytes, now: Instant) -> None:
+    def _survey_bytes(self, data: bytes, now: Instant) -> None:
         """Survey the bytes for a layout; it is adopted when two surveys agree."""
         self._survey.feed(data)
         if now < self._judge_due:
@@ -249,12 +249,12 @@ class SerialLine:
         if layout is not None:
             self._judge_wait = JUDGE_FIRST
             if before is not None and before.layout == layout:
-                self._adopt(layout)
+                self._use_layout(layout)
         elif self._survey.full:
             self._judge_wait = min(2 * self._judge_wait, JUDGE_SLOWEST)
         self._judge_due = after(now, self._judge_wait)
 
-    def _adopt(self, layout: Layout) -> None:
+    def _use_layout(self, layout: Layout) -> None:
         """Read frames of ``layout`` from now on, if its framing is known."""
         if layout == self._layout:
             return  # in use already; its frames will come
@@ -392,9 +392,9 @@ class CanLine:
                 if not self._wanted(node):
                     self.strangers += 1
                     continue
-                out += self._meet(node, chunk.received)
+                out += self._add_board(node, chunk.received)
             if self._known and not out and not self._early:
-                heard += self._hear(node, message, chunk.received)
+                heard += self._receive_message(node, message, chunk.received)
             else:
                 # The caller must first learn of the board, from the events that this returns.
                 self._early.append((node, message, chunk.received))
@@ -409,10 +409,10 @@ class CanLine:
             self._questions = [self._everyone.encode(Identify(0))]
         out: list[LineEvent] = []
         if not self._known and self._known_at is not None and now >= self._known_at:
-            out += self._take_up(now)
+            out += self._put_into_service(now)
         elif self._known:
             while self._early:
-                out += self._hear(*self._early.popleft())
+                out += self._receive_message(*self._early.popleft())
             for node, link in self._links.items():
                 out += [LineEvent(node, event) for event in link.tick(now)]
         if not self._links and now >= max(after(self._since, NOTHING_AFTER), self._diagnose_from):
@@ -432,7 +432,7 @@ class CanLine:
             return node in self._nodes
         return len(self._links) < MAX_NODES
 
-    def _meet(self, node: int, now: Instant) -> list[LineEvent]:
+    def _add_board(self, node: int, now: Instant) -> list[LineEvent]:
         def admit(identity: Identity) -> Refusal | None:
             return self._admit(node, identity)
 
@@ -446,14 +446,14 @@ class CanLine:
             self._known_at = after(now, GATHER)
         return []
 
-    def _take_up(self, now: Instant) -> list[LineEvent]:
+    def _put_into_service(self, now: Instant) -> list[LineEvent]:
         """Put the boards found so far into service; their kept messages are processed next."""
         self._known = True
         for link in self._links.values():
             link.connect(now)
         return [LineEvent(None, Found(tuple(sorted(self._links)), late=False))]
 
-    def _hear(self, node: int, message: Message, arrival: Instant) -> list[LineEvent]:
+    def _receive_message(self, node: int, message: Message, arrival: Instant) -> list[LineEvent]:
         return [LineEvent(node, event) for event in self._links[node].receive(message, arrival)]
 
     def _diagnose(self) -> Diagnosed:

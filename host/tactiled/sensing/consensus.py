@@ -514,7 +514,7 @@ class FieldTracker:
         turned = TURNING_UT_PER_S * (captured - self._seen) / NS_PER_S
         return Prior(self._newest, min(IMPOSTOR_UT + turned, REVERSED_UT))
 
-    def take(self, fit: Fit, captured: Instant, fresh: bool = True) -> Estimate:
+    def update(self, fit: Fit, captured: Instant, fresh: bool = True) -> Estimate:
         """Estimate of a cycle from its fit. ``fresh`` False: the fit only checks earlier planes."""
         if fresh and fit.whole:
             self.theta = fit.theta

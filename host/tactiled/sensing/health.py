@@ -573,7 +573,7 @@ class Masking:
         self.touched = np.zeros(taxels, bool)
         """(N,) taxels in contact in the last cycle; for the owner to set."""
 
-    def well(self, touched: Bool) -> None:
+    def all_healthy(self, touched: Bool) -> None:
         """Take a cycle without masked taxels. ``touched``: (N,) taxels in contact."""
         self.touched = touched
         if self._sick:
@@ -729,9 +729,9 @@ class HealthMonitor:
         self._rest = rest_ut
         self._jumps.accept_rest(rest_ut)
 
-    def told(self, array: int, scale: Scale) -> None:
+    def set_scale(self, array: int, scale: Scale) -> None:
         """Set the scale of ``array`` as the board reports it: µT per count of x and y, and of z."""
-        if self.scales.told(array, scale):
+        if self.scales.set_reported(array, scale):
             self._jumps.forget_wraps(array)
 
     def update(

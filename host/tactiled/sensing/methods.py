@@ -66,10 +66,10 @@ class ConsensusCompensator:
             if fit is None:
                 fit = self._consensus.fit(field_ee, forces, healthy, prior)
             self._fitted, self._sound = captured, fit.whole
-            return self._tracker.take(fit, captured)
+            return self._tracker.update(fit, captured)
         prior = self._tracker.prior(captured)
         fit = self._consensus.check(self._tracker.theta, field_ee, forces, healthy, prior)
-        return self._tracker.take(fit, captured, fresh=False)
+        return self._tracker.update(fit, captured, fresh=False)
 
 
 class SmallArrays:

@@ -315,7 +315,7 @@ class BoardPipeline:
         if rest_ut.shape != self._rest.rest_ut.shape or noise.shape != self._noise.shape:
             raise ValueError(f"a rest field of shape {rest_ut.shape} for another board")
         if unrested.shape != self._rest.unrested.shape or not np.isfinite(rest_ut).all():
-            raise ValueError("a rest field that is spoilt")
+            raise ValueError("a damaged rest field")
         self._rest.restore(rest_ut, unrested, state.rough)
         bare, rested_c = np.array(state.bare, dtype=bool), np.array(state.rested_c)
         if bare.shape == unrested.shape:
@@ -399,7 +399,7 @@ class BoardPipeline:
                 if regained is not None:
                     rest.suspect(regained, self._noise)
             self._watch_rest(field, forces, estimate, healthy, captured)
-            self._feel_warmth(temperature, healthy)
+            self._update_drift(temperature, healthy)
             if sick:
                 np.copyto(forces, np.nan, where=~healthy[:, None])
         else:
@@ -425,16 +425,16 @@ class BoardPipeline:
         if sick:
             self._masking.touched = self._features.contact
         else:
-            self._masking.well(self._features.contact)
+            self._masking.all_healthy(self._features.contact)
         if rest.taring:
             rest.note_peak(features.peak_force)
         if self.settings.rest_tracking_s is not None and valid and not reasons:
-            self._follow_rest(field, estimate, healthy, captured)
+            self._track_rest(field, estimate, healthy, captured)
         follows = known and rest.state is RestState.KNOWN and not self._net.fitted
         if follows and self._last_captured is not None:
             elapsed = max(0.0, (captured - self._last_captured) / NS_PER_S)
             left_over = field - self._model.plane_field(estimate.theta)
-            rest.recover(left_over, healthy, float(self._noise.max()), elapsed)
+            rest.track_release(left_over, healthy, float(self._noise.max()), elapsed)
         self._last_captured = captured
         if sick:
             np.copyto(field, np.nan, where=~healthy[:, None])
@@ -476,7 +476,7 @@ class BoardPipeline:
             temperature[a, :n] = told
             status[a, :n] = block.status
             if block.lsb_ut is not None:
-                self._monitor.told(a, block.lsb_ut)
+                self._monitor.set_scale(a, block.lsb_ut)
         return raw, temperature, status, present
 
     def _reasons(
@@ -578,9 +578,9 @@ class BoardPipeline:
         if reason is not None:
             self._rest.suspect(reason, self._noise)
         elif self._rest.suspicion is not None and self._watch.restored(forces, estimate, healthy):
-            self._rest.trust()
+            self._rest.clear_suspicion()
 
-    def _feel_warmth(self, temperature: FloatArray, healthy: Bool) -> None:
+    def _update_drift(self, temperature: FloatArray, healthy: Bool) -> None:
         """Estimate the drift since the tare from the taxels' own thermometers."""
         # the thermometer of a masked chip cannot be trusted
         warmer = self._layout.flat(np.where(healthy, self._model.warmer(temperature), 0.0))
@@ -613,7 +613,7 @@ class BoardPipeline:
         valid, reasons = features.valid, features.reasons
         if peak > limit or (bounds.few and normal > limit):
             valid = False
-            reasons = (*reasons, self._doubt(max(peak, normal)))
+            reasons = (*reasons, self._main_uncertainty(max(peak, normal)))
         # added after the check of validity: contacts too slight to be detected do not matter to a
         # strategy that acts on half a newton
         if not extractor.summed:
@@ -632,7 +632,7 @@ class BoardPipeline:
         normal_bound = taxels + bounds.scaled(1.0) * np.abs(force[:, 2])
         return features, normal_bound
 
-    def _doubt(self, bound: float) -> Reason:
+    def _main_uncertainty(self, bound: float) -> Reason:
         """The reason for the largest part of the uncertainty."""
         warmest = float(self._warmer[np.argmax(np.abs(self._warmer))])
         if QUANTILE_95 * float(self._drift.max()) > 0.5 * self.settings.bound_limit_n:
@@ -666,7 +666,7 @@ class BoardPipeline:
         self._set_thresholds()
         self._compensator.set_noise(self._noise)
 
-    def _follow_rest(
+    def _track_rest(
         self, field: FloatArray, estimate: Estimate, healthy: Bool, captured: Instant
     ) -> None:
         """Let the rest field of untouched taxels track what compensation leaves."""
@@ -675,7 +675,7 @@ class BoardPipeline:
             return
         share = min(1.0, (captured - self._last_captured) / NS_PER_S / period)
         free = healthy & ~self._layout.padded(self._features.contact)
-        self._rest.follow(field - self._model.plane_field(estimate.theta), free, share)
+        self._rest.track(field - self._model.plane_field(estimate.theta), free, share)
 
     def _due(self, captured: Instant) -> bool:
         """Whether to send this cycle's features, by ``feature_rate_hz``."""

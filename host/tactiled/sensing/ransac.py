@@ -72,9 +72,9 @@ class RansacCompensator:
         prior = self._tracker.prior(captured)
         if self._fit_surfaces(due, field_ee, healthy):
             fit = self._checker.check(self._theta, field_ee, forces, healthy, prior)
-            return self._tracker.take(replace(fit, valid=fit.valid & self._complete), captured)
+            return self._tracker.update(replace(fit, valid=fit.valid & self._complete), captured)
         held = self._checker.check(self._tracker.theta, field_ee, forces, healthy, prior)
-        return self._tracker.take(held, captured, fresh=False)
+        return self._tracker.update(held, captured, fresh=False)
 
     def _fit_surfaces(self, upto: int, field: FloatArray, healthy: Bool) -> bool:
         """Fit surfaces until ``upto`` of them are done; True when that completes the period."""

@@ -239,7 +239,7 @@ class RestWatch:
         self.off = False
         return (
             self._bare(field, healthy, captured, last)
-            or self._leapt(estimate)
+            or self._jumped(estimate)
             or self._gain(field, healthy)
             or self._scrambled(field, forces, healthy, captured, last)
         )
@@ -262,7 +262,7 @@ class RestWatch:
         magnet = (rest**2).sum(axis=1) > MAGNET_UT**2
         reading = ((field + rest) ** 2).sum(axis=1)
         strong = np.linalg.norm(rest, axis=1)
-        fallen = self._fallen(field, reading, strong, healthy & magnet, captured, last)
+        fallen = self._lost_field(field, reading, strong, healthy & magnet, captured, last)
         bare = healthy & magnet & (reading < BARE_UT**2)
         if not (bare.any() or fallen.any()):
             self._bare_since[:] = -1
@@ -284,7 +284,7 @@ class RestWatch:
         a, i = np.argwhere(fallen)[0].tolist()
         return why.magnet_lost(self._names[a], i)
 
-    def _fallen(
+    def _lost_field(
         self,
         field: FloatArray,
         reading: FloatArray,
@@ -311,7 +311,7 @@ class RestWatch:
         """(A, n) taxels whose present rest field is as large as a magnet's."""
         return np.asarray((self._model.rest**2).sum(axis=1) > 4 * MAGNET_UT**2)
 
-    def _leapt(self, estimate: Estimate) -> Reason | None:
+    def _jumped(self, estimate: Estimate) -> Reason | None:
         size = float(estimate.leap.max())
         if size == 0.0:
             sizes = np.linalg.norm(estimate.theta[:, :, 0], axis=1) * estimate.ambient.valid
@@ -530,7 +530,7 @@ class RestField:
             if self._tare is None:
                 self.begin(noise_ut)
 
-    def trust(self) -> None:
+    def clear_suspicion(self) -> None:
         """Drop the suspicion: the skin reads its rest field again."""
         self.suspicion = None
         self._tare = None
@@ -591,7 +591,7 @@ class RestField:
             self._tare = tare.again()
         return None
 
-    def recover(
+    def track_release(
         self, left_over: FloatArray, healthy: Bool, noise_ut: float, elapsed: float
     ) -> None:
         """Track a skin that was released; see `Recovery.step`."""
@@ -599,7 +599,7 @@ class RestField:
         if change is not None:
             self._model.rest += change
 
-    def follow(self, left_over: FloatArray, free: Bool, share: float) -> None:
+    def track(self, left_over: FloatArray, free: Bool, share: float) -> None:
         """Move the rest field of ``free`` (A, n) taxels by a share of what compensation left."""
         self._model.rest += np.where(free[:, None], share * left_over, 0.0)
 

@@ -22,6 +22,7 @@ KNOWN_UT = (0.150, 0.200, 0.250, 0.300, 0.375, 0.451, 0.601, 0.751)
 KNOWN_Z_UT = (0.242, 0.323, 0.403, 0.484, 0.605, 0.727, 0.968, 1.210)
 """µT per count of an MLX90393 (datasheet, HALLCONF 0xC) from gain 7 to 0, finest resolution."""
 RESOLUTIONS = (1.0, 2.0, 4.0, 8.0)
+"""Factors of these scales at the chip's coarser resolutions."""
 SNAP = 1.5e-3
 """Relative distance within which a step counts as one of the datasheet's."""
 
@@ -126,7 +127,7 @@ class Scales:
         self._real = real
         self._now: list[Scale | None] = [None] * arrays
         self._before: list[Scale | None] = [None] * arrays
-        self._told = [False] * arrays
+        self._reported = [False] * arrays
         self._misfits = [0] * arrays
         self._finders: list[ScaleFinder | None] = [ScaleFinder() for _ in range(arrays)]
         self.seeking = True
@@ -134,11 +135,11 @@ class Scales:
         self.steps = np.full((arrays, 3, 1), np.nan)
         self._bounds()
 
-    def told(self, array: int, scale: Scale) -> bool:
+    def set_reported(self, array: int, scale: Scale) -> bool:
         """Set the scale that the board reports; True when a different one was known before."""
         if self._now[array] == scale:
             return False
-        self._told[array] = True
+        self._reported[array] = True
         return self._set(array, scale)
 
     def learn(self, raw: FloatArray) -> list[int]:
@@ -157,7 +158,7 @@ class Scales:
     def recheck(self, raw: FloatArray, good: Bool) -> None:
         """Drop scales found earlier that the readings of ``good`` (A, n) no longer fit."""
         for a, scale in enumerate(self._now):
-            if scale is None or self._told[a]:
+            if scale is None or self._reported[a]:
                 continue
             values = np.abs(raw[a][:, good[a]])
             fits = on_grid(values[:2].ravel(), scale[0]) and on_grid(values[2], scale[1])

@@ -39,7 +39,7 @@ class PipelineSettings:
 
     method: Annotated[
         Method,
-        Meta(description="how the ambient field is taken off"),
+        Meta(description="how the ambient field is removed"),
     ] = "consensus"
     compensation_rate_hz: Annotated[
         Annotated[Hertz, Meta(ge=0.01, le=10_000)] | None,

@@ -110,7 +110,7 @@ RELEASED_SIGMAS = 2.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Small:
+class SmallEstimate:
     """Result of one frame.
 
     ``field``: ambient field since the tare, (3,) µT in ``ee``. ``sigma``: its uncertainty, (3,) µT
@@ -169,7 +169,7 @@ class SmallArray:
         self._lean_weight = 1.0
         self._pace = np.zeros(3)  # µT/s
 
-    def update(self, target: FloatArray, healthy: Bool, elapsed: float) -> Small:
+    def update(self, target: FloatArray, healthy: Bool, elapsed: float) -> SmallEstimate:
         """Process one frame.
 
         ``target``: (3, n) µT in ``ee`` over rest, without the crosstalk of neighbours' contacts.
@@ -201,7 +201,7 @@ class SmallArray:
         self._mean += share * (target - self._mean)
         self._mean_variance = (1 - share) ** 2 * self._mean_variance + share**2
 
-    def _judge(self, frame: _Frame) -> Small:
+    def _judge(self, frame: _Frame) -> SmallEstimate:
         """Estimate the present ambient field, and which chips changed since the filter's time."""
         state, cov = self._state, self._cov
         seen = np.flatnonzero(frame.healthy)
@@ -209,7 +209,7 @@ class SmallArray:
         prior = cov[:, 0, 0] + unsteady**2
         known = float(cov[:, 0, 0].max()) < KNOWN_UT**2
         if not seen.size or self._mean is None:
-            return self._say(moved, prior, frame.changing, 0.0, 0.0)
+            return self._result(moved, prior, frame.changing, 0.0, 0.0)
         own = np.diagonal(cov, axis1=1, axis2=2)[:, 1:][:, seen]
         ambient = (state[:, 0] + moved)[:, None]
         contact = state[:, 1 + seen]
@@ -234,7 +234,7 @@ class SmallArray:
         left_over = math.sqrt(float((left**2).mean())) if left.size else 0.0
         if not leap and known:
             frame.pace = (moved + shift) / max(self._behind, 1e-3)
-        return self._say(moved + shift, variance, frame.changing, leap, left_over)
+        return self._result(moved + shift, variance, frame.changing, leap, left_over)
 
     def _locate(
         self, away: FloatArray, chips: NDArray[np.intp], prior: FloatArray, noise: FloatArray
@@ -271,10 +271,10 @@ class SmallArray:
             pace *= 2 * TURNING_UT_PER_S / fast
         self._pace = pace
 
-    def _say(
+    def _result(
         self, shift: FloatArray, variance: FloatArray, changing: Bool, leap: float, left_over: float
-    ) -> Small:
-        return Small(
+    ) -> SmallEstimate:
+        return SmallEstimate(
             self._state[:, 0] + shift,
             np.sqrt(variance),
             self._free & ~changing,
@@ -308,7 +308,7 @@ class SmallArray:
             self._near |= self._free
         seen = np.flatnonzero(frame.healthy)
         if seen.size:
-            self._stir(frame, seen)
+            self._loosen(frame, seen)
             self._absorb(frame.target, seen)
         self._release(frame.healthy & ~changing)
         self._reinterpret(frame.healthy & ~changing)
@@ -340,7 +340,7 @@ class SmallArray:
         index = np.arange(1, self._n + 1)
         cov[:, index, index] += UNEVEN_CREEP_PER_S**2 * elapsed * contact**2
 
-    def _stir(self, frame: _Frame, seen: NDArray[np.intp]) -> None:
+    def _loosen(self, frame: _Frame, seen: NDArray[np.intp]) -> None:
         """Let loaded chips change while their readings deviate unevenly from the expected ones.
 
         A slowly growing contact changes each chip differently, the ambient field all alike.

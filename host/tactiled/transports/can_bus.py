@@ -53,6 +53,7 @@ TROUBLES = {
     Trouble.DENIED: PortDenied,
     Trouble.UNSUITABLE: PortUnsuitable,
 }
+"""Error class of each reason why a bus is unavailable."""
 
 
 class CanLink(Protocol):

@@ -57,7 +57,7 @@ def known_ports(limit: int = 8) -> str:
     if not devices:
         return "no serial port is plugged in"
     more = f" and {len(devices) - limit} more" if len(devices) > limit else ""
-    return f"ports there are: {', '.join(devices[:limit])}{more}"
+    return f"available ports: {', '.join(devices[:limit])}{more}"
 
 
 def holders(device: str) -> list[str]:

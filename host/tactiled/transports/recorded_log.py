@@ -36,6 +36,7 @@ SERIAL, CAN = 0, 1
 FD_BIT = 1 << 31
 ERROR_BIT = 1 << 29
 ID_MASK = ERROR_BIT - 1
+"""Bits of ``RawChunk.can_id``: FD frame, error frame, identifier."""
 
 
 def to_raw(chunk: Chunk, port: str, wall: WallClock) -> Any:

@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 USB_PREFIX = "usb:"
 PTY_MAJORS = range(136, 144)  # Linux devices.txt: UNIX98 pseudo-terminal slaves
 LOST_SLAVE = select.POLLHUP | select.POLLERR | select.POLLNVAL
+"""Poll events of a terminal whose other end is gone."""
 
 
 class SerialTransport:
@@ -244,7 +245,7 @@ def _check_is_port(device: str) -> None:
     except OSError as error:
         raise _explain(device, error.errno, error) from error
     if not stat.S_ISCHR(mode):
-        kind = "a folder" if stat.S_ISDIR(mode) else "no character device"
+        kind = "a folder" if stat.S_ISDIR(mode) else "a file"
         raise PortUnsuitable(f"{device} is {kind}, not a serial port", listing.known_ports())
 
 

@@ -89,7 +89,7 @@ class SlcanLink:
         self._told = BusState.ACTIVE
         try:
             self._open_channel()
-        except BaseException:
+        except BaseException:  # also Ctrl-C must not leave the port open
             self.port.close()
             raise
         self._last = monotonic_now()

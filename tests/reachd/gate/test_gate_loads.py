@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from reachd.gate.gate import SKIN_LATCH
-from reachd.gate.limits import felt
+from reachd.gate.limits import largest_skin_force
 from reachd.gate.settings import Check
 from reachd.interfaces import ZERO, Twist
 from tactile_core.geometry import Side
@@ -85,13 +85,13 @@ def test_load_jittering_about_its_limit_counts_once(rig: Callable) -> None:
 
 
 def test_felt_force_includes_its_uncertainty(make_touch: Callable) -> None:
-    assert felt(make_touch()) == 0.0
-    assert felt(make_touch(total_force=3.0, normal_force_bound=0.5)) == 3.5
+    assert largest_skin_force(make_touch()) == 0.0
+    assert largest_skin_force(make_touch(total_force=3.0, normal_force_bound=0.5)) == 3.5
     for unknown in (math.nan, math.inf, -1.0):
-        assert felt(make_touch(total_force=3.0, normal_force_bound=unknown)) == 6.0
-    assert felt(make_touch(total_force=1.0, normal_force_bound=0.0, peak_force=4.0,
+        assert largest_skin_force(make_touch(total_force=3.0, normal_force_bound=unknown)) == 6.0
+    assert largest_skin_force(make_touch(total_force=1.0, normal_force_bound=0.0, peak_force=4.0,
                            peak_force_bound=1.0)) == 5.0  # fmt: skip
-    assert felt(make_touch(total_force=-2.0, normal_force_bound=0.0)) == 0.0
+    assert largest_skin_force(make_touch(total_force=-2.0, normal_force_bound=0.0)) == 0.0
 
 
 SKIN = (*OFF, Check.TOUCH_RISING)

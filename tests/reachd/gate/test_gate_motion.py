@@ -206,7 +206,7 @@ def test_reset_pose_is_not_motion(rig: Callable) -> None:
 def test_gaps_or_old_states_restart_the_motion_check(settings: Any, make_arm: Callable) -> None:
     watch = MotionWatch(settings)
     t0 = Instant(5_000_000_000)
-    watch.told(AHEAD, t0)
+    watch.add_command(AHEAD, t0)
     assert watch.judge(make_arm(t0)) == ()
     bad = make_arm(after(t0, 0.01), twist=Twist(1.0, 0.0, 0.0))
     assert [c for c, _ in watch.judge(bad)] == [Check.ARM_SPEED]
@@ -222,18 +222,18 @@ def test_command_history_is_kept_and_cleared_on_backward_time(
 ) -> None:
     watch = MotionWatch(settings)
     t0 = Instant(5_000_000_000)
-    assert watch.first_after(t0) is None
+    assert watch.first_command_after(t0) is None
     x = -0.2
     for k in range(3000):
         now = Instant(t0 + k * 10 * MS)
-        watch.told(AHEAD if k % 2000 < 1000 else Twist(-0.04, 0.0, 0.0), now)
+        watch.add_command(AHEAD if k % 2000 < 1000 else Twist(-0.04, 0.0, 0.0), now)
         x += 0.0004 if k % 2000 < 1000 else -0.0004
         assert watch.judge(make_arm(Instant(now + 10 * MS), x=x)) == ()
-    assert watch.first_after(Instant(now - 15 * MS)) == now - 10 * MS
-    assert watch.first_after(now) is None
-    watch.told(AHEAD, t0)
-    assert watch.first_after(Instant(t0 - 1)) == t0
-    assert watch.first_after(t0) is None
+    assert watch.first_command_after(Instant(now - 15 * MS)) == now - 10 * MS
+    assert watch.first_command_after(now) is None
+    watch.add_command(AHEAD, t0)
+    assert watch.first_command_after(Instant(t0 - 1)) == t0
+    assert watch.first_command_after(t0) is None
 
 
 def test_command_without_successor_expired(settings: Any, make_arm: Callable) -> None:
@@ -243,7 +243,7 @@ def test_command_without_successor_expired(settings: Any, make_arm: Callable) ->
         t0 = Instant(5_000_000_000)
         x = 0.0
         for k in range(30):
-            watch.told(AHEAD, Instant(t0 + k * 10 * MS))
+            watch.add_command(AHEAD, Instant(t0 + k * 10 * MS))
             watch.judge(make_arm(Instant(t0 + (k + 1) * 10 * MS), x=x + 0.0004))
             x += 0.0004
         seen: tuple = ()
@@ -311,7 +311,7 @@ def test_an_arm_that_falls_short_does_not_drift(settings: Any, make_arm: Callabl
     t0 = Instant(5_000_000_000)
     x = 0.0
     for k in range(400):
-        watch.told(AHEAD, Instant(t0 + k * 10 * MS))
+        watch.add_command(AHEAD, Instant(t0 + k * 10 * MS))
         x += 0.0 if k % 4 == 0 else 0.0004
         assert watch.judge(make_arm(Instant(t0 + (k + 1) * 10 * MS), x=x)) == ()
     x -= 0.0004
@@ -360,5 +360,5 @@ def test_what_was_not_told_for_a_second_is_no_drift(settings: Any, make_arm: Cal
     t0 = Instant(5_000_000_000)
     for k in range(150):
         if k >= 140:
-            watch.told(ZERO, Instant(t0 + k * 10 * MS))
+            watch.add_command(ZERO, Instant(t0 + k * 10 * MS))
         assert watch.judge(make_arm(Instant(t0 + k * 10 * MS), x=min(k, 125) * 1e-4)) == ()
