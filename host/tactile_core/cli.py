@@ -65,6 +65,7 @@ EXTRAS: Final[Mapping[str, str]] = {
     "sklearn": "calibrate",
     "jinja2": "experiments",
     "cryptography": "keys",
+    "numba": "train",
     "pymunk": "crosscheck",
     "pybullet": "reference",
     "distributed": "dask",

@@ -12,16 +12,20 @@ if TYPE_CHECKING:
     from sim_device.world.parameters import WorldParameters
     from sim_device.world.scenes import Scene
 
-Engine = Literal["mujoco", "pymunk", "pybullet"]
+Engine = Literal["mujoco", "planar", "pymunk", "pybullet"]
 
 ENGINES: Final[tuple[Engine, ...]] = get_args(Engine)
 """Names of the engines; published figures come from the first."""
 
 _CLASSES: Final[dict[str, str]] = {
     "mujoco": "MujocoWorld",
+    "planar": "PlanarWorld",
     "pymunk": "PymunkWorld",
     "pybullet": "PybulletWorld",
 }
+_LIBRARIES: Final[dict[str, str]] = {"planar": "numba"}
+"""Library that an engine needs, where that is not called as the engine is."""
+
 EngineMissing = MissingExtraError
 """The requested engine is not installed; the message says how to install it."""
 
@@ -38,7 +42,8 @@ def world_maker(engine: str) -> WorldMaker:
     """Builder of worlds in ``engine``; `EngineMissing`, or ValueError for an unknown name."""
     if engine not in _CLASSES:
         raise ValueError(f"unknown engine {engine!r}; available: {', '.join(ENGINES)}")
-    require(engine, extra=EXTRAS[engine], what=f"engine {engine!r}")
+    library = _LIBRARIES.get(engine, engine)
+    require(library, extra=EXTRAS[library], what=f"engine {engine!r}")
     module: Any = import_module(f"sim_device.world.{engine}_world")
     return cast("WorldMaker", getattr(module, _CLASSES[engine]))
 

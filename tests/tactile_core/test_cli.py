@@ -42,7 +42,7 @@ MEANINGS = {
     "--config": {"FILE"},
     "--depth": {"contacts, taxels"},
     "--duration": {"S"},
-    "--engine": {"mujoco, pymunk, pybullet"},
+    "--engine": {"mujoco, planar, pymunk, pybullet"},
     "--force": {"flag"},
     "--format": {"png, pdf, svg", "csv, parquet, npz, lerobot"},
     "--from": {"TIME"},
@@ -85,6 +85,7 @@ MAINS = {
 SLOW = (
     "numpy", "zenoh", "mcap", "msgspec", "rich", "can", "serial", "rosbags", "zstandard", "mujoco",
     "matplotlib", "scipy", "sklearn", "pyarrow", "jinja2", "cryptography", "psutil",
+    "numba",
 )  # fmt: skip
 """Modules that no command may import for --help."""
 

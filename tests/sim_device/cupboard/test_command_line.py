@@ -74,8 +74,10 @@ def test_system_errors_are_distinguished_from_bad_input(
         taken.listen()
         port = taken.getsockname()[1]
         monkeypatch.setitem(sys.modules, "pymunk", None)
+        monkeypatch.setitem(sys.modules, "numba", None)
         for arguments, code, said in (
             (["--engine", "pymunk"], 2, "pip install 'tactile-reach[crosscheck]'"),
+            (["--engine", "planar"], 2, "pip install 'tactile-reach[train]'"),
             (["--listen", f"tcp/127.0.0.1:{port}"], 3, "is in use: another arm runs"),
             (["--listen", "tcp/0.0.0.0:1"], 3, "leaves this machine unprotected"),
         ):

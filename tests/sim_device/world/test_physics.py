@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from sim_device.world.base import WALL, World, WorldError
+from sim_device.world.engines import EngineMissing, world_maker
 from sim_device.world.mujoco_model import mean_lever
 from sim_device.world.mujoco_world import MujocoWorld
 from sim_device.world.parameters import WORLD_PARAMETERS, world_parameters
@@ -156,9 +157,15 @@ def test_untouched_objects_stay_in_place(engine: Engine) -> None:
     assert world.contacts() == ()
 
 
-def test_same_commands_same_bits() -> None:
+@pytest.mark.parametrize("name", ["mujoco", "planar"])
+def test_same_commands_same_bits(name: str) -> None:
+    try:
+        engine = world_maker(name)
+    except EngineMissing as missing:
+        pytest.skip(str(missing))
+
     def trial() -> bytes:
-        world = MujocoWorld(authors_sim(11))
+        world = engine(authors_sim(11))
         heard = []
         for cycle in range(600):
             world.step(0.01, Twist(0.05, 0.02 * math.sin(cycle / 20), 0.1 * math.cos(cycle / 30)))

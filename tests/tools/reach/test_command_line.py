@@ -23,7 +23,7 @@ BAD = [
     (["--trial-seed", "1e3"], "allowed: a whole number from 0"),
     (["--set", "mine"], "available: hardware, authors_sim"),
     (["--depth", "skin"], "allowed: contacts, taxels"),
-    (["--engine", "bullet"], "allowed: mujoco, pymunk"),
+    (["--engine", "bullet"], "allowed: mujoco, planar, pymunk"),
     (["--png", "x.png"], "give --log as well"),
     (["--log", "x.mcap", "--png", "nowhere/x.png"], "there is no folder nowhere"),
 ]

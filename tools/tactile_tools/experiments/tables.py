@@ -18,6 +18,7 @@ GROUP = ("set", "engine", "depth")
 
 _WORDS = {
     "mujoco": "MuJoCo",
+    "planar": "the planar engine",
     "pymunk": "Chipmunk",
     "pybullet": "Bullet",
     "contacts": "exact contacts",
