@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
+from sim_device.world.engines import ENGINES
 from tactile_core.cli import (
     Command,
     Parser,
@@ -18,6 +19,7 @@ from tactile_core.cli import (
     add_out,
     add_path,
     add_seeds,
+    add_strategies,
     checked,
     count,
     hertz,
@@ -98,6 +100,10 @@ COMMANDS: Final = {
     "fidelity": Command(
         "compare our engine with the authors' recorded outcomes",
         f"{HERE}:_fill_fidelity",
+    ),
+    "crosscheck": Command(
+        "compare an engine with another, trial by trial on the same scenes",
+        f"{HERE}:_fill_crosscheck",
     ),
     "fuzz": Command("corrupt frames and check that none is accepted wrongly", f"{HERE}:_fill_fuzz"),
     "crash": Command(
@@ -581,6 +587,47 @@ def _fill_fidelity(parser: Parser) -> None:
     add_jobs(parser)
     add_report(parser)
     parser.set_defaults(func=later("tactile_tools.dev.fidelity:run"))
+
+
+def _fill_crosscheck(parser: Parser) -> None:
+    parser.description = (
+        "Runs strategies in the same scenes in two engines, and in the second once more with the "
+        "start moved by 0.1 mm: how often outcomes agree, beside how often chance lets them. "
+        "Ctrl-C ends it with what has been run."
+    )
+    parser.add_argument(
+        "--engine",
+        choices=ENGINES,
+        default="planar",
+        help="engine to judge (default %(default)s)",
+    )
+    parser.add_argument(
+        "--beside",
+        choices=ENGINES,
+        default=ENGINES[0],
+        help="engine to judge it by (default %(default)s)",
+    )
+    parser.add_argument(
+        "--scene",
+        default="authors_sim",
+        metavar="SCENES",
+        help="a set of scenes by name, as for `tactile reach` (default %(default)s)",
+    )
+    parser.add_argument(
+        "--scenes", type=count, default=100, metavar="N", help="how many (default %(default)s)"
+    )
+    parser.add_argument(
+        "--from-seed",
+        type=natural,
+        default=1,
+        metavar="N",
+        help="seed of the first, the others follow (default %(default)s)",
+    )
+    add_strategies(parser, "strategies to run (default: all five)")
+    add_depth(parser)
+    add_jobs(parser)
+    add_report(parser)
+    parser.set_defaults(func=later("tactile_tools.dev.crosscheck:run"))
 
 
 def _fill_fuzz(parser: Parser) -> None:

@@ -7,6 +7,7 @@ import json
 import math
 import multiprocessing
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -45,7 +46,11 @@ PERTURBATION_M = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One trial: scene, strategy, and how it was perturbed (0: not at all)."""
+    """One trial: scene, strategy, and how it was perturbed (0: not at all).
+
+    ``peak_load``, ``mean_load``: summed normal forces on the finger, N. ``simulated_s``, ``cpu_s``:
+    its length, and what it took.
+    """
 
     seed: int
     strategy: str
@@ -56,6 +61,10 @@ class Trial:
     time: float
     excavations: int
     ejected: int
+    peak_load: float
+    mean_load: float
+    simulated_s: float
+    cpu_s: float
 
 
 def run(options: argparse.Namespace) -> int:
@@ -114,11 +123,20 @@ def outcomes_of(scenes: Path) -> Path:
 
 def _trial(task: tuple[Scene, str, int], engine: str, depth: str) -> Trial:
     scene, strategy, repeat = task
-    if repeat:
-        rng = np.random.default_rng([scene.seed, repeat])
+    return run_one(scene, strategy, engine, depth, repeat)
+
+
+def run_one(scene: Scene, strategy: str, engine: str, depth: str, perturbed: int = 0) -> Trial:
+    """Run one trial, the start moved across the cupboard unless ``perturbed`` is 0.
+
+    By `PERTURBATION_M` times a normal number that ``perturbed`` and the scene determine.
+    """
+    if perturbed:
+        rng = np.random.default_rng([scene.seed, perturbed])
         start = scene.start
         moved = Pose(start.x, start.y + PERTURBATION_M * rng.standard_normal(), start.heading)
         scene = replace(scene, start=moved)
+    began = time.process_time()
     result = run_trial(
         scene,
         strategy,
@@ -131,13 +149,17 @@ def _trial(task: tuple[Scene, str, int], engine: str, depth: str) -> Trial:
     return Trial(
         seed=scene.seed,
         strategy=strategy,
-        perturbed=repeat,
+        perturbed=perturbed,
         success=o.success,
         entered=result.entered,
         distance=o.distance,
         time=o.time,
         excavations=len(o.excavations),
         ejected=result.ejected,
+        peak_load=round(result.peak_load, 3),
+        mean_load=round(result.mean_load, 3),
+        simulated_s=round(result.simulated_s, 3),
+        cpu_s=round(time.process_time() - began, 4),
     )
 
 
