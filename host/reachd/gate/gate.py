@@ -119,6 +119,7 @@ class SafetyGate:
         self._hard = 0  # overloaded states in a row
         self._beyond = False  # whether load passed its limit and has not fallen below soft since
         self._seen: deque[tuple[Instant, bool]] = deque()  # whether touch was valid up to then
+        self._without = 0  # of these, how many without valid touch
         self._touched: Touch | None = None  # the newest usable touch
         self._rising = 0.0  # rate at which the force on the skin grew at that touch, N/s
         self._loaded_at: Instant | None = None  # capture of the newest state
@@ -345,10 +346,15 @@ class SafetyGate:
         if seen and now <= seen[-1][0]:
             if now < seen[-1][0]:
                 seen.clear()
+                self._without = 0
             return
-        seen.append((now, touch is not None and usable(touch)))
+        good = touch is not None and usable(touch)
+        seen.append((now, good))
+        self._without += not good
         while seconds_between(seen[0][0], now) > SPARSE_OVER:
-            seen.popleft()
+            self._without -= not seen.popleft()[1]
+        if not self._without:
+            return
         without, before = 0.0, seen[0][0]
         for at, good in seen:
             without += 0.0 if good else seconds_between(before, at)

@@ -84,7 +84,7 @@ KEPT = 512
 
 Finding = tuple[Check, str]
 Path = tuple[float, float, float, float, float]
-"""x, y m; heading rad; path length m; total turning rad: integrals of commands."""
+"""x, y m; heading rad; path length m; total turning rad: integrals of commands, or their rates."""
 
 
 class MotionWatch:
@@ -95,7 +95,7 @@ class MotionWatch:
         self._long_ns = round(settings.frozen_after * NS_PER_S)
         self._longest_ns = round(settings.command_expiry * NS_PER_S)
         self._told_at: list[Instant] = []
-        self._told: list[Twist] = []
+        self._told: list[Path] = []  # vx, vy, omega; speed, turn rate
         self._path: list[Path] = []  # commanded path up to the instant of the same index
         self._seen_at: list[Instant] = []
         self._seen: list[ArmState] = []
@@ -112,7 +112,8 @@ class MotionWatch:
         else:
             self._path.append(self._path_until(len(self._told_at) - 1, at))
         self._told_at.append(at)
-        self._told.append(twist)
+        speed = math.hypot(twist.vx, twist.vy)
+        self._told.append((twist.vx, twist.vy, twist.omega, speed, abs(twist.omega)))
         if len(self._told_at) > 2 * KEPT:
             del self._told_at[:KEPT], self._told[:KEPT], self._path[:KEPT]
 
@@ -153,7 +154,7 @@ class MotionWatch:
         elif self._free_since is None:
             self._free_since = at
         found = [self._speed(arm), self._tracking(arm) or self._drift(arm), self._disagreement(arm)]
-        self._found = tuple(one for one in found if one is not None)
+        self._found = tuple([one for one in found if one is not None])
         return self._found
 
     def _jumped(self, arm: ArmState) -> bool:
@@ -164,23 +165,18 @@ class MotionWatch:
     def _path_until(self, index: int, at: Instant) -> Path:
         """Commanded path up to ``at``; ``index``: newest command before it."""
         x, y, h, length, turned = self._path[index]
-        twist = self._told[index]
-        dt = min(at - self._told_at[index], self._longest_ns) / NS_PER_S
-        return (
-            x + twist.vx * dt,
-            y + twist.vy * dt,
-            h + twist.omega * dt,
-            length + math.hypot(twist.vx, twist.vy) * dt,
-            turned + abs(twist.omega) * dt,
-        )
+        vx, vy, omega, speed, turning = self._told[index]
+        passed = at - self._told_at[index]
+        # Not min(), whose call costs more than the rest.
+        dt = (passed if passed < self._longest_ns else self._longest_ns) / NS_PER_S
+        return x + vx * dt, y + vy * dt, h + omega * dt, length + speed * dt, turned + turning * dt
 
     def _commanded_path(self, begin: Instant, end: Instant) -> Path:
         """Path commanded between two instants; none before the first command."""
-        ends = []
-        for at in (begin, end):
-            index = bisect_right(self._told_at, at) - 1
-            ends.append(self._path_until(index, at) if index >= 0 else self._path[0])
-        (x0, y0, h0, l0, t0), (x1, y1, h1, l1, t1) = ends
+        first = bisect_right(self._told_at, begin) - 1
+        last = bisect_right(self._told_at, end) - 1
+        x0, y0, h0, l0, t0 = self._path_until(first, begin) if first >= 0 else self._path[0]
+        x1, y1, h1, l1, t1 = self._path_until(last, end) if last >= 0 else self._path[0]
         return x1 - x0, y1 - y0, h1 - h0, l1 - l0, t1 - t0
 
     def _before(self, at: Instant, window_ns: int) -> int | None:
@@ -278,10 +274,10 @@ class MotionWatch:
         """Whether the arm was at its own limits at a state from ``index`` on."""
         s = self._s
         force, torque = AT_ITS_LIMIT * s.arm_f_max, AT_ITS_LIMIT * s.arm_m_max
-        return any(
-            abs(a.fx) >= force or abs(a.fy) >= force or abs(a.mz) >= torque
-            for a in self._seen[index:]
-        )
+        for a in self._seen[index:]:  # in every cycle of a jam: any() costs three times as much
+            if abs(a.fx) >= force or abs(a.fy) >= force or abs(a.mz) >= torque:
+                return True
+        return False
 
     def _disagreement(self, arm: ArmState) -> Finding | None:
         """Check for another path than commanded, over a longer window, that no load explains."""
@@ -349,17 +345,17 @@ class MotionWatch:
         mx, my, mh = self._motion_since(since, last)
         if ux or uy:
             dx, dy = moved[0] - ux * length, moved[1] - uy * length
-            pushed = sum(a.fx * dx + a.fy * dy for a in states) / (n * math.hypot(dx, dy))
+            pushed = sum([a.fx * dx + a.fy * dy for a in states]) / (n * math.hypot(dx, dy))
             aside = pushed >= s.free_air_force
             went, moves = moved[0] * ux + moved[1] * uy, mx * ux + my * uy
-            reported = sum(a.twist.vx * ux + a.twist.vy * uy for a in lately) / len(lately)
+            reported = sum([a.twist.vx * ux + a.twist.vy * uy for a in lately]) / len(lately)
             words = f"{length * 1e3:.1f} mm", f"{went * 1e3:.1f}"
         else:
             sign = math.copysign(1.0, length)
-            pushed = math.copysign(1.0, moved[2] - length) * sum(a.mz for a in states) / n
+            pushed = math.copysign(1.0, moved[2] - length) * sum([a.mz for a in states]) / n
             aside = pushed >= s.free_air_torque
             went, moves, length = moved[2] * sign, mh * sign, abs(length)
-            reported = sign * sum(a.twist.omega for a in lately) / len(lately)
+            reported = sign * sum([a.twist.omega for a in lately]) / len(lately)
             words = f"{math.degrees(length):.2f}°", f"{math.degrees(went):.2f}"
         pace = length / seconds
         dead = abs(moves) < DEAD * pace * TRACK_NS / NS_PER_S
@@ -367,8 +363,8 @@ class MotionWatch:
             # Held back by anything that presses on the finger, which may be wedged in any
             # direction; or held back for a part of the window and now free.
             explained = any(
-                sum(math.hypot(a.fx, a.fy) for a in some) >= s.free_air_force * len(some)
-                or sum(abs(a.mz) for a in some) >= s.free_air_torque * len(some)
+                sum([math.hypot(a.fx, a.fy) for a in some]) >= s.free_air_force * len(some)
+                or sum([abs(a.mz) for a in some]) >= s.free_air_torque * len(some)
                 for some in (states, lately)
             )
         else:
