@@ -7,13 +7,14 @@ not name gives stamps far from now, which the gate refuses. When in doubt, the a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from enum import Enum, auto
 from typing import Any, Generic, TypeVar
 
 import zenoh
 
-from reachd.interfaces import ArmState, Touch, Twist
+from reachd.interfaces import ArmState, Patch, Touch, Twist, Wrench, planar_patch
 from tactile_core.bus.messages import DecodeError, codec
 from tactile_core.bus.streams import BusSample, Latest, Tap, latest
 from tactile_core.bus.topics import FEATURES, Topic
@@ -138,8 +139,17 @@ class Input(Generic[T]):
         return self._clock.here(stamp, now)
 
 
+MAX_PATCHES = 64
+"""Patches in a message of features; tactiled sends no more."""
+
+
 def make_touch(message: Any, captured: Instant, received: Instant) -> Touch:
-    """Convert ``ContactFeatures`` for strategies; ValueError for an unknown side."""
+    """Convert ``ContactFeatures`` for strategies.
+
+    ValueError for an unknown side, for more than `MAX_PATCHES` patches and, where the features are
+    valid, for a patch that is not finite.
+    """
+    force, torque = message.wrench.force, message.wrench.torque
     return Touch(
         captured=captured,
         received=received,
@@ -152,7 +162,32 @@ def make_touch(message: Any, captured: Instant, received: Instant) -> Touch:
         tip_force=float(message.tip_force),
         peak_force_bound=float(message.peak_force_bound),
         normal_force_bound=float(message.normal_force_bound),
+        tip_force_bound=float(message.tip_force_bound),
+        tip_contact_time=float(message.tip_contact_time),
+        wrench=Wrench(float(force.x), float(force.y), float(torque.z)),
+        patches=_patches(message) if message.valid else (),
     )
+
+
+def _patches(message: Any) -> tuple[Patch, ...]:
+    """The patches of a message that is valid, strongest first; ValueError."""
+    if len(message.patches) > MAX_PATCHES:
+        raise ValueError(f"{len(message.patches)} patches; at most {MAX_PATCHES} are sent")
+    patches = []
+    for felt in message.patches:
+        patch = planar_patch(
+            (float(felt.centroid.x), float(felt.centroid.y)),
+            (float(felt.normal.x), float(felt.normal.y)),
+            float(felt.normal_force),
+            (float(felt.force.x), float(felt.force.y)),
+            Side(felt.side),
+            float(felt.normal_force_bound),
+        )
+        if not math.isfinite(patch.x + patch.y + patch.normal_force + patch.shear_force):
+            raise ValueError("a patch is not finite")
+        patches.append(patch)
+    patches.sort(key=lambda patch: -patch.normal_force)
+    return tuple(patches)
 
 
 def make_arm_state(

@@ -1,8 +1,9 @@
-"""What a strategy sees and says: the seam between touch, arm, strategy and safety gate.
+"""Types between touch, arm, strategy and safety gate: what a strategy is given, what it returns.
 
-Planar quantities are in the cupboard's frame ``cupboard``: origin at the middle of its front
-edge, x into the cupboard, y left, angles counter-clockwise from x. (The paper's axes are x right,
-y forward, angles from y: x_here = y_paper, y_here = −x_paper.)
+Frames. ``cupboard``: origin at the middle of the cupboard's front edge, x into the cupboard, y to
+the left, angles counter-clockwise from x. ``ee``: origin at the wrist pivot, x along the finger
+towards its tip, y to the left. Everything is planar. (The paper's axes are x right, y forward,
+angles from y: x_here = y_paper, y_here = −x_paper.)
 """
 
 from __future__ import annotations
@@ -14,16 +15,99 @@ from typing import Protocol
 from tactile_core.geometry import Side
 from tactile_core.types import ZERO, ArmState, Instant, Twist, record
 
-__all__ = ["ZERO", "ArmState", "Goal", "Strategy", "Touch", "Twist"]
+__all__ = [
+    "ZERO",
+    "ArmState",
+    "Goal",
+    "Patch",
+    "Strategy",
+    "Touch",
+    "Twist",
+    "Wrench",
+    "arm_wrench",
+]
+
+
+@record
+class Wrench:
+    """Force (N, N) and moment about the wrist pivot (N·m) on the end-effector, in ``ee``."""
+
+    fx: float
+    fy: float
+    mz: float
+
+
+NO_WRENCH = Wrench(0.0, 0.0, 0.0)
+
+
+@record
+class Patch:
+    """One place where something presses on the skin, in ``ee``.
+
+    ``x``, ``y``: m, the centre of pressure. ``normal_x``, ``normal_y``: unit vector out of the skin
+    there. ``normal_force``: N, positive when pressed. ``shear_force``: N along the skin, positive
+    90° counter-clockwise of the normal. ``bound``: N; in 95 % of cycles the true normal force is
+    within this of ``normal_force``: 0 where an engine's contacts are felt as they are, NaN for
+    unknown.
+    """
+
+    x: float
+    y: float
+    normal_x: float
+    normal_y: float
+    normal_force: float
+    shear_force: float
+    side: Side
+    bound: float = math.nan
+
+    @property
+    def force_x(self) -> float:
+        """N along x of ``ee``: what presses exerts this on the finger, friction included."""
+        return -self.normal_force * self.normal_x - self.shear_force * self.normal_y
+
+    @property
+    def force_y(self) -> float:
+        """N along y of ``ee``."""
+        return -self.normal_force * self.normal_y + self.shear_force * self.normal_x
+
+
+def planar_patch(
+    place: tuple[float, float],
+    normal: tuple[float, float],
+    normal_force: float,
+    force: tuple[float, float],
+    side: Side,
+    bound: float,
+) -> Patch:
+    """`Patch` of a skin in space. x and y in ``ee`` of its place (m), normal and force (N).
+
+    A normal may lean up or down: its direction in the plane counts. Where it has none the patch's
+    normal and shear are 0.
+    """
+    nx, ny = normal
+    length = math.hypot(nx, ny)
+    nx, ny = (nx / length, ny / length) if length > 0.0 else (0.0, 0.0)
+    x, y = place
+    fx, fy = force
+    return Patch(x, y, nx, ny, normal_force, fy * nx - fx * ny, side, bound)
 
 
 @record
 class Touch:
-    """The contact features a strategy may use; see ``ContactFeatures.msg``.
+    """What is felt: the contact features of one cycle; see ``ContactFeatures.msg``.
 
-    Forces in N, ``peak_x``/``peak_y`` in m in ``ee``. ``total_force``: sum of normal forces over
-    the skin. ``tip_force``: sum of normal forces at the tip. Bounds: N by which the true force may
-    differ, in 95 % of cycles, from ``peak_force`` and from ``total_force``; NaN for unknown.
+    ``captured``, ``received``: when the skin was sampled and when this was received. While
+    ``valid`` is false no other field means anything: it does not mean that nothing is touched.
+
+    ``peak_force`` (N), ``peak_side``, ``peak_x``, ``peak_y`` (m, ``ee``): the strongest contact.
+    ``total_force``: N, sum of normal forces over the skin. ``tip_force``: N, the same at the tip.
+    Bounds: N by which the true force may differ, in 95 % of cycles, from ``peak_force``,
+    ``total_force`` and ``tip_force``; NaN for unknown. ``tip_contact_time``: s that the tip has
+    been in light contact without a break.
+
+    ``patches``: the contacts, strongest first. ``wrench``: sum of all contacts as the skin feels
+    it. What the arm feels at its wrist is in `ArmState`, with stamps of its own; `arm_wrench` turns
+    it into the same frame.
     """
 
     captured: Instant
@@ -37,6 +121,16 @@ class Touch:
     tip_force: float
     peak_force_bound: float = math.nan
     normal_force_bound: float = math.nan
+    tip_force_bound: float = math.nan
+    tip_contact_time: float = 0.0
+    wrench: Wrench = NO_WRENCH
+    patches: tuple[Patch, ...] = ()
+
+
+def arm_wrench(arm: ArmState) -> Wrench:
+    """The wrench that the arm reports, turned from ``cupboard`` to ``ee``."""
+    c, s = math.cos(arm.heading), math.sin(arm.heading)
+    return Wrench(c * arm.fx + s * arm.fy, c * arm.fy - s * arm.fx, arm.mz)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,5 +156,5 @@ class Strategy(Protocol):
 
     @property
     def activity(self) -> str:
-        """What it does: "straight", "burrow", "excavate_cw", "excavate_ccw" or its own word."""
+        """What it is doing now: "straight", "burrow", "excavate_cw", … or a word of its own."""
         ...

@@ -31,6 +31,8 @@ class Patch:
     """One cluster of neighbouring taxels in contact.
 
     ``force``: (3,) N in ``ee``. ``centroid``: (3,) m in ``ee``, weighted by normal force.
+    ``normal``: unit vector out of the skin in ``ee``. ``normal_force_bound``: N; in 95 % of cycles
+    the true normal force is within this. Both are NaN in logs of versions that did not have them.
     """
 
     array: int
@@ -40,6 +42,8 @@ class Patch:
     peak_force: float
     force: tuple[float, float, float]
     centroid: tuple[float, float, float]
+    normal: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    normal_force_bound: float = math.nan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,6 +241,7 @@ def _planar(twist: Any) -> tuple[float, float, float]:
 
 
 def _patch(message: Any) -> Patch:
+    told = hasattr(message, "normal")
     return Patch(
         message.array,
         SIDES.get(message.side, "none"),
@@ -245,6 +250,8 @@ def _patch(message: Any) -> Patch:
         message.peak_force,
         _triple(message.force),
         _triple(message.centroid),
+        _triple(message.normal) if told else (math.nan, math.nan, math.nan),
+        message.normal_force_bound if told else math.nan,
     )
 
 

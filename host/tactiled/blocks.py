@@ -116,7 +116,11 @@ class Reason(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patch:
-    """Neighbouring taxels in contact; see ``ContactPatch.msg``. N and m; vectors (3,) in ``ee``."""
+    """Neighbouring taxels in contact; see ``ContactPatch.msg``. N and m; vectors (3,) in ``ee``.
+
+    ``normal``: unit vector out of the skin. ``bound``: N; in 95 % of cycles the true normal force
+    is within this of ``normal_force``.
+    """
 
     array: int
     side: Side
@@ -125,6 +129,8 @@ class Patch:
     peak_force: float
     force: FloatArray
     centroid: FloatArray
+    normal: FloatArray
+    bound: float = math.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)

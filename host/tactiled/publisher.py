@@ -175,6 +175,8 @@ def _patch(patch: Patch) -> Any:
         peak_force=patch.peak_force,
         force=MSG.Vector3(*patch.force.tolist()),
         centroid=MSG.Point(*patch.centroid.tolist()),
+        normal=MSG.Vector3(*patch.normal.tolist()),
+        normal_force_bound=patch.bound,
     )
 
 

@@ -32,7 +32,7 @@ def example_messages() -> dict[topics.Topic, Any]:
         topics.FEATURES: MSG.ContactFeatures(
             head, 11, 12, 0.5, 7, True, ["tare", "few taxels"], True, 1.5, 2, point, 3.5,
             MSG.Wrench(vector, vector), 0.75, 0.25, 3, 4,
-            [MSG.ContactPatch(1, 2, 3, 1.5, 0.5, vector, point)],
+            [MSG.ContactPatch(1, 2, 3, 1.5, 0.5, vector, point, vector, 0.5)],
             ["taring", "few:tip"], 0.5, 0.25, 0.125,
         ),
         topics.FORCES: MSG.TaxelForces(

@@ -24,7 +24,8 @@ SLOW_S = 60.0
 
 def features(sequence: int, normal: float = 1.5) -> bytes:
     zero, here = MSG.Vector3(0.0, 0.0, 0.0), MSG.Point(0.1, 0.2, 0.3)
-    patch = MSG.ContactPatch(0, 3, 2, 0.9, 0.6, MSG.Vector3(-0.9, 0.0, 1.2), here)
+    out = MSG.Vector3(1.0, 0.0, 0.0)
+    patch = MSG.ContactPatch(0, 3, 2, 0.9, 0.6, MSG.Vector3(-0.9, 0.0, 1.2), here, out, 0.25)
     message = MSG.ContactFeatures(
         header=header(5_000_000_007, "ee"), captured_ns=9, received_ns=10, uncertainty=0.0,
         sequence=sequence, valid=False, reasons=["taring"], calibrated=True, peak_force=1.0,
@@ -95,6 +96,7 @@ def test_values_match_the_message(daemon: Daemon, bus: tr.Bus) -> None:
     assert f.wall_ns == 5_000_000_007
     assert f.patches[0].side == "tip"
     assert f.patches[0].centroid == (0.1, 0.2, 0.3)
+    assert (f.patches[0].normal, f.patches[0].normal_force_bound) == ((1.0, 0.0, 0.0), 0.25)
     assert f.shear_force == pytest.approx(1.2)
 
 

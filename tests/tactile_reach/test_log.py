@@ -24,8 +24,8 @@ def features(sequence: int, normal: float, patches: int = 0):
         peak_position=here, normal_force=normal,
         wrench=MSG.Wrench(MSG.Vector3(1.0, 2.0, 3.0), zero),
         tip_force=0.0, tip_contact_time=0.0, taxels_in_contact=0, taxels_masked=0,
-        patches=[MSG.ContactPatch(0, 1, 1, normal, normal, zero, here)] * patches, reason_codes=[],
-        peak_force_bound=0.1, normal_force_bound=0.1, tip_force_bound=0.1,
+        patches=[MSG.ContactPatch(0, 1, 1, normal, normal, zero, here, zero, 0.1)] * patches,
+        reason_codes=[], peak_force_bound=0.1, normal_force_bound=0.1, tip_force_bound=0.1,
     )  # fmt: skip
 
 

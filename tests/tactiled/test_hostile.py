@@ -302,7 +302,9 @@ def test_excess_patches_are_cut_to_the_strongest_and_counted() -> None:
     assert maker is not None
     assert cycle is not None
     zero = np.zeros(3)
-    patches = tuple(Patch(0, Side.TIP, 1, float(n), float(n), zero, zero) for n in range(1024))
+    patches = tuple(
+        Patch(0, Side.TIP, 1, float(n), float(n), zero, zero, zero) for n in range(1024)
+    )
     features = replace(cycle.features, patches=patches)
     message = maker.features(replace(cycle, features=features))
     assert len(codec().encode(FEATURES, message)) < MAX_PAYLOAD

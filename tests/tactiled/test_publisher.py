@@ -45,7 +45,15 @@ def cycle(instant: Callable[[float], Instant]) -> Cycle:
         taxels_masked=16,
         patches=(
             Patch(
-                1, Side.RIGHT, 3, 4.0, 2.5, np.array([0.0, -4.0, 0.0]), np.array([0.1, 0.0, 0.0])
+                array=1,
+                side=Side.RIGHT,
+                taxels=3,
+                normal_force=4.0,
+                peak_force=2.5,
+                force=np.array([0.0, -4.0, 0.0]),
+                centroid=np.array([0.1, 0.0, 0.0]),
+                normal=np.array([0.0, -1.0, 0.0]),
+                bound=0.5,
             ),
         ),
         peak_force_bound=0.5,
@@ -102,6 +110,8 @@ def test_features_message_matches_the_pipeline(calibration: BoardCalibration, cy
     assert (seen.wrench.force.z, seen.wrench.torque.x) == (2.0, 3.0)
     assert seen.patches[0].taxels == 3
     assert seen.patches[0].force.y == -4.0
+    assert seen.patches[0].normal.y == -1.0
+    assert seen.patches[0].normal_force_bound == 0.5
 
 
 def test_forces_and_field_messages_match_the_pipeline(

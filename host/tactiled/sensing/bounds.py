@@ -98,6 +98,23 @@ class Bounds:
             variance += float((lost[:, 1:] ** 2).sum()) * float(estimate.slope_sigma[a]) ** 2
         return QUANTILE_95 * math.sqrt(variance)
 
+    def apart(self, patches: list[list[int]], estimate: Estimate, drift: FloatArray) -> list[float]:
+        """N, the additive bound of the summed normal force of each of ``patches``.
+
+        As `together`, for groups of taxels that are each of one array, all at once.
+        """
+        if not patches:
+            return []
+        every = [taxel for patch in patches for taxel in patch]
+        starts = np.cumsum([0, *map(len, patches[:-1])])
+        a = self._array[[patch[0] for patch in patches]]
+        lost = np.add.reduceat(self._slopes[every], starts, axis=0)
+        variance = np.add.reduceat(self._still[every] + drift[every] ** 2, starts)
+        variance += ((lost[:, :, 0] * estimate.sigma[a]) ** 2).sum(axis=1)
+        variance += (lost[:, :, 1:] ** 2).sum(axis=(1, 2)) * estimate.slope_sigma[a] ** 2
+        found: list[float] = (QUANTILE_95 * np.sqrt(variance)).tolist()
+        return found
+
     def implausible(self, force: FloatArray) -> float:
         """Force that no contact exerts, N: pulls, and shear beyond friction. ``force``: (N, 3) N.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -134,6 +136,7 @@ class FeatureExtractor:
         # (N, 6, 3): maps a taxel's force in its own axes to force and moment about the origin of ee
         turned = np.cross(position[:, :, None], rotation, axis=1)
         self._lever = np.concatenate([rotation, turned], axis=1)
+        self._outward = rotation[:, :, 2]  # (N, 3) unit normals of the taxels in ee
         self._place = np.concatenate([np.ones((len(position), 1)), position], axis=1)
         self._array = np.concatenate(
             [np.full(a.taxels, i) for i, a in enumerate(geometry.arrays)]
@@ -157,6 +160,8 @@ class FeatureExtractor:
         """Taxels whose normal forces were summed in the last cycle."""
         self.tip_summed: list[int] = []
         """Taxels of ``summed`` at the tip."""
+        self.patch_summed: list[list[int]] = []
+        """Taxels of ``summed`` in each patch."""
         self.peak_taxel = 0
         """Taxel of the peak force; 0 when nothing is in contact."""
 
@@ -213,7 +218,7 @@ class FeatureExtractor:
         else:
             self._threshold = self._certain
         if members.size == 0:
-            self.summed, self.tip_summed, self.peak_taxel = [], [], 0
+            self.summed, self.tip_summed, self.patch_summed, self.peak_taxel = [], [], [], 0
             tip_time = self._tip_time(0.0, tip_usable, captured)
             return Features(
                 valid, reasons, 0.0, Side.NONE, _ZERO3, 0.0, _ZERO6, 0.0, tip_time, 0, masked
@@ -241,10 +246,12 @@ class FeatureExtractor:
         # Positions are weighted over the core alone: noise in the ring would have a long lever.
         weights = core @ table[:, 6:]
         centroids = weights[:, 1:] / weights[:, :1]
-        patches = []
+        normals = core @ (self._outward[involved] * normal[involved, None])
+        patches_summed = []
         for g, (group, normal_force) in enumerate(zip(groups, sums[:, 6].tolist(), strict=True)):
             array = self._array[group[0]]
-            patches.append(
+            length = math.sqrt(float(normals[g] @ normals[g]))
+            found = (
                 Patch(
                     array=array,
                     side=self._side[array],
@@ -253,9 +260,14 @@ class FeatureExtractor:
                     peak_force=max(presses[row[taxel]] for taxel in group),
                     force=sums[g, :3],
                     centroid=centroids[g],
-                )
+                    normal=normals[g] / length if length > 0.0 else self._outward[group[0]],
+                ),
+                group + rings[g],
             )
-        patches.sort(key=lambda patch: -patch.normal_force)  # stable: then by first taxel
+            patches_summed.append(found)
+        patches_summed.sort(key=lambda found: -found[0].normal_force)  # stable: then by first taxel
+        patches = [patch for patch, _ in patches_summed]
+        self.patch_summed = [summed for _, summed in patches_summed]
         tip_force = sum((p.normal_force for p in patches if p.side is Side.TIP), 0.0)
         peak_force = max(presses)
         peak = taxels[presses.index(peak_force)]

@@ -621,8 +621,16 @@ class BoardPipeline:
         else:
             unseen *= BESIDE
         normal, tip = math.hypot(normal, unseen), math.hypot(tip, unseen)
+        alone = bounds.apart(extractor.patch_summed, estimate, self._drift)
+        patches = [
+            dataclasses.replace(
+                patch, bound=math.hypot(bound + odd, unseen) + bounds.scaled(patch.normal_force)
+            )
+            for patch, bound in zip(features.patches, alone, strict=True)
+        ]
         features = dataclasses.replace(
             features,
+            patches=tuple(patches),
             valid=valid,
             reasons=reasons,
             peak_force_bound=peak + bounds.scaled(features.peak_force),

@@ -71,6 +71,16 @@ def test_wrench_of_a_known_press_is_exact():
     (patch,) = features.patches
     assert (patch.array, patch.side, patch.taxels) == (0, Side.LEFT, 1)
     np.testing.assert_allclose(patch.force, in_ee, atol=1e-12)
+    np.testing.assert_allclose(patch.normal, [0, 1, 0], atol=1e-9)
+
+
+def test_normal_of_a_patch_round_the_tip_lies_between_those_of_its_taxels():
+    tip = [t for t in range(64, 80) if abs(POSITION[t][2] - POSITION[64][2]) < 1e-9]
+    pressed = tip[:2]
+    features = Feel()(presses(**{f"t{t}": 2.0 for t in pressed}))
+    (patch,) = features.patches
+    middle = ROTATION[pressed][:, :, 2].sum(axis=0)
+    np.testing.assert_allclose(patch.normal, middle / np.linalg.norm(middle), atol=1e-9)
 
 
 def test_press_between_taxels_is_located_between_them():

@@ -110,7 +110,7 @@ def recorded() -> Callable[..., Path]:
 
 def features(at: int, number: int) -> bytes:
     zero, point = MSG.Vector3(0.0, 0.0, 0.0), MSG.Point(0.125, 0.25, 0.0)
-    patch = MSG.ContactPatch(0, 1, 2, 1.5, 1.25, MSG.Vector3(0.0, -1.5, 0.0), point)
+    patch = MSG.ContactPatch(0, 1, 2, 1.5, 1.25, MSG.Vector3(0.0, -1.5, 0.0), point, zero, 0.1)
     message = MSG.ContactFeatures(
         header(at, "ee"), at, at + 500_000, 0.001, number, number % 10 != 0,
         ["taring"] if number % 10 == 0 else [], True, float(np.float32(number / 7)), 1, point, 1.5,

@@ -21,6 +21,7 @@ def features(sequence: int = 1, normal: float = 3.0, valid: bool = True, bound: 
     patch = MSG.ContactPatch(
         array=0, side=1, taxels=3, normal_force=normal, peak_force=normal,
         force=MSG.Vector3(0.0, -normal, 0.5), centroid=MSG.Point(0.1, 0.028, 0.0),
+        normal=MSG.Vector3(0.0, 1.0, 0.0), normal_force_bound=bound,
     )  # fmt: skip
     zero = MSG.Vector3(0.0, 0.0, 0.0)
     return MSG.ContactFeatures(

@@ -20,6 +20,7 @@ from sim_device.world.scenes import Scene
 from tactile_core.geometry import finger
 from tactile_core.types import Instant, after
 from tactile_tools.reach.touch_senses import ContactSense, TaxelSense
+from tactiled.sensing.bounds import QUANTILE_95
 from tactiled.sensing.pipeline import PipelineSettings
 
 BOARD_RATE_HZ = 25.0
@@ -104,7 +105,14 @@ class FingerStretch:
         """``touch`` of the finger as built, on the stretched one."""
         if self._stretch == 1.0:
             return touch
-        return replace(touch, peak_y=touch.peak_y * self._stretch)
+        wrench = touch.wrench
+        mz = sum(p.x * p.force_y - p.y * self._stretch * p.force_x for p in touch.patches)
+        return replace(
+            touch,
+            peak_y=touch.peak_y * self._stretch,
+            wrench=replace(wrench, mz=mz) if touch.patches else wrench,
+            patches=tuple([replace(p, y=p.y * self._stretch) for p in touch.patches]),
+        )
 
 
 class DegradedContacts:
@@ -122,6 +130,7 @@ class DegradedContacts:
     ) -> None:
         self._inner = ContactSense()
         self._rng = np.random.default_rng([seed, 3])
+        self._patch_rng = np.random.default_rng([seed, 5])
         self._noise = noise
         self._period = None if rate is None else 1.0 / rate
         self._due: Instant | None = None
@@ -161,13 +170,24 @@ class DegradedContacts:
         return tuple(felt)
 
     def _with_noise(self, touch: Touch) -> Touch:
-        """``touch`` with noise; a force is never below 0."""
+        """``touch`` with noise; a force is never below 0.
+
+        The bounds of peak, sum and tip stay 0, as the gate has always judged these trials.
+        """
         peak, total, tip = (self._rng.standard_normal(3) * self._noise).tolist()
+        # Drawn from a generator of their own: the three above are the same with and without them.
+        noise = self._patch_rng.standard_normal(len(touch.patches)) * self._noise
+        patches = [
+            replace(p, normal_force=max(0.0, p.normal_force + n), bound=QUANTILE_95 * self._noise)
+            for p, n in zip(touch.patches, noise.tolist(), strict=True)
+        ]
+        patches.sort(key=lambda patch: -patch.normal_force)
         return replace(
             touch,
             peak_force=max(0.0, touch.peak_force + peak),
             total_force=max(0.0, touch.total_force + total),
             tip_force=max(0.0, touch.tip_force + tip),
+            patches=tuple(patches),
         )
 
 

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from reachd.interfaces import Touch
+from reachd.interfaces import Patch, Touch, Wrench, planar_patch
 from sim_device.board.catalogue import build_skin, factory_calibration, identity
 from sim_device.board.firmware import SerialBoard
 from sim_device.skin.environment import rotation_about
@@ -16,8 +16,9 @@ from sim_device.world.base import World
 from sim_device.world.touch import on_skin
 from tactile_core.arrays import FloatArray
 from tactile_core.geometry import Side, finger
-from tactile_core.types import Instant, after
+from tactile_core.types import Instant, after, seconds_between
 from tactiled.blocks import Chunk, Cycle
+from tactiled.blocks import Patch as FeltPatch
 from tactiled.boards.events import Event, Identity, Refusal, Refused, Sampled
 from tactiled.boards.line import SerialLine
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
@@ -27,6 +28,9 @@ UP = np.array([0.0, 0.0, 1.0])
 CELL_M = 1e-4
 """Size of a cell for finding the nearest taxel, m; fifty times finer than their spacing. A search
 costs more than a trial's whole control cycle, and a finger is touched in few of these cells."""
+
+LIGHT_N = PipelineSettings().tip_light_n
+"""N, least and greatest force of a light tip contact; as tactiled is set up by default."""
 
 SETTLE_S = 1.0
 """Seconds for a board to be identified, its clock to be mapped and its first fits to be made."""
@@ -55,6 +59,9 @@ class ContactSense:
 
     cycle: Cycle | None = None
 
+    def __init__(self) -> None:
+        self._light_since: Instant | None = None
+
     def settle(self, world: World, now: Instant) -> Instant:
         """Return at once: there is nothing to start."""
         del world
@@ -62,19 +69,56 @@ class ContactSense:
 
     def feel(self, world: World, now: Instant) -> Touch:
         """Touch from the contacts of the last physics step."""
-        peak, tip, total = None, 0.0, 0.0
-        greatest, peak_side = -1.0, Side.NONE
-        for contact in world.contacts():
-            force, side = contact.normal_force, side_of(contact.x, contact.y)
+        tip, total = 0.0, 0.0
+        fx = fy = mz = 0.0
+        peak: Patch | None = None
+        patches = []
+        for c in world.contacts():
+            force, side = c.normal_force, side_of(c.x, c.y)
             total += force
             if side is Side.TIP:
                 tip += force
-            if force > greatest:
-                peak, greatest, peak_side = contact, force, side
+            fx, fy, mz = fx + c.force_x, fy + c.force_y, mz + c.x * c.force_y - c.y * c.force_x
+            patch = Patch(c.x, c.y, c.normal_x, c.normal_y, force, c.shear_force, side, 0.0)
+            patches.append(patch)
+            if peak is None or force > peak.normal_force:
+                peak = patch
         if peak is None:
-            return Touch(now, now, True, 0.0, Side.NONE, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        # The engine's own contacts are exact.
-        return Touch(now, now, True, greatest, peak_side, peak.x, peak.y, total, tip, 0.0, 0.0)
+            self._light_since = None
+            return Touch(now, now, True, 0.0, Side.NONE, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        if len(patches) > 1:
+            patches.sort(key=_strength, reverse=True)
+        return Touch(
+            captured=now,
+            received=now,
+            valid=True,
+            peak_force=peak.normal_force,
+            peak_side=peak.side,
+            peak_x=peak.x,
+            peak_y=peak.y,
+            total_force=total,
+            tip_force=tip,
+            peak_force_bound=0.0,  # the engine's own contacts are exact
+            normal_force_bound=0.0,
+            tip_force_bound=0.0,
+            tip_contact_time=self._tip_time(tip, now),
+            wrench=Wrench(fx, fy, mz),
+            patches=tuple(patches),
+        )
+
+    def _tip_time(self, tip_force: float, now: Instant) -> float:
+        """Seconds that the tip has been in light contact, as tactiled counts them."""
+        least, greatest = LIGHT_N
+        if not least <= tip_force <= greatest:
+            self._light_since = None
+            return 0.0
+        if self._light_since is None:
+            self._light_since = now
+        return seconds_between(self._light_since, now)
+
+
+def _strength(patch: Patch) -> float:
+    return patch.normal_force
 
 
 def side_of(x: float, y: float) -> Side:
@@ -164,4 +208,15 @@ def touch_of(cycle: Cycle) -> Touch:
         tip_force=features.tip_force,
         peak_force_bound=features.peak_force_bound,
         normal_force_bound=features.normal_force_bound,
+        tip_force_bound=features.tip_force_bound,
+        tip_contact_time=features.tip_contact_time,
+        wrench=Wrench(*(float(features.wrench[i]) for i in (0, 1, 5))),
+        patches=tuple([_patch_of(patch) for patch in features.patches]) if features.valid else (),
     )
+
+
+def _patch_of(felt: FeltPatch) -> Patch:
+    x, y, _ = felt.centroid.tolist()
+    nx, ny, _ = felt.normal.tolist()
+    fx, fy, _ = felt.force.tolist()
+    return planar_patch((x, y), (nx, ny), felt.normal_force, (fx, fy), felt.side, felt.bound)

@@ -200,10 +200,11 @@ class TrialLog:
                 peak_force=c.normal_force,
                 force=MSG.Vector3(c.force_x, c.force_y, 0.0),
                 centroid=MSG.Point(c.x, c.y, 0.0),
+                normal=MSG.Vector3(c.normal_x, c.normal_y, 0.0),
+                normal_force_bound=0.0,
             )
             for c in contacts
         ]
-        zero = MSG.Vector3(0.0, 0.0, 0.0)
         return MSG.ContactFeatures(
             header=header(self._wall.wall_ns(touch.captured), "ee"),
             captured_ns=touch.captured,
@@ -217,9 +218,12 @@ class TrialLog:
             peak_side=int(touch.peak_side),
             peak_position=MSG.Point(touch.peak_x, touch.peak_y, 0.0),
             normal_force=touch.total_force,
-            wrench=MSG.Wrench(zero, zero),
+            wrench=MSG.Wrench(
+                MSG.Vector3(touch.wrench.fx, touch.wrench.fy, 0.0),
+                MSG.Vector3(0.0, 0.0, touch.wrench.mz),
+            ),
             tip_force=touch.tip_force,
-            tip_contact_time=0.0,
+            tip_contact_time=touch.tip_contact_time,
             taxels_in_contact=0,
             taxels_masked=0,
             patches=patches,
