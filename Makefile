@@ -7,7 +7,7 @@ SOAK_MINUTES ?= 60
 KILLS ?= 1000
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-random test-loaded lint demo demo-ur arms arms-scenes demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage hostile recordings stress soak fuzz-pipeline kills firmware-test docs docs-reference pictures clean
+.PHONY: help setup test test-random test-loaded lint demo demo-ur arms arms-scenes demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage hostile recordings stress soak fuzz-pipeline kills firmware-test docs docs-reference leaderboard pictures clean
 
 help:  ## list the targets (what `make` alone does)
 	@echo "make TARGET, where TARGET is one of:"
@@ -47,6 +47,10 @@ test-loaded: setup  ## the suite RUNS times beside two busy loops
 # The reference of every configuration file, from the code that reads them.
 docs-reference: setup  ## the reference of configuration files, from the code
 	$(BIN)/python -m tactile_tools.dev.config_reference docs/configuration.md
+
+# The page of strategies, from the entries that `tactile benchmark` wrote.
+leaderboard: setup  ## docs/leaderboard.md from the entries in docs/results/benchmark
+	$(BIN)/python -m tactile_tools.dev.leaderboard docs/results/benchmark docs/leaderboard.md
 
 demo: setup  ## reach into a simulated cupboard, leave a log and a picture
 	$(BIN)/tactile demo

@@ -176,7 +176,7 @@ def _trial(parser: Parser) -> None:
 
 BENCHMARK_EXAMPLES = """\
 examples:
-  tactile benchmark quick_sweep                          # everything: about an hour of CPU time
+  tactile benchmark quick_sweep                          # everything: about two hours of CPU time
   tactile benchmark my_strategies:Wiggle --sets squeezed --engine mujoco --depth contacts --limit 20
   tactile benchmark quick_sweep --out runs/quick_sweep --entry quick_sweep.json
 
