@@ -1,4 +1,4 @@
-"""From contacts in the plane to contacts on the skin, which has height."""
+"""Turn contacts in the plane into contacts on the skin, which has height."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from sim_device.world.scenes import Scene
 from tactile_core.geometry import FINGER_HEIGHT
 
 SHELF_CLEARANCE: Final = 0.011
-"""m from the shelf to the lower edge of the finger (simulator: z 1.11 over a floor at 1.0)."""
+"""m from the shelf to the lower edge of the finger (authors' simulator: z 1.11, floor at 1.0)."""
 
 LINE_SPACING: Final = 0.016
-"""m between the points that stand for a line of contact: that of the rows of taxels."""
+"""m between the points that represent a line of contact; rows of taxels are as far apart."""
 
 
 def on_skin(contacts: Sequence[FingerContact], scene: Scene) -> list[Contact]:
-    """What the skin feels of ``contacts``.
+    """Point contacts on the skin (positions in m, forces in N, in ``ee``) for planar ``contacts``.
 
-    Objects are upright prisms, so each touches along a vertical line from the finger's lower edge
-    to the object's top, or the finger's upper edge; its force is spread evenly over that line.
+    Objects are upright prisms: each touches along a vertical line from the finger's lower edge to
+    its own top, or to the finger's upper edge if that is lower. The force is spread evenly over it.
     """
     felt = []
     for contact in contacts:

@@ -1,4 +1,4 @@
-"""Reaching strategies: the paper's five, `quick_sweep`, and loading of others."""
+"""Reaching strategies: the built-in ones, and loading of others."""
 
 from reachd.strategies.builtin import ReachingStrategy, ReportsEvents, StrategyEvent
 from reachd.strategies.runner import Answer, StrategyError, ask, available, begin, load_strategy

@@ -1,4 +1,4 @@
-"""What the built-in strategies share: the clock of a reach, excavations and their events."""
+"""The paper's five strategies, and the base class of the built-in ones."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from tactile_core.geometry import Side
 from tactile_core.types import NS_PER_S, Instant, record, seconds_between
 
 MAX_EVENTS = 64
-"""Events kept until they are taken: a reach has at most a few excavations, so more means that
-nobody takes them."""
+"""Events kept until they are taken. They are taken once a cycle, so more means that nobody does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +42,7 @@ class StrategyEvent:
 
 @record
 class Moment:
-    """What a strategy chooses by: newest touch and arm state, the aim, s since the reach began."""
+    """Inputs of one choice; ``elapsed``: s since the reach began."""
 
     touch: Touch
     arm: ArmState
@@ -53,7 +52,7 @@ class Moment:
 
 
 class ReportsEvents(Protocol):
-    """A strategy that tells what it decided."""
+    """A strategy that reports its decisions."""
 
     def take_events(self) -> tuple[StrategyEvent, ...]:
         """Events since the last call, oldest first."""
@@ -61,9 +60,9 @@ class ReportsEvents(Protocol):
 
 
 class ReachingStrategy(ABC):
-    """Base of the built-in strategies. ``rng`` is the only source of chance.
+    """Base of the built-in strategies. ``rng`` is the only source of randomness.
 
-    A subclass writes ``_choose``; an excavation that it has begun runs to its end by itself.
+    A subclass implements ``_choose``. An excavation that it began runs to its end without it.
     """
 
     def __init__(self, parameters: Parameters, rng: np.random.Generator) -> None:
@@ -117,20 +116,20 @@ class ReachingStrategy(ABC):
 
     @abstractmethod
     def _choose(self, at: Moment) -> Twist | None:
-        """Motion wanted outside an excavation, or None after ``_begin`` started one."""
+        """Motion wanted outside an excavation; None after ``_begin`` started one."""
 
     def _excavation_ended(self, at: Moment) -> None:
-        """Take note that an excavation has just ended."""
+        """Called when an excavation has just ended."""
         self._excavation_end = at.now
 
     def _has_time(self, at: Moment) -> bool:
-        """Whether the set allows an excavation to start with the time that remains."""
+        """Whether enough time remains for an excavation, where the set asks for that."""
         p = self._parameters
         remaining = self._time_limit - at.elapsed
         return not p.excavate_needs_time or remaining >= p.excavate_duration
 
     def _clock_trigger(self, at: Moment) -> bool:
-        """Whether t_trig has passed since the start or the end of the last excavation."""
+        """Whether t_trig has passed since the reach began or the last excavation ended."""
         passed = seconds_between(self._excavation_end, at.now) > self._parameters.trigger_interval
         return passed and self._has_time(at)
 
@@ -146,7 +145,7 @@ class ReachingStrategy(ABC):
             self._events.append(event)
 
     def _excavate(self, at: Moment) -> Twist:
-        """Equations (5) to (8) for the excavation under way."""
+        """Equations (5) to (8) for the running excavation."""
         running, p = self._excavating, self._parameters
         if running is None:
             raise RuntimeError("_choose() returned None without having begun an excavation")
@@ -161,7 +160,7 @@ class ReachingStrategy(ABC):
 
 
 class Straight(ReachingStrategy):
-    """Straight at the goal without end."""
+    """Straight at the goal, always."""
 
     def _choose(self, at: Moment) -> Twist | None:
         """Equations (1) and (2)."""
@@ -169,7 +168,7 @@ class Straight(ReachingStrategy):
 
 
 class Burrow(ReachingStrategy):
-    """Burrow without end."""
+    """Burrow, always."""
 
     def _choose(self, at: Moment) -> Twist | None:
         """Equations (2) to (4)."""
@@ -196,9 +195,9 @@ class Excavate(ReachingStrategy):
 
 # The paper's hybrid strategies: excavate by the clock or by what is felt, and burrow otherwise.
 #
-# Touch that is invalid or not finite is never taken for "no contact". While it lasts, the event
-# strategy goes on with what it did, the time of a tip contact stands still, and no excavation is
-# triggered; before the first valid touch it waits. The safety gate ends motion after 0.2 s of it.
+# Touch that is invalid or not finite does not mean "no contact". While it lasts, the event strategy
+# continues what it did, does not count the time of a tip contact and starts no excavation; before
+# the first valid touch it waits. After 0.2 s the safety gate stops the arm.
 
 
 class HybridClock(Excavate):
@@ -216,8 +215,8 @@ class HybridEvent(ReachingStrategy):
         super()._reset(now)
         self._previous = now
         self._mode = ""  # nothing felt yet
-        self._light_ns: int | None = None  # of light tip contact, None when there is none
-        self._dark_ns = 0  # since it was last felt
+        self._light_ns: int | None = None  # duration of the light tip contact, None without one
+        self._dark_ns = 0  # since that contact was last felt
         self._reference: float | None = None  # distance (m) from which progress counts
         self._reference_at = now
 
@@ -253,11 +252,11 @@ class HybridEvent(ReachingStrategy):
             self._reference = at.aim.distance
 
     def _force(self, touch: Touch) -> float:
-        """The force that F_bur and F_excv are compared with."""
+        """The force (N) that is compared with F_bur and F_excv."""
         return touch.peak_force if self._parameters.force_measure == "peak" else touch.total_force
 
     def _feel(self, touch: Touch, elapsed_ns: int) -> None:
-        """Count how long the tip has been in light contact, short gaps overlooked."""
+        """Count how long the tip has been in light contact, ignoring short gaps."""
         p = self._parameters
         if p.push_force_min <= touch.tip_force <= p.push_force_max:
             self._light_ns = 0 if self._light_ns is None else self._light_ns + elapsed_ns
@@ -269,7 +268,7 @@ class HybridEvent(ReachingStrategy):
                 self._light_ns = None
 
     def _trigger(self, at: Moment) -> str:
-        """Which of the paper's two cases holds: (2) "stall", (1) "push", or neither, ""."""
+        """Which of the paper's two cases holds: "stall" (2), "push" (1), or "" for neither."""
         p = self._parameters
         late = seconds_between(self._reference_at, at.now) - p.progress_time
         gained = (self._reference or 0.0) - at.aim.distance
@@ -280,9 +279,9 @@ class HybridEvent(ReachingStrategy):
         return ""
 
     def _direction(self, at: Moment) -> bool:
-        """Whether to excavate CCW: peak contact on the left, with the set's obedience.
+        """Whether to excavate CCW: when the peak contact is on the left, as often as the set says.
 
-        A peak that is on neither side leaves it to chance. One draw an excavation, always.
+        A peak on neither side leaves it to chance. Draws exactly once an excavation.
         """
         p, touch, arm = self._parameters, at.touch, at.arm
         draw = float(self._rng.random())

@@ -1,4 +1,4 @@
-"""What a reach is made of: the values of the paper's Tables I and II and the readings of its text.
+"""Parameters of a reach: the values of the paper's Tables I and II, and readings of its text.
 
 The symbols in the descriptions are the paper's.
 """
@@ -110,9 +110,7 @@ class Parameters:
     push_time: Annotated[
         Seconds, Meta(gt=0, description="t_push, light tip contact that excavates")
     ]
-    push_dropout: Annotated[
-        Seconds, Meta(ge=0, description="gap in a tip contact that is overlooked")
-    ]
+    push_dropout: Annotated[Seconds, Meta(ge=0, description="gap in a tip contact that is ignored")]
     progress_time: Annotated[
         Seconds, Meta(gt=0, description="t_prog, lag behind v_max that is a stall")
     ]
@@ -152,7 +150,7 @@ class Parameters:
     note: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse values out of range and values that contradict one another."""
+        """Check ranges, and values against one another; ConfigError."""
         check_fields(self)
         if self.push_force_max <= self.push_force_min:
             raise ConfigError(

@@ -1,8 +1,8 @@
-"""The two named parameter sets, and every disagreement between the sources decided once.
+"""The two named parameter sets, with the reason for every reading of the sources.
 
-``hardware`` is Tables I and II of the paper; ``authors_sim`` is what the authors' published
-simulator (clutter-jamming) does, brought from its lengths × 10 to metres. Where the paper is
-silent or cannot have run as it is printed, the reason for our reading stands beside the value.
+``hardware``: Tables I and II of the paper. ``authors_sim``: what the authors' published simulator
+(clutter-jamming) does, its lengths converted from decimetres to metres. Where the paper says
+nothing, or cannot have been run as printed, the reason for the value stands beside it.
 """
 
 from __future__ import annotations
@@ -317,7 +317,7 @@ def parameters(
 
 
 def _nested(overrides: Mapping[str, object]) -> dict[str, object]:
-    """Bring keys such as ``safety.force`` into a table under ``safety``."""
+    """Move keys such as ``safety.force`` into a table under ``safety``."""
     nested: dict[str, object] = {}
     gate: dict[str, object] = {}
     for key, value in overrides.items():

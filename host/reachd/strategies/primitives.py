@@ -1,6 +1,6 @@
 """Equations (1) to (8) of the paper as pure functions.
 
-The paper's axes are x right, y forward, angles from y; ours (``cupboard``, see ``seam``) are x
+The paper's axes are x right, y forward, angles from y; ours (``cupboard``, see `interfaces`) are x
 forward, y left, angles from x. One is the other turned by 90° about z, so x_here = y_paper,
 y_here = −x_paper, angles and cross products stay as they are, and R_θ of equation (5) turns
 (forward, left) = (y_paper, −x_paper) of the finger into the cupboard.

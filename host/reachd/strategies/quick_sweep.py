@@ -78,9 +78,9 @@ class QuickSweep(ReachingStrategy):
         )
 
     def _goes_left(self, touch: Touch) -> bool:
-        """Whether to sweep to the left: away from the peak contact, with the set's obedience.
+        """Whether to sweep to the left: away from the peak contact, as often as the set says.
 
-        A peak in the middle leaves it to chance. One draw a sweep, always.
+        A peak in the middle leaves it to chance. Draws exactly once a sweep.
         """
         draw = float(self._rng.random())
         if touch.peak_side == Side.LEFT:

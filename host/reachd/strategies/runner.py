@@ -1,4 +1,4 @@
-"""Finding a strategy by name, entry point or ``module:Class``, and asking it safely."""
+"""Load a strategy by name, entry point or ``module:Class``; call it so that it cannot fail."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from reachd.strategies.quick_sweep import QuickSweep
 from tactile_core.types import Instant, record
 
 GROUP = "tactile_reach.strategies"
-"""Entry-point group in which an installed package offers strategies."""
+"""Entry-point group of the strategies of installed packages."""
 
 Factory = Callable[[Parameters, np.random.Generator], Strategy]
 
@@ -38,18 +38,18 @@ BUILT_IN: dict[str, Factory] = {
 
 
 class StrategyError(ValueError):
-    """A strategy that cannot be had: says what was asked for, what exists and what to do."""
+    """Strategy could not be loaded: which, what is available, what to do."""
 
 
 def available() -> tuple[str, ...]:
-    """Names that ``load_strategy`` knows: the built-in ones, then those of installed packages."""
+    """Names for `load_strategy`: the built-in ones, then those of installed packages."""
     return (*BUILT_IN, *sorted(e.name for e in _offered() if e.name not in BUILT_IN))
 
 
 def load_strategy(spec: str, parameters: Parameters, rng: np.random.Generator) -> Strategy:
     """Make the strategy ``spec``: a built-in name, an entry point's name, or ``module:Class``.
 
-    A class is called with (parameters, rng). Built-in names cannot be taken by a package. Raises
+    A class is called with (parameters, rng). A package cannot replace a built-in name. Raises
     StrategyError.
     """
     strategy = _guarded(spec, lambda: _factory(spec)(parameters, rng))
@@ -63,7 +63,7 @@ def load_strategy(spec: str, parameters: Parameters, rng: np.random.Generator) -
 
 @record
 class Answer:
-    """What a strategy said: twist and activity, what it decided, or how it failed (``failure``)."""
+    """Result of one step: twist, activity and events, or in ``failure`` how the strategy failed."""
 
     twist: Twist | None
     activity: str
@@ -72,7 +72,7 @@ class Answer:
 
 
 def begin(strategy: Strategy, goal: Goal, now: Instant) -> str | None:
-    """Start a reach; returns what went wrong, None when nothing did."""
+    """Start a reach; returns the error in words, or None."""
     try:
         strategy.start(goal, now)
     except Exception as error:  # noqa: BLE001 - a plug-in may raise anything
@@ -81,7 +81,7 @@ def begin(strategy: Strategy, goal: Goal, now: Instant) -> str | None:
 
 
 def ask(strategy: Strategy, touch: Touch, arm: ArmState, goal: Goal, now: Instant) -> Answer:
-    """One step of a strategy, whatever it does: it never raises."""
+    """One step of a strategy. Never raises: an error is in `Answer.failure`."""
     try:
         said = strategy.step(touch, arm, goal, now)
         if not isinstance(said, Twist):
@@ -100,7 +100,7 @@ def _offered() -> tuple[EntryPoint, ...]:
 
 
 def _factory(spec: str) -> Factory:
-    """Class or function that makes the strategy ``spec``."""
+    """Find the class or function that makes the strategy ``spec``."""
     if spec in BUILT_IN:
         return BUILT_IN[spec]
     for entry in _offered():
@@ -119,7 +119,7 @@ def _factory(spec: str) -> Factory:
 
 
 def _guarded(spec: str, make: Callable[[], Strategy]) -> Strategy:
-    """Run the making of a strategy; whatever it raises becomes a StrategyError."""
+    """Call ``make``; whatever it raises becomes a StrategyError."""
     try:
         return make()
     except StrategyError:
