@@ -15,7 +15,7 @@ from matplotlib.image import imread
 from tactile_tools.cli import main
 from tactile_tools.plot import reach as plot_reach
 from tactile_tools.plot.curves import holes
-from tactile_tools.plot.look import LOOKS, drawn
+from tactile_tools.plot.look import LOOKS, styled
 from tactile_tools.plot.reach import draw_reach
 from tactile_tools.plot.reach_series import read_reach
 from tactile_tools.plot.series import LogUnreadableError
@@ -114,7 +114,7 @@ def test_labels_of_a_reach_stay_inside_the_picture_and_off_the_data(
     several: Path, size: str
 ) -> None:
     reach = read_reach(several)
-    with drawn(LOOKS[size]):
+    with styled(LOOKS[size]):
         figure = plot_reach.reach_sheet(reach, LOOKS[size]).finish()
         figure.canvas.draw()
     whole, inches = figure.bbox, figure.get_tightbbox()
@@ -151,7 +151,7 @@ def test_missing_data_is_not_drawn(recorded: Recorded, tmp_path: Path) -> None:
     reach = read_reach(rewrite(log, tmp_path / "hole.mcap", cut))
     (hole,) = holes(reach.time)
     assert hole == pytest.approx((begin, end), abs=0.1)
-    with drawn(LOOKS["screen"]):
+    with styled(LOOKS["screen"]):
         figure = plot_reach.reach_sheet(reach, LOOKS["screen"]).figure
     above, distance, _, doing = figure.axes
     for line in [*above.lines, *distance.lines]:
