@@ -107,7 +107,7 @@ class Cupboard:
         return self._world.finger().heading
 
     def begin(self, now: Instant) -> None:
-        """Start time at ``now``."""
+        """Start the clock of world and arm at ``now``."""
         self._start = now
         self._arm = SimulatedArm(self._world, self._settings, now, self._rng)
         self._apply_faults(0.0)

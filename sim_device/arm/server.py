@@ -230,7 +230,7 @@ class ArmServer:
             world.markers.put(self._codec.encode(WORLD, markers), wall_ns)
 
     def _begin(self, now: Instant) -> _World:
-        """Start time and declare the topics and services."""
+        """Start the clock and declare the topics and services."""
         self._polled = self._next_markers = now
         self.cupboard.begin(now)
         self.port.begin()
