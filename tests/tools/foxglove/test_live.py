@@ -234,7 +234,7 @@ def test_late_joiners_get_the_geometry(rig: Rig, start: Callable[..., Any]) -> N
     late.socket.close()
 
 
-def test_tare_is_a_service_and_its_refusal_is_told(rig: Rig, start: Callable[..., Any]) -> None:
+def test_tare_is_a_service_and_its_refusal_is_shown(rig: Rig, start: Callable[..., Any]) -> None:
     live, viewer = start()
     viewer.until(lambda: "/tactile/left/tare" in viewer.services, both(rig, live))
     assert viewer.call("/tactile/left/tare", {"force": True}) == {"message": "rest field set"}

@@ -129,7 +129,7 @@ def test_time_limit_truncates() -> None:
         assert truncated == (step == 4)
 
 
-def test_several_in_processes_of_their_own() -> None:
+def test_vectorised_environments_give_the_same_results() -> None:
     """Vectorised over processes, it gives the same as one by one."""
     vector = gymnasium.make_vec(
         ID,
@@ -158,7 +158,7 @@ def test_several_in_processes_of_their_own() -> None:
         ({"overrides": {"speed": 3}}, "speed"),
     ],
 )
-def test_what_does_not_exist_is_named(options: dict[str, Any], said: str) -> None:
+def test_unknown_scene_or_parameter_is_named(options: dict[str, Any], said: str) -> None:
     env = make(**options)
     with pytest.raises(ValueError, match=said):
         env.reset(seed=0)

@@ -100,7 +100,7 @@ def table(folder: Path) -> Any:
     return pq.read_table(folder / "data/chunk-000/file-000.parquet")
 
 
-def test_streams_come_to_one_clock_as_they_were_known(
+def test_frames_hold_what_was_known_at_their_time(
     write: Write, log_tool: Callable[..., Any], tmp_path: Path
 ) -> None:
     out = tmp_path / "ds"
@@ -159,7 +159,7 @@ def test_several_logs_are_episodes(
     assert stats["observation.tactile"]["count"] == [len(values)]
 
 
-def test_masked_taxels_become_zero_and_are_told(
+def test_masked_taxels_become_zero_and_are_counted(
     write: Write, log_tool: Callable[..., Any], tmp_path: Path
 ) -> None:
     out = tmp_path / "ds"
@@ -199,15 +199,13 @@ def test_log_without_touch_is_refused(
 
 
 @pytest.mark.parametrize("fps", ["0", "2.5", "many", "5000"])
-def test_rates_that_cannot_be_are_refused(
-    write: Write, log_tool: Callable[..., Any], fps: str
-) -> None:
+def test_impossible_rates_are_refused(write: Write, log_tool: Callable[..., Any], fps: str) -> None:
     done = log_tool("export", write("a.mcap"), "--format", "lerobot", "--fps", fps)
     assert done.code == 2
     assert "a whole number from 1 to 1000" in done.err
 
 
-def test_nothing_else_is_overwritten(
+def test_only_exports_are_overwritten(
     write: Write, log_tool: Callable[..., Any], tmp_path: Path
 ) -> None:
     out, log = tmp_path / "ds", write("a.mcap")
@@ -221,7 +219,7 @@ def test_nothing_else_is_overwritten(
     assert log_tool("export", log, "--format", "lerobot", "--out", other, "--force").code == 0
 
 
-def test_lerobots_own_loader_reads_it(
+def test_lerobots_own_loader_reads_the_data_set(
     write: Write, log_tool: Callable[..., Any], tmp_path: Path
 ) -> None:
     python = os.environ.get(PYTHON)

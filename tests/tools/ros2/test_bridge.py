@@ -236,7 +236,7 @@ def test_too_many_streams_are_refused_and_counted(
 # From ROS
 
 
-def test_nothing_is_accepted_unasked(
+def test_requests_are_refused_unless_accepted_by_name(
     bus: Any, peer: Any, start_bridge: Callable[..., Any], filled: Callable[..., Any]
 ) -> None:
     running = start_bridge()
@@ -273,9 +273,7 @@ def twist(x: float = 0.03, *, frame: str = "cupboard", wall_ns: int = 0, z: floa
     return MSG.TwistStamped(header(wall_ns, frame), MSG.Twist(linear, angular))
 
 
-def test_twists_are_checked_before_they_are_wanted(
-    bus: Any, peer: Any, start_bridge: Callable[..., Any]
-) -> None:
+def test_invalid_twists_are_refused(bus: Any, peer: Any, start_bridge: Callable[..., Any]) -> None:
     running = start_bridge(accept=frozenset({"twist"}), reach="reach")
     wanted = latest(bus.session, WANTED.key("reach"))
     counts = running.bridge.counts
@@ -308,7 +306,7 @@ def test_twists_are_checked_before_they_are_wanted(
     assert codec().decode(WANTED, got[0].data).twist == good.twist
 
 
-def test_goals_are_asked_of_reachd_and_refusals_told(
+def test_goals_are_passed_to_reachd_and_refusals_reported(
     bus: Any, peer: Any, start_bridge: Callable[..., Any]
 ) -> None:
     asked: list[Any] = []
@@ -349,7 +347,7 @@ def test_goals_are_asked_of_reachd_and_refusals_told(
     assert running.bridge.counts["refused_goal"] == 2
 
 
-def test_router_may_go_and_come_back(
+def test_bridge_survives_a_restart_of_the_router(
     bus: Any, router: Any, start_bridge: Callable[..., Any], filled: Callable[..., Any]
 ) -> None:
     running = start_bridge()
@@ -398,12 +396,12 @@ def test_bad_arguments_are_refused(
 
 
 @pytest.mark.parametrize("endpoint", ["nonsense", "tcp/", "tcp/127.0.0.1:9"])
-def test_router_that_cannot_be_is_one_sentence(endpoint: str) -> None:
+def test_unreachable_router_is_reported_in_one_sentence(endpoint: str) -> None:
     with pytest.raises(RouterError, match="--router tcp/HOST:PORT"):
         open_client(endpoint, timeout_s=0.2)
 
 
-def test_told_to_stop_the_bridge_takes_its_tokens_back(
+def test_sigterm_withdraws_the_tokens_of_the_bridge(
     bus: Any,
     router: Any,
     peer: Any,

@@ -129,7 +129,7 @@ def test_without_reachd_it_says_what_it_needs() -> None:
 @pytest.mark.parametrize(
     ("frame", "z", "x"), [("map", 0.0, 0.1), ("", 0.1, 0.1), ("", 0.0, float("inf"))]
 )
-def test_twists_that_cannot_be_followed(frame: str, z: float, x: float) -> None:
+def test_twist_that_is_not_finite_or_planar_is_not_followed(frame: str, z: float, x: float) -> None:
     linear, angular = MSG.Vector3(x, 0.0, z), MSG.Vector3(0.0, 0.0, 0.0)
     message = MSG.TwistStamped(header(0, frame), MSG.Twist(linear, angular))
     assert codec().encode(WANTED, message)

@@ -63,7 +63,7 @@ def test_qos_tokens(qos: Qos, token: str) -> None:
     assert qos.token == token
 
 
-def test_names_are_made_fit_for_ros() -> None:
+def test_names_are_adapted_to_ros() -> None:
     assert ros_name("left-finger") == "left_finger"
     assert ros_name("0left") == "_0left"
     assert mangle("") == "%"
@@ -124,7 +124,7 @@ def test_package_xml_names_what_ros_needs() -> None:
     assert {e.text for e in root.findall("depend")} == set(package.DEPENDENCIES)
 
 
-def test_package_is_written_and_old_definitions_go(tmp_path: Path) -> None:
+def test_package_is_written_and_old_definitions_are_deleted(tmp_path: Path) -> None:
     out = tmp_path / "tactile_msgs"
     (out / "msg").mkdir(parents=True)
     (out / "msg" / "Old.msg").write_text("int8 x\n")

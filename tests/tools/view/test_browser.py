@@ -90,7 +90,7 @@ def test_it_fits_the_screen_and_nothing_overlaps(
     assert troubles == []
 
 
-def test_a_daemon_that_is_killed_is_told_in_words(browser: Any, make_rig: Any) -> None:
+def test_killed_daemon_is_described_in_words(browser: Any, make_rig: Any) -> None:
     rig = make_rig()
     page, _ = open_page(browser, rig.page())
     rig.daemon.end()

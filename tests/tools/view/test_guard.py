@@ -20,13 +20,13 @@ def test_names_of_this_machine_are_served(host: str) -> None:
 @pytest.mark.parametrize(
     "host", [None, "", "evil.example:8420", "127.0.0.1.evil.example", "10.0.0.2:8420", "a b", "\r"]
 )
-def test_other_names_are_refused_so_that_a_name_made_to_point_here_gets_nothing(
+def test_foreign_host_names_are_refused(
     host: str | None,
 ) -> None:
     assert Guard(8420).refuse_host(host)
 
 
-def test_with_a_token_addresses_are_served_and_names_that_were_given() -> None:
+def test_with_a_token_addresses_and_given_names_are_served() -> None:
     guard = Guard(8420, TOKEN, frozenset({"robot"}))
     assert guard.refuse_host("10.0.0.2:8420") is None
     assert guard.refuse_host("robot:8420") is None
@@ -34,7 +34,7 @@ def test_with_a_token_addresses_are_served_and_names_that_were_given() -> None:
     assert guard.refuse_host("evil.example:8420")
 
 
-def test_pages_of_others_may_not_use_the_stream() -> None:
+def test_foreign_origins_may_not_use_the_stream() -> None:
     guard = Guard(8420)
     assert guard.refuse_origin("127.0.0.1:8420", "http://127.0.0.1:8420") is None
     assert guard.refuse_origin("127.0.0.1:8420", None) is None
@@ -42,7 +42,7 @@ def test_pages_of_others_may_not_use_the_stream() -> None:
         assert guard.refuse_origin("127.0.0.1:8420", origin)
 
 
-def test_the_token_is_known_by_address_or_cookie_and_nothing_else() -> None:
+def test_token_is_accepted_from_address_or_cookie_only() -> None:
     guard = Guard(8420, TOKEN)
     assert guard.knows_token(f"/?token={TOKEN}", None)
     assert guard.knows_token("/live", f"other=1; {guard.cookie}={TOKEN}")
@@ -52,7 +52,7 @@ def test_the_token_is_known_by_address_or_cookie_and_nothing_else() -> None:
         assert not guard.knows_token(path, cookies)
 
 
-def test_the_owner_of_a_connection_is_who_opened_it() -> None:
+def test_owner_of_a_connection_is_found() -> None:
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
         socket.create_connection(server.getsockname()) as client,
@@ -61,6 +61,6 @@ def test_the_owner_of_a_connection_is_who_opened_it() -> None:
     assert owner_of(("not an address", 1)) is None
 
 
-def test_what_is_loopback() -> None:
+def test_loopback_addresses_are_recognised() -> None:
     assert all(map(is_loopback, ("127.0.0.1", "127.9.9.9", "::1", "localhost")))
     assert not any(map(is_loopback, ("0.0.0.0", "::", "10.0.0.1", "robot")))

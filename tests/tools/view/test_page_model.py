@@ -97,7 +97,7 @@ def test_values_are_those_of_the_messages() -> None:
 @pytest.mark.parametrize(
     ("state", "word"), [("unplugged", "plug the board in"), ("silent", "check the board")]
 )
-def test_a_board_that_is_not_there_says_so_with_the_remedy(state: str, word: str) -> None:
+def test_missing_board_is_named_with_the_remedy(state: str, word: str) -> None:
     model = PageModel()
     model.take(FEATURES, "left", features(), Instant(S))
     model.take(DIAGNOSTICS, "left", told(state), Instant(2 * S))
@@ -106,7 +106,7 @@ def test_a_board_that_is_not_there_says_so_with_the_remedy(state: str, word: str
     assert word in seen["reasons"][0]
 
 
-def test_silence_and_the_end_of_a_daemon_are_told_apart() -> None:
+def test_silence_and_end_of_a_daemon_are_distinguished() -> None:
     model = PageModel()
     model.set_alive("left", True)
     assert board(model, S)["state"] == "waiting"
@@ -129,7 +129,7 @@ def test_a_recording_is_shown_from_the_diagnostics() -> None:
     assert recording["seconds"] == 2.5
 
 
-def test_what_is_not_finite_is_null_and_never_breaks_the_frame() -> None:
+def test_values_that_are_not_finite_become_null() -> None:
     model = PageModel()
     strange = forces()
     strange.force[:] = np.inf

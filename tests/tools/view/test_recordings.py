@@ -23,7 +23,7 @@ def board(rig: Any) -> Any:
 @pytest.mark.parametrize(
     "name", ["../up", "/tmp/x", ".hidden", "a/b", "-x", "a b", "x" * 65, "\0", "ä", "..", "a\n"]
 )
-def test_a_name_that_is_no_plain_file_name_is_refused(board: Any, name: str) -> None:
+def test_recording_name_with_a_path_is_refused(board: Any, name: str) -> None:
     with pytest.raises(tr.RefusedError, match="allowed: letters, digits"):
         board.start_recording(name)
 
@@ -34,7 +34,7 @@ def test_a_limit_out_of_bounds_is_refused(board: Any, limit_s: float) -> None:
         board.start_recording("x", limit_s=limit_s)
 
 
-def test_one_at_a_time_whole_and_never_over_another(
+def test_one_recording_at_a_time_never_over_an_older_one(
     rig: Any, board: Any, until: Callable[..., Any]
 ) -> None:
     with board.record("whole") as path:
@@ -55,13 +55,13 @@ def test_one_at_a_time_whole_and_never_over_another(
     assert not board.status()["recording"]["recording"]
 
 
-def test_it_ends_by_itself(rig: Any, board: Any, until: Callable[..., Any]) -> None:
+def test_recording_ends_at_its_limit(rig: Any, board: Any, until: Callable[..., Any]) -> None:
     path = board.start_recording("short", limit_s=0.5)
     until(lambda: not board.status()["recording"]["recording"])
     until(lambda: tr.read_log(rig.folder / path).closed)
 
 
-def test_it_is_finished_when_the_daemon_ends(
+def test_recording_is_closed_when_the_daemon_ends(
     make_rig: Callable[[], Any], until: Callable[..., Any]
 ) -> None:
     rig = make_rig()

@@ -58,13 +58,13 @@ def test_files_are_served_with_a_strict_policy_and_nothing_else_is(rig: Any) -> 
     assert fetch(address + "live", Origin="http://evil.example")[0] == 403
 
 
-def test_a_page_of_another_site_gets_no_stream(rig: Any, viewer: Any) -> None:
+def test_page_of_another_site_gets_no_stream(rig: Any, viewer: Any) -> None:
     with pytest.raises(InvalidStatus) as refused:
         viewer(rig.page(), additional_headers={"Origin": "http://evil.example"})
     assert refused.value.response.status_code == 403
 
 
-def test_beyond_loopback_only_the_token_opens_it(rig: Any, viewer: Any) -> None:
+def test_beyond_loopback_a_token_is_needed(rig: Any, viewer: Any) -> None:
     address = rig.page("--bind", "0.0.0.0", "--token", "0123456789abcdef0123")
     port = address.partition("?")[0].rstrip("/").rpartition(":")[2]
     here = f"http://127.0.0.1:{port}/"
@@ -88,7 +88,7 @@ def test_beyond_loopback_only_the_token_opens_it(rig: Any, viewer: Any) -> None:
     assert viewer(here, additional_headers={"Cookie": known}).next()["hello"]
 
 
-def test_a_viewer_that_draws_nothing_holds_up_nobody_and_gets_no_old_frames(
+def test_viewer_that_draws_nothing_delays_nobody_and_gets_no_old_frames(
     rig: Any, viewer: Any, streaming: Any
 ) -> None:
     address = rig.page()
@@ -146,14 +146,14 @@ def test_tare_record_and_rate_by_the_page(rig: Any, viewer: Any, streaming: Any)
     assert "takes no commands" in text
 
 
-def test_a_page_that_only_looks_on_asks_nothing(rig: Any, viewer: Any, streaming: Any) -> None:
+def test_read_only_page_sends_no_requests(rig: Any, viewer: Any, streaming: Any) -> None:
     page = viewer(rig.page("--read-only"))
     page.frame(streaming)
     assert page.hello["read_only"]
     assert page.ask(do="tare", board="pad") == (False, "this page only looks on (--read-only)")
 
 
-def test_unplugged_killed_and_back_again(
+def test_page_follows_unplugging_and_restarts(
     make_rig: Callable[[], Any], viewer: Any, streaming: Any
 ) -> None:
     rig = make_rig()
@@ -176,7 +176,7 @@ def test_unplugged_killed_and_back_again(
     page.frame(streaming)
 
 
-def test_a_log_is_played_sought_and_paused(
+def test_log_is_played_paused_and_repositioned(
     rig: Any, viewer: Any, streaming: Any, tmp_path: Path
 ) -> None:
     with tr.connect(rig.endpoint, find_s=60) as bus:
