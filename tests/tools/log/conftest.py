@@ -51,9 +51,14 @@ def log_tool(capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
 def tiny_log() -> Callable[..., bytes]:
     """``tiny_log(path)``: write a complete log of some 1.4 kB with all kinds of records."""
 
-    def write(path: Path, library: str = "t", profile: str = "ros2", count: int = 6) -> bytes:
+    def write(
+        path: Path,
+        library: str = "t",
+        profile: str = "ros2",
+        count: int = 6,
+        text: bytes = b"float64 x\nfloat64 y\nfloat64 z\n",
+    ) -> bytes:
         file = McapFile(path, DiskStorage(), library, profile)
-        text = b"float64 x\nfloat64 y\nfloat64 z\n"
         file.add_schema(1, VECTOR, "ros2msg", text)
         file.add_channel(1, 1, "/v", "cdr", {})
         file.add_metadata("m", {"a": "b"})

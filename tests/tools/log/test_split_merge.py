@@ -114,6 +114,28 @@ def test_logs_of_two_daemons_merge_into_one(
     assert counts(kept)[COMMAND] == 200
 
 
+@pytest.mark.parametrize(
+    ("text", "tables"),
+    [
+        (b"# A place.\nfloat64 x  # m\n\nfloat64   y\nfloat64 z\n", 1),
+        (b"float64 x\nfloat64 y\nfloat64 w\n", 2),
+    ],
+    ids=["other comments", "other fields"],
+)
+def test_only_comments_of_a_definition_may_differ_within_a_topic(
+    log_tool: Any, tiny_log: Any, tmp_path: Path, text: bytes, tables: int
+) -> None:
+    tiny_log(tmp_path / "old.mcap")
+    tiny_log(tmp_path / "new.mcap", text=text)
+    merged = log_tool(
+        "merge", tmp_path / "old.mcap", tmp_path / "new.mcap", "--out", tmp_path / "m.mcap"
+    )
+    assert merged.code == 0, merged.err
+    told = log_tool("export", tmp_path / "m.mcap", "--format", "csv", "--out", tmp_path / "e")
+    assert told.code == 0, told.err
+    assert len(list((tmp_path / "e").glob("v*.csv"))) == tables
+
+
 def test_logs_with_different_clocks_are_aligned(
     log_tool: Any, recorded: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

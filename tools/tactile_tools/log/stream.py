@@ -35,7 +35,8 @@ NAMED = 20
 class Stream:
     """Content of a channel; equal for all files that describe it alike. Immutable.
 
-    ``metadata``: of the channel, as sorted pairs.
+    Comments in the definition do not count: they changed between versions of this software, and
+    two logs of one topic stay one topic. ``metadata``: of the channel, as sorted pairs.
     """
 
     __slots__ = (
@@ -64,7 +65,8 @@ class Stream:
         self.definition = definition
         self.encoding = encoding
         self.metadata = metadata
-        self._key = topic, msgtype, schema_encoding, encoding, metadata, definition
+        layout = _layout(definition) if schema_encoding == "ros2msg" else definition
+        self._key = topic, msgtype, schema_encoding, encoding, metadata, layout
         self._hash = hash(self._key)  # looked up with every message
 
     def __hash__(self) -> int:
@@ -77,6 +79,19 @@ class Stream:
 
     def __repr__(self) -> str:
         return f"Stream({self.topic!r}, {self.msgtype!r})"
+
+
+def _layout(definition: bytes) -> bytes:
+    """Return a ``ros2msg`` definition without its comments and spacing."""
+    lines = []
+    for line in definition.splitlines():
+        # The value of a text constant or default may contain a # that begins no comment.
+        is_text = line.lstrip().startswith((b"string", b"wstring"))
+        has_value = any(sign in line for sign in (b"=", b'"', b"'"))
+        words = line.split() if is_text and has_value else line.partition(b"#")[0].split()
+        if words:
+            lines.append(b" ".join(words))
+    return b"\n".join(lines)
 
 
 class Record(NamedTuple):
