@@ -115,7 +115,7 @@ def test_features_of_real_daemons_are_reproduced_bit_for_bit(lab: Path, log_tool
     assert outcome.code == 0, outcome.err
     assert "estimated anew" not in outcome.out
     rows = re.findall(
-        r"^(\S+): (\d+) messages, (\d+) in the log; (\d+) the same", outcome.out, re.M
+        r"^(\S+): (\d+) messages, (\d+) in the log; (\d+) bit for bit the same", outcome.out, re.M
     )
     assert len(rows) == 10
     for topic, new, old, same in rows:
@@ -126,7 +126,7 @@ def test_log_of_a_killed_daemon_is_reproduced_bit_for_bit(lab: Path, log_tool: A
     outcome = log_tool("reprocess", lab / "cut.mcap", "--out", lab / "cut-again.mcap")
     assert outcome.code == 0, outcome.err
     rows = re.findall(
-        r"^(\S+): (\d+) messages, (\d+) in the log; (\d+) the same", outcome.out, re.M
+        r"^(\S+): (\d+) messages, (\d+) in the log; (\d+) bit for bit the same", outcome.out, re.M
     )
     assert len(rows) == 10
     for topic, _, old, same in rows:
