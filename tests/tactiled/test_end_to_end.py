@@ -27,7 +27,7 @@ TICK_NS = NS_PER_S // 500
 At = Callable[[float], Instant]
 
 
-def welcome(node: int, identity: Identity) -> Refusal | None:
+def admit_all(node: int, identity: Identity) -> Refusal | None:
     return None
 
 
@@ -66,7 +66,7 @@ def make_board(**options: Any) -> SerialBoard:
 
 def run_serial(at: At, seconds: float = 4.0, **options: Any) -> tuple[Any, SerialLine, list[Any]]:
     board = make_board(**options)
-    line = SerialLine("p", welcome)
+    line = SerialLine("p", admit_all)
     pipeline = BoardPipeline(factory_calibration("finger", SEED))
     return board, line, drive(board, line, pipeline, at, seconds)
 
@@ -147,7 +147,7 @@ def test_stream_survives_a_board_reset(instant: At) -> None:
 
 def test_press_is_located_over_can(instant: At) -> None:
     board = CanBoard(build_skin("finger", SEED), identity("finger", SEED), node=9, contacts=press)
-    line = CanLine("can", welcome)
+    line = CanLine("can", admit_all)
     cycles = drive(board, line, BoardPipeline(factory_calibration("finger", SEED)), instant, 3.0)
     assert set(line.links) == {9}
     assert cycles[-1][1].features.peak_side is Side.LEFT

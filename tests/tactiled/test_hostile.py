@@ -67,7 +67,7 @@ def array(number: int, rows: int = 2, columns: int = 2) -> ArrayDescriptor:
 BOARD = Descriptor(1, 0, bytes(7) + b"\xaa", "pad", "1", TICK_HZ, 493_000, (array(0), array(1)))
 
 
-class Ends:
+class MemorySink:
     """Sink without a bus: encodes messages, keeps them by topic, and logs them."""
 
     def __init__(self, recorder: Recorder | None = None) -> None:
@@ -101,7 +101,7 @@ class Ends:
         self.send(LOG, name, log_message(stamp_ns, level, speaker, text), stamp_ns)
 
 
-class Asked(RecordedSource):
+class CapturingSource(RecordedSource):
     """Keeps the host's messages to the board."""
 
     def __init__(self) -> None:
@@ -120,21 +120,21 @@ class Rig:
         self, descriptor: Descriptor = BOARD, recorder: Recorder | None = None, settle: bool = True
     ) -> None:
         self.descriptor = descriptor
-        self.ends = Ends(recorder)
+        self.sink = MemorySink(recorder)
         self.sequence = 0
-        self._second = self.ends.at
+        self._second = self.sink.at
         store = CalibrationStore((), strict=False)
         line = SerialLine("p", lambda node, identity: self.port.admit(node, identity))
         self.inbox = Inbox(Wake(), limit=100_000)
-        self.source = Asked()
+        self.source = CapturingSource()
         self.port = Port(
             "p", line, self.source, self.inbox, lambda nodes, late: {},
-            lambda port, node, name: BoardSession(name, self.ends, store, PipelineSettings()),
-            True, Journal(self.ends, "b0", "p"),
+            lambda port, node, name: BoardSession(name, self.sink, store, PipelineSettings()),
+            True, Journal(self.sink, "b0", "p"),
         )  # fmt: skip
         self.port.add_board(0, "b0")
         self.session = self.port.boards[0]
-        line.connect(self.ends.at)
+        line.connect(self.sink.at)
         if settle:
             for _ in range(120):  # identified, tared
                 self.cycle()
@@ -142,27 +142,27 @@ class Rig:
             assert self.session.features.valid, self.session.features.reasons
 
     def ticks(self) -> int:
-        return self.ends.at * TICK_HZ // NS_PER_S % (1 << 32)
+        return self.sink.at * TICK_HZ // NS_PER_S % (1 << 32)
 
     def send(self, *messages: Any, seconds: float = 0.0) -> None:
         """Process messages from the board."""
-        self.ends.at = after(self.ends.at, seconds)
+        self.sink.at = after(self.sink.at, seconds)
         data = b"".join(m if isinstance(m, bytes) else encode_serial(m) for m in messages)
         for at in range(0, len(data), READ_LIMIT):
-            self.inbox.put(Chunk(self.ends.at, data[at : at + READ_LIMIT]))
+            self.inbox.put(Chunk(self.sink.at, data[at : at + READ_LIMIT]))
         while True:
-            self.port.pump(self.ends.at)
+            self.port.pump(self.sink.at)
             if not self.port.behind:
                 break
-        if self.ends.at >= self._second:
-            self._second = after(self.ends.at, 1.0)
-            self.session.each_second(self.ends.at)
+        if self.sink.at >= self._second:
+            self._second = after(self.sink.at, 1.0)
+            self.session.each_second(self.sink.at)
 
     def cycle(self, press: float = 0.0, seconds: float = 0.01) -> None:
         """One sampling cycle, and answers to the host; ``press``: counts along z."""
-        self.ends.at = after(self.ends.at, seconds)
+        self.sink.at = after(self.sink.at, seconds)
         answers: list[Any] = []
-        for data in self._asked():
+        for data in self._host_messages():
             answers.append(data)
         rng = np.random.default_rng(self.sequence)
         for a in self.descriptor.arrays:
@@ -176,7 +176,7 @@ class Rig:
         self.sequence = (self.sequence + 1) % (1 << 32)
         self.send(*answers)
 
-    def _asked(self) -> list[Any]:
+    def _host_messages(self) -> list[Any]:
         said: list[Any] = []
         heard, self.source.heard = self.source.heard, []
         for message in heard:
@@ -199,7 +199,7 @@ def recorder(tmp_path: Path) -> Iterator[Recorder]:
     made.close(30)
 
 
-def hostile(rng: random.Random, rig: Rig) -> Any:
+def hostile_item(rng: random.Random, rig: Rig) -> Any:
     """A random item: any message with a correct CRC, or bytes that are not a frame."""
     ticks = rng.choice((0, 1, 2**31, 2**32 - 1, rng.randrange(2**32), rig.ticks()))
     kind = rng.randrange(9)
@@ -234,7 +234,7 @@ def test_pipeline_and_log_survive_many_hostile_items(
 ) -> None:
     rng = random.Random(42)
     rig = Rig(recorder=recorder)
-    items = [hostile(rng, rig) for _ in range(3000)]
+    items = [hostile_item(rng, rig) for _ in range(3000)]
     frames = [item if isinstance(item, bytes) else encode_serial(item) for item in items]
     for k in range(ITEMS // 50):
         rig.send(*rng.choices(frames, k=50), seconds=rng.choice((0.0, 0.01, 0.3)))
@@ -258,9 +258,9 @@ def test_pipeline_and_log_survive_many_hostile_items(
     told = info(tmp_path / "a.mcap")
     assert told.whole
     counts = {c.topic: c.messages for c in told.channels}
-    assert counts["/tactile/b0/features"] == rig.ends.sent["features"]
+    assert counts["/tactile/b0/features"] == rig.sink.sent["features"]
     # A flood cannot fill a disk: some 4,000 s at the rates of the limits.
-    seconds = (rig.ends.at - 1000 * NS_PER_S) / NS_PER_S
+    seconds = (rig.sink.at - 1000 * NS_PER_S) / NS_PER_S
     assert counts["/tactile/b0/log"] < 200 + 12 * seconds
     assert (tmp_path / "a.mcap").stat().st_size < 30_000_000
 
@@ -276,16 +276,16 @@ def test_largest_boards_work_with_every_other_taxel_pressed(
     rig = Rig(replace(BOARD, arrays=largest().arrays[:count]), recorder)
     for _ in range(15):
         rig.cycle(press=8000.0)
-    features = codec().decode(FEATURES, rig.ends.last["features"][-1])
+    features = codec().decode(FEATURES, rig.sink.last["features"][-1])
     assert features.taxels_in_contact == count * 64
     assert 1 <= len(features.patches) <= MAX_PATCHES
-    assert len(codec().decode(FORCES, rig.ends.last["forces"][-1]).force) == count * 128 * 3
-    geometry = codec().decode(GEOMETRY, rig.ends.last["geometry"][-1])
+    assert len(codec().decode(FORCES, rig.sink.last["forces"][-1]).force) == count * 128 * 3
+    geometry = codec().decode(GEOMETRY, rig.sink.last["geometry"][-1])
     assert len(geometry.position) == len(geometry.normal) == count * 128 * 3
     # The unrolled skin, which is for pictures only, is left out when it does not fit.
     assert len(geometry.surface) == (0 if count == 16 else count * 128 * 2)
-    assert any("unrolled skin" in text for text in rig.ends.texts) == (count == 16)
-    parts = [codec().decode(CONTACTS, data).markers for data in rig.ends.last["contacts"]]
+    assert any("unrolled skin" in text for text in rig.sink.texts) == (count == 16)
+    parts = [codec().decode(CONTACTS, data).markers for data in rig.sink.last["contacts"]]
     starts = [i for i, part in enumerate(parts) if part[0].action == 3]
     whole = [marker for part in parts[starts[-2] : starts[-1]] for marker in part]
     assert sum(len(m.points) for m in whole if m.ns == "taxels") == count * 128
@@ -317,7 +317,7 @@ def test_failed_markers_do_not_stop_features(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     rig = Rig()
-    before = rig.ends.sent["features"]
+    before = rig.sink.sent["features"]
 
     def draw(picture: SkinPicture, *_: Any) -> Any:
         raise ZeroDivisionError("a mistake in a picture")
@@ -328,7 +328,7 @@ def test_failed_markers_do_not_stop_features(
     monkeypatch.setattr(SkinPicture, "draw", lambda *_: [object()])
     for _ in range(50):
         rig.cycle()
-    assert rig.ends.sent["features"] == before + 100
+    assert rig.sink.sent["features"] == before + 100
     assert rig.session.drops()["unsent_contacts"] == pytest.approx(10, abs=3)
     assert "a mistake in a picture" in caplog.text
 
@@ -336,7 +336,7 @@ def test_failed_markers_do_not_stop_features(
 @pytest.mark.parametrize("kind", ["features", "forces", "field"])
 def test_unencodable_message_costs_only_itself(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     rig = Rig()
-    before = rig.ends.sent.copy()
+    before = rig.sink.sent.copy()
     real: Callable[..., Any] = getattr(MessageMaker, kind)
     calls = []
 
@@ -350,7 +350,7 @@ def test_unencodable_message_costs_only_itself(kind: str, monkeypatch: pytest.Mo
     for _ in range(10):
         rig.cycle()
     for other in ("features", "forces", "field"):
-        assert rig.ends.sent[other] - before[other] == (5 if other == kind else 10)
+        assert rig.sink.sent[other] - before[other] == (5 if other == kind else 10)
     assert rig.session.drops()[f"unsent_{kind}"] == 5
 
 
@@ -368,10 +368,10 @@ def test_unexpected_event_costs_only_itself_and_is_reported(
         return real(pipeline, block)
 
     monkeypatch.setattr(BoardPipeline, "feed", now_and_then)
-    before = rig.ends.sent["features"]
+    before = rig.sink.sent["features"]
     for _ in range(100):
         rig.cycle()
-    assert rig.ends.sent["features"] >= before + 70
+    assert rig.sink.sent["features"] >= before + 70
     assert rig.session.drops()["spoilt_events"] == 10
     assert "a mistake in the pipeline" in caplog.text
 
@@ -381,8 +381,8 @@ def test_text_with_impossible_stamp_is_stamped_on_arrival(
 ) -> None:
     rig = Rig(recorder=recorder)
     for captured, text in (
-        (Instant(rig.ends.at - 2147483000 * NS_PER_S), "hello from 1955"),
-        (Instant(rig.ends.at - NS_PER_S), "hello"),
+        (Instant(rig.sink.at - 2147483000 * NS_PER_S), "hello from 1955"),
+        (Instant(rig.sink.at - NS_PER_S), "hello"),
     ):
         rig.session.handle(BoardLog(20, captured, text))
     assert rig.session.drops()["texts_without_time"] == 1
@@ -402,36 +402,36 @@ def test_text_with_impossible_stamp_is_stamped_on_arrival(
 
 def test_flood_of_serial_numbers_is_throttled_and_counted() -> None:
     rig = Rig()
-    said = len(rig.ends.texts)
+    said = len(rig.sink.texts)
     for k in range(3000):
         stranger = replace(BOARD, unique_id=(k + 1000).to_bytes(8, "big"))
         rig.send(stranger, seconds=0.001)
-    told = rig.ends.texts[said:]
+    told = rig.sink.texts[said:]
     assert 1 <= len(told) <= 10
     held = rig.session.drops()["texts_held_back"]
     assert held >= 2900
     rig.send(b"\0", seconds=10.0)
     rig.send(b"\0", seconds=10.0)
-    assert any("times more in" in text and "refused" in text for text in rig.ends.texts)
+    assert any("times more in" in text and "refused" in text for text in rig.sink.texts)
 
 
 def test_flood_of_firmware_texts_is_throttled_and_counted() -> None:
     rig = Rig()
-    before = rig.ends.sent["log"]
+    before = rig.sink.sent["log"]
     rig.send(*(Log(40, rig.ticks(), f"flood {k}") for k in range(5000)))
-    assert rig.ends.sent["log"] == before + FIRMWARE_BURST
+    assert rig.sink.sent["log"] == before + FIRMWARE_BURST
     assert rig.session.drops()["texts_held_back"] == 5000 - FIRMWARE_BURST
     rig.send(b"\0", seconds=2.0)
-    assert f"{5000 - FIRMWARE_BURST} texts held back, too many: firmware" in rig.ends.texts
+    assert f"{5000 - FIRMWARE_BURST} texts held back, too many: firmware" in rig.sink.texts
 
 
 def test_board_that_keeps_changing_shape_is_refused() -> None:
     rig = Rig()
-    before = rig.ends.sent["geometry"]
+    before = rig.sink.sent["geometry"]
     for k in range(200):
         rig.send(replace(BOARD, arrays=(array(0, 1, 1 + k % 100),)), seconds=0.01)
-    assert rig.ends.sent["geometry"] <= before + SET_UP_BURST + 3
-    assert any("describes itself anew again and again" in text for text in rig.ends.texts)
+    assert rig.sink.sent["geometry"] <= before + SET_UP_BURST + 3
+    assert any("describes itself anew again and again" in text for text in rig.sink.texts)
 
 
 def test_throttle_passes_a_burst_then_its_rate() -> None:

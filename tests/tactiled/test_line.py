@@ -23,7 +23,7 @@ from tactiled.boards.line import CanLine, LineEvent, SerialLine
 At = Callable[[float], Instant]
 
 
-def welcome(node: int, identity: Identity) -> Refusal | None:
+def admit_all(node: int, identity: Identity) -> Refusal | None:
     return None
 
 
@@ -66,7 +66,7 @@ def feed(line: SerialLine, at: At, seconds: float, data: Callable[[int], bytes])
 
 
 def test_own_protocol_board_is_found_by_its_answer(board: Any, instant: At) -> None:
-    line = SerialLine("p", welcome)
+    line = SerialLine("p", admit_all)
     line.connect(instant(0.0))
     events = serve(line, board, instant, 1.0)
     assert isinstance(line.links[0], BoardLink)
@@ -75,7 +75,7 @@ def test_own_protocol_board_is_found_by_its_answer(board: Any, instant: At) -> N
 
 
 def test_float_board_is_found_by_its_frames(instant: At) -> None:
-    line = SerialLine("p", welcome)
+    line = SerialLine("p", admit_all)
     line.connect(instant(0.0), usb_serial="USB7")
     events = feed(line, instant, 2.0, lambda k: floats(100.0 + k))
     assert isinstance(line.links[0], FloatLink)
@@ -88,7 +88,7 @@ def test_float_board_is_found_by_its_frames(instant: At) -> None:
 
 
 def test_bytes_buffered_before_opening_are_not_taken_as_new(instant: At) -> None:
-    line = SerialLine("p", welcome)
+    line = SerialLine("p", admit_all)
     line.connect(instant(0.0))
     old = b"".join(floats(-1.0) for _ in range(100))
     events = feed(line, instant, 2.0, lambda k: old if k == 0 else floats(1.0))
@@ -98,13 +98,13 @@ def test_bytes_buffered_before_opening_are_not_taken_as_new(instant: At) -> None
 
 
 def test_configured_kind_is_not_second_guessed(instant: At) -> None:
-    line = SerialLine("p", welcome, kind="tactile")
+    line = SerialLine("p", admit_all, kind="tactile")
     line.connect(instant(0.0))
     events = feed(line, instant, 4.0, lambda k: floats(100.0 + k))
     (diagnosed,) = of(events, Diagnosed)
     assert "--kind" in diagnosed.remedy
     with pytest.raises(ValueError, match="anyskin"):
-        SerialLine("p", welcome, kind="skin")
+        SerialLine("p", admit_all, kind="skin")
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_configured_kind_is_not_second_guessed(instant: At) -> None:
 def test_port_without_a_board_is_diagnosed_once(
     instant: At, data: Callable[[int], bytes], said: str
 ) -> None:
-    line = SerialLine("/dev/ttyX", welcome)
+    line = SerialLine("/dev/ttyX", admit_all)
     line.connect(instant(0.0), byte_time=1e-4)
     events = feed(line, instant, 6.0, data)
     (diagnosed,) = of(events, Diagnosed)
@@ -130,7 +130,7 @@ def test_port_without_a_board_is_diagnosed_once(
 
 def test_board_that_does_not_receive_is_diagnosed(board: Any, instant: At) -> None:
     board.deaf, board.streaming = True, True
-    line = SerialLine("p", welcome)
+    line = SerialLine("p", admit_all)
     line.connect(instant(0.0))
     events = serve(line, board, instant, 4.0)
     (diagnosed,) = of(events, Diagnosed)
@@ -138,7 +138,7 @@ def test_board_that_does_not_receive_is_diagnosed(board: Any, instant: At) -> No
 
 
 def test_wire_time_of_trailing_bytes_is_subtracted(board: Any, instant: At) -> None:
-    line = SerialLine("p", welcome)
+    line = SerialLine("p", admit_all)
     line.connect(instant(0.0), byte_time=1e-4)
     serve(line, board, instant, 1.0)
     line.tick(instant(1.0))
@@ -150,7 +150,7 @@ def test_wire_time_of_trailing_bytes_is_subtracted(board: Any, instant: At) -> N
 
 
 def test_replugged_board_continues_where_it_stopped(board: Any, instant: At) -> None:
-    line = SerialLine("p", welcome)
+    line = SerialLine("p", admit_all)
     line.connect(instant(0.0))
     serve(line, board, instant, 1.0)
     line.disconnect()
@@ -199,7 +199,7 @@ def test_boards_on_a_bus_are_discovered_then_served_separately(
     make_board: Callable[..., Any], instant: At
 ) -> None:
     boards = {3: make_board("00000000000000a3"), 5: make_board("00000000000000a5")}
-    line = CanLine("can", welcome)
+    line = CanLine("can", admit_all)
     bus = Bus(line, boards, instant)
     line.connect(instant(0.0))
     events = bus.run(0.0, 2.0)
@@ -214,7 +214,7 @@ def test_boards_on_a_bus_are_discovered_then_served_separately(
 
 
 def test_late_board_is_found_by_its_status(make_board: Callable[..., Any], instant: At) -> None:
-    line = CanLine("can", welcome)
+    line = CanLine("can", admit_all)
     bus = Bus(line, {3: make_board("00000000000000a3")}, instant)
     line.connect(instant(0.0))
     bus.run(0.0, 2.0)
@@ -229,7 +229,7 @@ def test_late_board_is_found_by_its_status(make_board: Callable[..., Any], insta
 def test_unrequested_boards_are_counted_not_used(
     make_board: Callable[..., Any], instant: At
 ) -> None:
-    line = CanLine("can", welcome, nodes=frozenset({3}))
+    line = CanLine("can", admit_all, nodes=frozenset({3}))
     boards = {3: make_board("00000000000000a3"), 5: make_board("00000000000000a5")}
     bus = Bus(line, boards, instant)
     line.connect(instant(0.0))
@@ -239,12 +239,12 @@ def test_unrequested_boards_are_counted_not_used(
 
 
 def test_bus_without_boards_is_diagnosed(instant: At) -> None:
-    line = CanLine("can", welcome)
+    line = CanLine("can", admit_all)
     bus = Bus(line, {}, instant)
     line.connect(instant(0.0))
     (diagnosed,) = of(bus.run(0.0, 6.0), Diagnosed)
     assert "silent" in diagnosed.problem
-    other = CanLine("can", welcome)
+    other = CanLine("can", admit_all)
     other.connect(instant(0.0))
     other.receive(Chunk(instant(0.0), (CanFrame(0x123, b"hello"),)))
     events: list[LineEvent] = []
@@ -257,7 +257,7 @@ def test_bus_without_boards_is_diagnosed(instant: At) -> None:
 def test_recording_needs_no_answers(
     board: Any, instant: At, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    live = SerialLine("p", welcome)
+    live = SerialLine("p", admit_all)
     live.connect(instant(0.0))
     tape: list[Chunk] = []
     take = live.receive
@@ -268,7 +268,7 @@ def test_recording_needs_no_answers(
 
     monkeypatch.setattr(live, "receive", record)
     heard = of(serve(live, board, instant, 2.0), Sampled)
-    again = SerialLine("p", welcome, listen_only=True)
+    again = SerialLine("p", admit_all, listen_only=True)
     again.connect(instant(0.0))
     events: list[LineEvent] = []
     for chunk in tape:
@@ -284,7 +284,7 @@ def test_recording_needs_no_answers(
 
 def test_other_protocol_versions_are_refused_on_a_line(board: Any, instant: At) -> None:
     board.descriptor = replace(board.descriptor, major=3)
-    line = SerialLine("p", welcome)
+    line = SerialLine("p", admit_all)
     line.connect(instant(0.0))
     events = serve(line, board, instant, 4.0)
     assert "3.0" in of(events, Refused)[0].refusal.problem
@@ -292,7 +292,7 @@ def test_other_protocol_versions_are_refused_on_a_line(board: Any, instant: At) 
 
 
 def test_temporarily_quiet_board_is_not_called_deaf(board: Any, instant: At) -> None:
-    line = SerialLine("p", welcome)
+    line = SerialLine("p", admit_all)
     line.connect(instant(0.0))
     serve(line, board, instant, 5.0)
     board.mute = True

@@ -33,7 +33,7 @@ At = Callable[[float], Instant]
 RATES = [0.5, 1.0, 2.0, 5.0, 60.0, 1000.0]
 
 
-def welcome(node: int, identity: Identity) -> Refusal | None:
+def admit_all(node: int, identity: Identity) -> Refusal | None:
     del node, identity
     return None
 
@@ -61,7 +61,7 @@ def play_floats(line: SerialLine, at: At, rate: float, frames: int, until: float
 
 @pytest.mark.parametrize("rate", RATES)
 def test_float_board_is_found_and_never_called_silent(rate: float, instant: At) -> None:
-    line, frames = SerialLine("p", welcome), max(20, round(4 * rate))
+    line, frames = SerialLine("p", admit_all), max(20, round(4 * rate))
     events = play_floats(line, instant, rate, frames, frames / rate)
     blocks = [e.block for e in events if isinstance(e, Sampled)]
     assert len(blocks) >= frames - 6 - rate * 0.6
@@ -77,7 +77,7 @@ def test_float_board_is_found_and_never_called_silent(rate: float, instant: At) 
 def test_stopped_float_board_is_called_silent_after_its_own_period(
     rate: float, instant: At
 ) -> None:
-    line, frames = SerialLine("p", welcome), max(16, round(2 * rate))
+    line, frames = SerialLine("p", admit_all), max(16, round(2 * rate))
     last = (frames - 0.7) / rate
     limit = max(0.2, 3 / rate)
     events = play_floats(line, instant, rate, frames, last + limit + max(0.1, 0.3 / rate))
@@ -87,7 +87,7 @@ def test_stopped_float_board_is_called_silent_after_its_own_period(
 
 def test_rare_garbage_is_reported_as_such(instant: At) -> None:
     rng = np.random.default_rng(1)
-    line, told = SerialLine("p", welcome), []
+    line, told = SerialLine("p", admit_all), []
     line.connect(instant(0.0))
     for k in range(4000):
         now = k * 0.01
@@ -102,7 +102,7 @@ def test_rare_garbage_is_reported_as_such(instant: At) -> None:
 
 def test_flood_of_garbage_is_reported_within_three_seconds(instant: At) -> None:
     rng = np.random.default_rng(1)
-    line, told = SerialLine("p", welcome), []
+    line, told = SerialLine("p", admit_all), []
     line.connect(instant(0.0))
     for k in range(500):
         told += [(k * 0.01, e.event) for e in line.tick(instant(k * 0.01))]
@@ -137,7 +137,7 @@ def test_own_protocol_board_is_served_at_any_rate(
     board = make_board(period=1 / rate)
     board.rate_mhz = {"its rate": round(rate * 1000), "nothing": 0, "another rate": 100_000}[says]
     seconds = max(3.0, 12 / rate)
-    events = play_board(SerialLine("p", welcome), board, instant, seconds, min(0.005, 1 / rate))
+    events = play_board(SerialLine("p", admit_all), board, instant, seconds, min(0.005, 1 / rate))
     assert len([e for e in events if isinstance(e, Sampled)]) >= 2 * (seconds * rate * 0.8 - 2)
     assert not [e for e in events if isinstance(e, Reset)]
     if says != "another rate":  # the reported rate is used until the actual one is measured
@@ -203,7 +203,7 @@ def test_features_are_marked_while_the_board_clock_is_unusable(instant: At) -> N
 def test_changed_tick_rate_is_reported_after_reconnect(
     make_board: Callable[..., Any], descriptor: Descriptor, instant: At
 ) -> None:
-    line, board = SerialLine("p", welcome), make_board()
+    line, board = SerialLine("p", admit_all), make_board()
     play_board(line, board, instant, 1.0, 0.01)
     again = replace(descriptor, tick_hz=1000)
     events = line.receive(Chunk(instant(1.0), encode_serial(again)))

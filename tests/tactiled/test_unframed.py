@@ -21,7 +21,7 @@ from tactiled.sensing.pipeline import BoardPipeline
 At = Callable[[float], Instant]
 
 
-def welcome(node: int, identity: Identity) -> Refusal | None:
+def admit_all(node: int, identity: Identity) -> Refusal | None:
     return None
 
 
@@ -77,7 +77,7 @@ def of(events: list[Any], kind: type) -> list[Any]:
 def test_detected_or_declared_board_streams(
     board: str, sent: str, read: str | None, instant: At
 ) -> None:
-    line = SerialLine("p", welcome, board)
+    line = SerialLine("p", admit_all, board)
     line.connect(instant(0.0), usb_serial="USB7")
     events = play(line, instant, frames(sent, 300))
     assert not of(events, Diagnosed)
@@ -109,7 +109,7 @@ def test_detected_or_declared_board_streams(
 def test_ambiguous_layout_is_named_once_without_blaming_the_baud_rate(
     sent: str, words: str, board: str, uart: bool, instant: At
 ) -> None:
-    line = SerialLine("/dev/ttyACM0", welcome)
+    line = SerialLine("/dev/ttyACM0", admit_all)
     line.connect(instant(0.0), byte_time=1e-5 if uart else 0.0)
     events = play(line, instant, frames(sent, 600))
     (diagnosed,) = of(events, Diagnosed)
@@ -129,7 +129,7 @@ def test_ambiguous_layout_is_named_once_without_blaming_the_baud_rate(
     ],
 )
 def test_baud_rate_is_never_blamed_on_usb(data: list[bytes], instant: At) -> None:
-    line = SerialLine("/dev/ttyACM0", welcome)
+    line = SerialLine("/dev/ttyACM0", admit_all)
     line.connect(instant(0.0), byte_time=0.0)
     (diagnosed,) = of(play(line, instant, data), Diagnosed)
     assert "baud" not in diagnosed.problem + diagnosed.remedy
@@ -137,7 +137,7 @@ def test_baud_rate_is_never_blamed_on_usb(data: list[bytes], instant: At) -> Non
 
 def test_declared_board_is_not_second_guessed(instant: At) -> None:
     """Twelve floats are four chips if the user declares so."""
-    line = SerialLine("p", welcome, "floats:4xyz")
+    line = SerialLine("p", admit_all, "floats:4xyz")
     line.connect(instant(0.0))
     sent = [
         struct.pack("<12f", *(r + np.random.default_rng(k).normal(0, 0.02, 12))) + b"\r\n"
@@ -148,7 +148,7 @@ def test_declared_board_is_not_second_guessed(instant: At) -> None:
 
 
 def test_board_with_changed_firmware_is_detected_again(instant: At) -> None:
-    line = SerialLine("p", welcome)
+    line = SerialLine("p", admit_all)
     line.connect(instant(0.0))
     play(line, instant, frames("floats:5txyz,end=crlf", 200))
     line.disconnect()
@@ -160,7 +160,7 @@ def test_board_with_changed_firmware_is_detected_again(instant: At) -> None:
 
 def test_bytes_before_layout_detection_are_counted(instant: At) -> None:
     for board, sent in (("auto", "text:5xyzt"), ("floats:5xyz", "floats:5xyz,end=lf")):
-        line = SerialLine("p", welcome, board)
+        line = SerialLine("p", admit_all, board)
         line.connect(instant(0.0))
         data = frames(sent, 200)
         used = len(of(play(line, instant, data), Sampled))
@@ -169,7 +169,7 @@ def test_bytes_before_layout_detection_are_counted(instant: At) -> None:
 
 
 def test_slow_board_is_given_time(instant: At) -> None:
-    line = SerialLine("p", welcome)
+    line = SerialLine("p", admit_all)
     line.connect(instant(0.0))
     lines = [
         b"X: %.4f uT\r\nY: %.4f uT\r\nZ: %.4f uT\r\n" % (400 + k % 3, -30, 900) for k in range(20)
@@ -182,12 +182,12 @@ def test_slow_board_is_given_time(instant: At) -> None:
 @pytest.mark.parametrize("text", ["skin", "floats", "floats:5", "auto:5xyz"])
 def test_unknown_kind_lists_available_kinds(text: str) -> None:
     with pytest.raises(ValueError, match="floats:5xyz"):
-        SerialLine("p", welcome, text)
+        SerialLine("p", admit_all, text)
 
 
 def test_boards_of_one_controller_are_separate_arrays(instant: At) -> None:
     """The link sees one array; the calibration splits it."""
-    line = SerialLine("p", welcome)
+    line = SerialLine("p", admit_all)
     line.connect(instant(0.0))
     blocks = [
         e.block for e in of(play(line, instant, frames("floats:10txyz,end=crlf", 300)), Sampled)
@@ -228,7 +228,7 @@ def test_arrays_without_poses_share_no_ambient_field(instant: At) -> None:
 
 
 def test_board_without_temperatures_has_forces(instant: At) -> None:
-    line = SerialLine("p", welcome, "floats:5xyz")
+    line = SerialLine("p", admit_all, "floats:5xyz")
     line.connect(instant(0.0))
     blocks = [
         e.block for e in of(play(line, instant, frames("floats:5xyz,end=crlf", 300)), Sampled)

@@ -14,7 +14,7 @@ from tactile_core.types import Echo, Instant, after
 MS = 1_000_000
 
 
-class Way:
+class DelayedCommands:
     """Commands reach the arm after ``delay`` ms; its states echo the one in effect."""
 
     def __init__(self, rig: Any) -> None:
@@ -41,23 +41,23 @@ class Way:
 
 
 @pytest.fixture
-def way(rig: Callable) -> Way:
-    made = Way(rig())
+def delayed(rig: Callable) -> DelayedCommands:
+    made = DelayedCommands(rig())
     assert made.run(20)[0] is None
     return made
 
 
 @pytest.mark.parametrize("delay", [0.0, 10.0, 30.0, 39.9])
-def test_short_echo_delay_is_ignored(delay: float, way: Way) -> None:
-    way.delay = delay
-    assert way.run(100)[0] is None
+def test_short_echo_delay_is_ignored(delay: float, delayed: DelayedCommands) -> None:
+    delayed.delay = delay
+    assert delayed.run(100)[0] is None
 
 
 @pytest.mark.parametrize("delay", [60.0, 100.0, 250.0])
-def test_long_echo_delay_stops_at_once_and_latches(delay: float, way: Way) -> None:
+def test_long_echo_delay_stops_at_once_and_latches(delay: float, delayed: DelayedCommands) -> None:
     """Row 37: within 100 ms after the echo is 50 ms late."""
-    way.delay = delay
-    seen = [way.step() for _ in range(30)]
+    delayed.delay = delay
+    seen = [delayed.step() for _ in range(30)]
     stopped = [k for k, d in enumerate(seen) if d.twist == ZERO]
     latched = [k for k, d in enumerate(seen) if d.held is not None]
     assert stopped[0] <= 5
@@ -66,38 +66,38 @@ def test_long_echo_delay_stops_at_once_and_latches(delay: float, way: Way) -> No
     assert "come into force" in seen[latched[0]].interventions[0].text
 
 
-def test_slowly_growing_echo_delay_is_detected_at_50_ms(way: Way) -> None:
-    way.slow = 10.0
-    when, decision = way.run(700)
+def test_slowly_growing_echo_delay_is_detected_at_50_ms(delayed: DelayedCommands) -> None:
+    delayed.slow = 10.0
+    when, decision = delayed.run(700)
     assert when is not None
     assert decision.held is Check.ECHO_LOST
-    assert 40.0 <= way.delay <= 52.0
+    assert 40.0 <= delayed.delay <= 52.0
 
 
-def test_single_delay_spike_only_stops(way: Way) -> None:
-    way.delay = 80.0
-    stopped = sum(way.step().twist == ZERO for _ in range(4))
-    way.delay = 5.0
-    seen = [way.step() for _ in range(10)]
+def test_single_delay_spike_only_stops(delayed: DelayedCommands) -> None:
+    delayed.delay = 80.0
+    stopped = sum(delayed.step().twist == ZERO for _ in range(4))
+    delayed.delay = 5.0
+    seen = [delayed.step() for _ in range(10)]
     assert stopped
     assert all(d.held is None for d in seen)
     assert seen[-1].twist != ZERO
 
 
-def test_stalled_loop_does_not_count_as_echo_delay(way: Way) -> None:
-    way.rig.now = after(way.rig.now, 0.5)
-    decisions = [way.step() for _ in range(5)]
+def test_stalled_loop_does_not_count_as_echo_delay(delayed: DelayedCommands) -> None:
+    delayed.rig.now = after(delayed.rig.now, 0.5)
+    decisions = [delayed.step() for _ in range(5)]
     codes = {i.code for d in decisions for i in d.interventions}
     assert not codes & {Check.ECHO_LATE, Check.ECHO_LOST}
 
 
 def test_the_checks_can_be_switched_off(rig: Callable) -> None:
-    way = Way(rig(Check.ECHO_LATE, Check.ECHO_LOST))
-    way.run(10)
-    way.delay = 300.0
-    assert way.run(60)[0] is None
-    assert way.step().twist != ZERO
-    only = Way(rig(Check.ECHO_LOST))
+    delayed = DelayedCommands(rig(Check.ECHO_LATE, Check.ECHO_LOST))
+    delayed.run(10)
+    delayed.delay = 300.0
+    assert delayed.run(60)[0] is None
+    assert delayed.step().twist != ZERO
+    only = DelayedCommands(rig(Check.ECHO_LOST))
     only.run(10)
     only.delay = 300.0
     assert only.run(60)[0] is None
@@ -105,8 +105,8 @@ def test_the_checks_can_be_switched_off(rig: Callable) -> None:
 
 
 @pytest.mark.parametrize("who", ["", "other-2"])
-def test_arm_obeying_another_commander_latches(who: str, way: Way) -> None:
-    r = way.rig
+def test_arm_obeying_another_commander_latches(who: str, delayed: DelayedCommands) -> None:
+    r = delayed.rig
     echo = Echo(who, 5, Instant(r.now), own=False)
     decision = r.step(arm=r.fresh_arm(-r.period, echo=echo))
     assert decision.held is Check.COMMANDER

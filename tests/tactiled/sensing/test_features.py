@@ -19,7 +19,7 @@ ROTATION = np.concatenate([a.rotation for a in GEOMETRY.arrays])
 MS = 1_000_000
 
 
-class Feel:
+class FedExtractor:
     """An extractor fed cycle by cycle at 100 Hz."""
 
     def __init__(self, **changes):
@@ -44,7 +44,7 @@ def presses(**newton):
 
 
 def test_untouched_board_has_no_contact():
-    features = Feel()()
+    features = FedExtractor()()
     assert features.peak_force == 0.0
     assert features.peak_side is Side.NONE
     assert features.patches == ()
@@ -58,7 +58,7 @@ def test_wrench_of_a_known_press_is_exact():
     force = np.zeros((80, 3))
     in_ee = np.array([-0.5, -2.0, 0.0])  # the left side's normal is +y
     force[taxel] = in_ee @ ROTATION[taxel]
-    features = Feel()(force)
+    features = FedExtractor()(force)
     np.testing.assert_allclose(ROTATION[taxel][:, 2], [0, 1, 0], atol=1e-9)
     np.testing.assert_allclose(features.wrench[:3], in_ee, atol=1e-12)
     x, y, z = POSITION[taxel]
@@ -77,22 +77,22 @@ def test_wrench_of_a_known_press_is_exact():
 def test_normal_of_a_patch_round_the_tip_lies_between_those_of_its_taxels():
     tip = [t for t in range(64, 80) if abs(POSITION[t][2] - POSITION[64][2]) < 1e-9]
     pressed = tip[:2]
-    features = Feel()(presses(**{f"t{t}": 2.0 for t in pressed}))
+    features = FedExtractor()(presses(**{f"t{t}": 2.0 for t in pressed}))
     (patch,) = features.patches
     middle = ROTATION[pressed][:, :, 2].sum(axis=0)
     np.testing.assert_allclose(patch.normal, middle / np.linalg.norm(middle), atol=1e-9)
 
 
 def test_press_between_taxels_is_located_between_them():
-    features = Feel()(presses(t9=1.0, t10=1.0))
+    features = FedExtractor()(presses(t9=1.0, t10=1.0))
     np.testing.assert_allclose(features.peak_position, (POSITION[9] + POSITION[10]) / 2)
-    features = Feel()(presses(t9=3.0, t10=1.0))
+    features = FedExtractor()(presses(t9=3.0, t10=1.0))
     np.testing.assert_allclose(features.peak_position, 0.75 * POSITION[9] + 0.25 * POSITION[10])
 
 
 def test_patches_are_clusters_within_one_array_strongest_first():
     force = presses(t0=1.0, t9=2.0, t20=0.5, t31=1.0, t64=4.0)  # 0 and 9 touch at a corner
-    features = Feel()(force)
+    features = FedExtractor()(force)
     assert [(p.array, p.taxels, round(p.normal_force, 6)) for p in features.patches] == [
         (2, 1, 4.0),
         (0, 2, 3.0),
@@ -108,7 +108,7 @@ def test_patches_are_clusters_within_one_array_strongest_first():
 
 def test_touching_arrays_are_not_one_patch():
     """Taxel 31 is the last of the left array and 32 the first of the right."""
-    assert len(Feel()(presses(t31=1.0, t32=1.0)).patches) == 2
+    assert len(FedExtractor()(presses(t31=1.0, t32=1.0)).patches) == 2
 
 
 @settings(max_examples=50, deadline=None)
@@ -139,7 +139,7 @@ def test_neighbours_on_grid_and_cross():
 
 
 def test_contact_has_hysteresis_against_noise():
-    feel = Feel()
+    feel = FedExtractor()
     assert feel(presses(t5=0.25)).taxels_in_contact == 0  # once above the threshold may be noise
     assert feel(presses(t5=0.0)).taxels_in_contact == 0
     assert feel(presses(t5=0.25)).taxels_in_contact == 0
@@ -160,10 +160,10 @@ def test_no_false_contact_in_many_hours_of_noise(board, stream):
 
 
 def test_smallest_contact_is_a_tenth_of_a_newton():
-    feel = Feel()
+    feel = FedExtractor()
     feel.extractor.set_noise(np.full(80, 1e-6))
     assert feel(presses(t5=0.14)).taxels_in_contact == 1
-    assert Feel().extractor.contact.sum() == 0
+    assert FedExtractor().extractor.contact.sum() == 0
     feel.extractor.reset()
     feel.extractor.set_noise(np.full(80, 1e-6))
     assert feel(presses(t5=0.09)).taxels_in_contact == 0
@@ -173,7 +173,7 @@ def test_smallest_contact_is_a_tenth_of_a_newton():
 def test_masked_taxel_is_excluded_without_ending_contacts():
     force = presses(t5=1.0, t6=2.0)
     force[6] = np.nan
-    features = Feel()(force, masked=1)
+    features = FedExtractor()(force, masked=1)
     assert features.taxels_in_contact == 1
     assert features.taxels_masked == 1
     assert features.normal_force == pytest.approx(1.0)
@@ -187,7 +187,7 @@ def test_features_are_finite_and_add_up(seed, masked):
     rng = np.random.default_rng(seed)
     force = rng.normal(0, 1, (80, 3)) * rng.integers(0, 2, (80, 1))
     force[list(masked)] = np.nan
-    features = Feel()(force, masked=len(masked))
+    features = FedExtractor()(force, masked=len(masked))
     assert np.isfinite(features.wrench).all()
     assert np.isfinite(features.peak_position).all()
     assert sum(p.normal_force for p in features.patches) == pytest.approx(features.normal_force)
@@ -199,7 +199,7 @@ def test_features_are_finite_and_add_up(seed, masked):
 
 
 def test_light_tip_contact_time_is_measured():
-    feel = Feel()
+    feel = FedExtractor()
     light = presses(t70=2.0)
     assert feel(light).tip_contact_time == 0.0
     for _ in range(10):
@@ -212,7 +212,7 @@ def test_light_tip_contact_time_is_measured():
 
 
 def test_one_lost_cycle_is_bridged_two_are_not():
-    feel = Feel()
+    feel = FedExtractor()
     light = presses(t70=2.0)
     for _ in range(5):
         feel(light)
@@ -224,7 +224,7 @@ def test_one_lost_cycle_is_bridged_two_are_not():
 
 
 def test_light_contact_limits_are_configurable():
-    feel = Feel(tip_light_n=(1.0, 3.0))
+    feel = FedExtractor(tip_light_n=(1.0, 3.0))
     feel(presses(t70=2.0))
     assert feel(presses(t70=2.0)).tip_contact_time > 0
     assert feel(presses(t70=3.1)).tip_contact_time == 0
@@ -246,7 +246,7 @@ def test_tip_contact_time_survives_a_lost_tip_block(board, stream, field_of):
 
 
 def test_patch_includes_subthreshold_force_around_it():
-    features = Feel()(presses(t9=2.0, t8=0.05, t10=0.05, t30=0.05))  # t30 is far away
+    features = FedExtractor()(presses(t9=2.0, t8=0.05, t10=0.05, t30=0.05))  # t30 is far away
     assert features.taxels_in_contact == 1
     assert features.normal_force == pytest.approx(2.1)
     assert features.patches[0].normal_force == pytest.approx(2.1)
@@ -254,11 +254,11 @@ def test_patch_includes_subthreshold_force_around_it():
 
 
 def test_pulled_neighbour_does_not_reduce_a_patch():
-    features = Feel()(presses(t9=2.0, t10=-0.5, t8=-0.1))
+    features = FedExtractor()(presses(t9=2.0, t10=-0.5, t8=-0.1))
     assert features.normal_force == pytest.approx(1.9)
 
 
 def test_masked_taxels_around_a_patch_are_excluded():
     force = presses(t9=2.0)
     force[10] = np.nan
-    assert Feel()(force, masked=1).normal_force == pytest.approx(2.0)
+    assert FedExtractor()(force, masked=1).normal_force == pytest.approx(2.0)

@@ -42,7 +42,7 @@ ARRAY = anyskin().arrays[0]
 PLACE = np.column_stack([ARRAY.surface, np.zeros(5)])
 
 
-class Owner:
+class UserBoard:
     """The readings of a user's board, frame by frame."""
 
     def __init__(self, hz: float = 100.0, seed: int = 1) -> None:
@@ -98,7 +98,7 @@ def codes(cycles: list[Cycle]) -> set[str]:
     return {code for cycle in cycles for code in cycle.features.codes}
 
 
-def honest(cycles: list[Cycle], newton: float) -> float:
+def share_within_bound(cycles: list[Cycle], newton: float) -> float:
     """Share of the cycles whose bound includes a normal force of ``newton``."""
     return float(
         np.mean(
@@ -123,7 +123,7 @@ def test_press_on_a_calibrated_board_reads_true_force(newton):
     assert read == pytest.approx(truth[-1], abs=max(0.25, 0.06 * truth[-1]))
     assert all(c.features.valid for c in late)
     # a single slight press may be off throughout; over all presses it is 97 %, see the bench
-    assert honest(late, truth[-1]) > (0.95 if newton > 1.0 else 0.6)
+    assert share_within_bound(late, truth[-1]) > (0.95 if newton > 1.0 else 0.6)
     # and the force ends with the press
     _, after = board.run(lambda _: np.zeros((5, 3)), lambda _: np.eye(3), 1.0)
     assert after[-1].features.normal_force < 0.25
@@ -131,11 +131,11 @@ def test_press_on_a_calibrated_board_reads_true_force(newton):
 
 @pytest.mark.parametrize("chips", [[], [2], [0, 1, 2]])
 def test_bounds_hold_while_the_board_turns_under_a_press(chips):
-    owner = Owner()
-    owner.play(lambda t: REST + turning(t), 2.0)
+    user_board = UserBoard()
+    user_board.play(lambda t: REST + turning(t), 2.0)
     load = pressed(dict.fromkeys(chips, 2.0))
-    cycles = owner.play(lambda t: REST + turning(2.0 + t) + load, 6.0)
-    assert honest(cycles, 2.0 * len(chips)) > 0.97
+    cycles = user_board.play(lambda t: REST + turning(2.0 + t) + load, 6.0)
+    assert share_within_bound(cycles, 2.0 * len(chips)) > 0.97
     if chips:
         peaks = [c.features.peak_force for c in cycles[50:]]
         assert np.median(peaks) == pytest.approx(2.0, abs=0.15)
@@ -161,48 +161,48 @@ def test_taxel_bounds_grow_while_the_field_is_unobserved():
 
 
 def test_jump_of_a_uniform_field_is_not_a_contact():
-    owner = Owner()
+    user_board = UserBoard()
     leap = in_chips(np.tile([1200.0, -800.0, 1400.0], (5, 1)))
-    on = owner.play(lambda t: REST + leap * min(1.0, t / 0.2), 1.5)
+    on = user_board.play(lambda t: REST + leap * min(1.0, t / 0.2), 1.5)
     assert "field_jump" in codes(on)
     assert not any(c.features.valid and c.features.normal_force > 0.5 for c in on)
-    assert owner.pipeline.rest_state is RestState.SUSPECT
+    assert user_board.pipeline.rest_state is RestState.SUSPECT
     text = next(r.text for r in on[-1].features.reasons if r.code == "field_jump")
     assert "on all taxels at once" in text
     assert "tare" in text
-    off = owner.play(lambda _: REST, 3.0)
+    off = user_board.play(lambda _: REST, 3.0)
     assert off[-1].features.valid
     assert off[-1].features.normal_force < 0.1
-    assert owner.pipeline.rest_state is RestState.KNOWN
+    assert user_board.pipeline.rest_state is RestState.KNOWN
 
 
 @pytest.mark.parametrize("gain", [1.2, 0.8, 0.6])
 def test_gain_change_is_detected_at_once_and_adopted(gain):
-    owner = Owner()
-    cycles = owner.play(lambda _: REST * gain, 3.0)
+    user_board = UserBoard()
+    cycles = user_board.play(lambda _: REST * gain, 3.0)
     assert cycles[0].features.codes[0] == "gain_changed"
     assert not any(c.features.valid and c.features.normal_force > 0.3 for c in cycles)
     assert cycles[-1].features.valid
 
 
 def test_exchanged_skin_is_never_a_contact_and_is_adopted():
-    owner = Owner(hz=40.0)
-    bare = owner.play(lambda _: BARE, 2.0)
+    user_board = UserBoard(hz=40.0)
+    bare = user_board.play(lambda _: BARE, 2.0)
     assert codes(bare) >= {"skin_off:skin"}
     assert not any(c.features.valid for c in bare)
-    other = owner.play(lambda _: OTHER_SKIN, 4.0)
+    other = user_board.play(lambda _: OTHER_SKIN, 4.0)
     assert not any(c.features.valid and c.features.normal_force > 0.3 for c in other)
     assert other[-1].features.valid
-    assert owner.pipeline.tare_report.accepted
-    press = owner.play(lambda _: OTHER_SKIN + pressed({2: 3.0}), 2.0)
+    assert user_board.pipeline.tare_report.accepted
+    press = user_board.play(lambda _: OTHER_SKIN + pressed({2: 3.0}), 2.0)
     assert press[-1].features.normal_force == pytest.approx(3.0, abs=0.3)
 
 
 def test_loose_magnet_leaves_its_taxel_masked():
-    owner = Owner(hz=40.0)
+    user_board = UserBoard(hz=40.0)
     lost = REST.copy()
     lost[2] = 20, 10, 30
-    cycles = owner.play(lambda _: lost, 4.0)
+    cycles = user_board.play(lambda _: lost, 4.0)
     assert not any(c.features.valid and c.features.normal_force > 0.3 for c in cycles)
     assert "magnet_lost:skin" in codes(cycles)
     assert np.isnan(cycles[-1].force[2]).all()
@@ -210,58 +210,58 @@ def test_loose_magnet_leaves_its_taxel_masked():
 
 
 def test_warming_is_not_a_contact_and_widens_the_bound():
-    owner = Owner(hz=20.0)
+    user_board = UserBoard(hz=20.0)
 
     def warmer(t):
         return 20.0 * min(1.0, t / 60.0)
 
     offset = np.random.default_rng(2).normal(0, 0.5, (5, 3))
-    cycles = owner.play(
+    cycles = user_board.play(
         lambda t: REST * (1 - 0.0012 * warmer(t)) + offset * warmer(t),
         70.0,
         lambda t: 27.0 + warmer(t),
     )
     assert not any(c.features.valid and c.features.normal_force > 0.3 for c in cycles)
-    assert honest(cycles, 0.0) > 0.99
+    assert share_within_bound(cycles, 0.0) > 0.99
     assert "temperature_moved" in codes(cycles)
     assert not cycles[-1].features.valid
-    owner.pipeline.tare()
-    after = owner.play(lambda _: REST * (1 - 0.024) + offset * 20.0, 2.0, lambda _: 47.0)
+    user_board.pipeline.tare()
+    after = user_board.play(lambda _: REST * (1 - 0.024) + offset * 20.0, 2.0, lambda _: 47.0)
     assert after[-1].features.valid
 
 
 def test_tare_under_load_is_refused_unless_forced():
-    owner = Owner()
+    user_board = UserBoard()
     load = REST + pressed({2: 4.0})
-    owner.play(lambda _: load, 1.0)
-    owner.pipeline.tare()
-    owner.play(lambda _: load, 1.0)
-    report = owner.pipeline.tare_report
+    user_board.play(lambda _: load, 1.0)
+    user_board.pipeline.tare()
+    user_board.play(lambda _: load, 1.0)
+    report = user_board.pipeline.tare_report
     assert not report.accepted
     assert "force" in report.message
-    assert owner.play(lambda _: load, 0.3)[-1].features.normal_force > 3.0
-    owner.pipeline.tare(force=True)
-    after = owner.play(lambda _: load, 1.0)
-    assert owner.pipeline.tare_report.accepted
+    assert user_board.play(lambda _: load, 0.3)[-1].features.normal_force > 3.0
+    user_board.pipeline.tare(force=True)
+    after = user_board.play(lambda _: load, 1.0)
+    assert user_board.pipeline.tare_report.accepted
     assert after[-1].features.normal_force < 0.2
 
 
 def test_possibly_exchanged_board_has_no_rest_field_until_tared():
-    owner = Owner()
-    owner.pipeline.forget_rest(REPLUGGED)
-    cycles = owner.play(lambda _: OTHER_SKIN, 1.5)
+    user_board = UserBoard()
+    user_board.pipeline.forget_rest(REPLUGGED)
+    cycles = user_board.play(lambda _: OTHER_SKIN, 1.5)
     assert cycles[0].features.codes[0] == "replugged"
     assert not any(c.features.valid and c.features.normal_force > 0.2 for c in cycles)
     assert cycles[-1].features.valid
 
 
 def test_unrecovered_skin_strain_fades_and_is_not_a_lasting_contact():
-    owner = Owner(hz=25.0)
-    owner.play(lambda _: REST + pressed({0: 8.0, 1: 15.0, 2: 3.0, 3: 6.0, 4: 4.0}), 4.0)
+    user_board = UserBoard(hz=25.0)
+    user_board.play(lambda _: REST + pressed({0: 8.0, 1: 15.0, 2: 3.0, 3: 6.0, 4: 4.0}), 4.0)
     left = pressed({0: 0.3, 1: 0.7, 2: 0.2, 3: 0.3, 4: 0.2})  # 4 % of the peak
-    cycles = owner.play(lambda _: REST + left, 15.0)
+    cycles = user_board.play(lambda _: REST + left, 15.0)
     assert cycles[-1].features.normal_force < 0.3
-    assert owner.play(lambda _: REST + left, 3.0)[-1].features.valid
+    assert user_board.play(lambda _: REST + left, 3.0)[-1].features.valid
 
 
 @pytest.mark.parametrize(

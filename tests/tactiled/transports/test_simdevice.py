@@ -61,7 +61,7 @@ def launch(tmp_path: Path) -> Iterator[Launch]:
         process.communicate()
 
 
-def hear(
+def receive_until(
     transport: Transport, decoder: Any, enough: Callable[[list[Any]], bool], ask: Any = None
 ) -> list[Any]:
     """Messages of a board until ``enough``; ``ask`` makes the question sent every half second."""
@@ -86,7 +86,7 @@ def hello() -> bytes:
     return encode_serial(Identify(1)) + encode_serial(Start(2))
 
 
-def greeted(messages: list[Any]) -> bool:
+def has_descriptor(messages: list[Any]) -> bool:
     return bool(kinds(messages, Descriptor)) and len(kinds(messages, Samples)) >= 9
 
 
@@ -96,7 +96,7 @@ def test_serial_board_is_announced_answers_and_streams(launch: Launch, tmp_path:
     assert "0000000000000abc" in process.announced[0]
     host = SerialTransport(str(tmp_path / "board0"))
     host.open()
-    received = hear(host, SerialDecoder(), greeted, hello)
+    received = receive_until(host, SerialDecoder(), has_descriptor, hello)
     (descriptor, *_) = kinds(received, Descriptor)
     assert descriptor.serial_number == "0000000000000abc"
     assert {s.array for s in kinds(received, Samples)} == {0, 1, 2}
@@ -133,7 +133,7 @@ def test_simdevice_restarts_after_a_kill(launch: Launch, tmp_path: Path) -> None
     launch("boards", "--pty", "board0")
     host = SerialTransport(str(tmp_path / "board0"))
     host.open()
-    assert kinds(hear(host, SerialDecoder(), greeted, hello), Descriptor)
+    assert kinds(receive_until(host, SerialDecoder(), has_descriptor, hello), Descriptor)
     host.close()
 
 
@@ -150,7 +150,7 @@ def test_several_boards_on_one_bus_keep_their_names(launch: Launch, tmp_path: Pa
     def both(messages: list[Any]) -> bool:
         return {r.board for r in messages if isinstance(r.message, Descriptor)} == {5, 9}
 
-    received = hear(host, CanDecoder(), both, ask)
+    received = receive_until(host, CanDecoder(), both, ask)
     assert both(received)
     named = {r.board: r.message.serial_number for r in received if kinds([r], Descriptor)}
     assert named[5] != named[9]
@@ -167,7 +167,7 @@ def test_boards_on_can_fd_stream_through_an_adapter(launch: Launch, tmp_path: Pa
     def ask() -> Any:
         return encoder.encode(Identify(1)) + encoder.encode(Start(2))
 
-    assert greeted(hear(host, CanDecoder(), greeted, ask))
+    assert has_descriptor(receive_until(host, CanDecoder(), has_descriptor, ask))
     host.close()
 
 
@@ -175,7 +175,7 @@ def test_anyskin_board_streams_floats_without_commands(launch: Launch, tmp_path:
     launch("boards", "--pty", "skin0", "--board", "anyskin")
     host = SerialTransport(str(tmp_path / "skin0"))
     host.open()
-    received = hear(host, AnySkinDecoder(), lambda m: len(m) >= 20)
+    received = receive_until(host, AnySkinDecoder(), lambda m: len(m) >= 20)
     assert {r.message.field_ut.shape for r in received} == {(5, 3)}
     assert isinstance(received[0].message, FloatSamples)
     host.close()
@@ -189,11 +189,11 @@ def test_unplugged_board_vanishes_and_returns_freshly_booted(
     host = SerialTransport(str(link))
     host.open()
     with pytest.raises(PortGone):
-        hear(host, SerialDecoder(), lambda m: False)
+        receive_until(host, SerialDecoder(), lambda m: False)
     wait_until(lambda: not os.path.lexists(link))
     wait_until(link.exists)
     host.open()
-    received = hear(host, SerialDecoder(), greeted, hello)
+    received = receive_until(host, SerialDecoder(), has_descriptor, hello)
     assert min(s.sequence for s in kinds(received, Samples)) < 50
     host.close()
 
@@ -207,7 +207,7 @@ def test_calibration_command_describes_the_simulated_board(launch: Launch, tmp_p
     assert calibration.serial_number in process.announced[0]
     host = SerialTransport(str(tmp_path / "skin0"))
     host.open()
-    received = hear(host, AnySkinDecoder(), lambda m: len(m) >= 20)
+    received = receive_until(host, AnySkinDecoder(), lambda m: len(m) >= 20)
     host.close()
     # The rest field of this seed: mounting tolerances of different seeds differ by hundreds of µT.
     rest = calibration.arrays[0].rest_ut
