@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from sim_device.arguments import make_parser
 from tactile_core.cli import DONE, REFUSED, USAGE, CommandError, seeds_of, working
-from tactile_core.daemon import Shutdown, run
+from tactile_core.daemon import Shutdown, request_real_time, run
 
 if TYPE_CHECKING:
     from sim_device.arm.cupboard_plan import CupboardRequest
@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 SWITCH_INTERVAL_S = 0.0005
 """Seconds after which Python may switch threads. The default, 5 ms, exceeds a tick."""
+
+CONTROLLER_PRIORITY = 18
+"""Real-time priority of an emulated robot if the system grants it, below armd's and reachd's: other
+programs do not hold up a robot's controller."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -161,6 +165,7 @@ def robot(arguments: argparse.Namespace) -> int:
         except ValueError as error:
             raise CommandError(str(error)) from error
         sys.setswitchinterval(SWITCH_INTERVAL_S)
+        request_real_time(CONTROLLER_PRIORITY)
         return _serve(planned, arguments)
 
 

@@ -64,6 +64,10 @@ class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     rate: Annotated[
         Hertz, Meta(ge=100, le=1000, description="at which it is commanded, where that is free")
     ] = 125.0
+    priority: Annotated[
+        int,
+        Meta(ge=0, le=98, description="real-time priority where the system grants it; 0: none"),
+    ] = 20
     port: (
         Annotated[
             int, Meta(ge=1, le=65535, description="TCP port, where it is not the vendor's own")

@@ -26,7 +26,7 @@ from armd.port import ArmPort, Job
 from tactile_core.bus.services import ServiceError
 from tactile_core.bus.session import BusConfig, BusError
 from tactile_core.cli import REFUSED, CommandError
-from tactile_core.daemon import Service
+from tactile_core.daemon import Service, request_real_time
 from tactile_core.types import ArmLimits, ArmState, Instant, after, monotonic_now, seconds_between
 
 log = logging.getLogger(__name__)
@@ -79,6 +79,7 @@ class Daemon(Service):
         self._reading: deque[int] = deque(maxlen=LATENCIES)
         self._published = Instant(0)
         self._connecting = False
+        self._real_time = False
         self._threads: list[threading.Thread] = []
         self.port = ArmPort(
             name,
@@ -91,6 +92,11 @@ class Daemon(Service):
 
     def _start(self) -> None:
         """Connect, check, join the bus and serve."""
+        priority = self._config.robot.priority
+        if priority > 1:
+            # Of the threads of the vendor's library, too: the robot's own watchdog stops a robot
+            # whose commands are 50 ms late, and only an operator gets it going again.
+            self._real_time = request_real_time(priority - 1)
         self.port.open()
         self._connecting = True
         try:
@@ -122,6 +128,8 @@ class Daemon(Service):
     def _guarded(self, work: Callable[[], None]) -> None:
         """Run a thread; what it raises ends the daemon, and the robot's own watchdog stops it."""
         try:
+            if self._real_time:
+                request_real_time(self._config.robot.priority)
             work()
         except Exception as error:  # noqa: BLE001 - kept for the verdict
             self.fail(error)

@@ -39,7 +39,7 @@ SILENT: Final = 0.15
 UNANSWERED: Final = 0.15
 """s that a call of the robot's library may take before the robot is taken to be lost."""
 
-RISE: Final = 0.3
+RISE: Final = 0.1
 """s in which the speed against what presses may grow from nothing to the limit."""
 
 SLIDES: Final = 0.8

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import threading
 import time
 from collections import deque
@@ -22,6 +21,7 @@ from reachd.gate.settings import Check, SafetySettings
 from reachd.interfaces import ZERO, ArmState, Goal, Touch, Twist
 from reachd.strategies import StrategyEvent
 from reachd.trial import Outcome, Status, Supervisor
+from tactile_core.daemon import request_real_time
 from tactile_core.types import NS_PER_S, Instant, monotonic_now, seconds_between
 
 # One cycle of control: supervisor, then gate, which gives the twist to send. Pure.
@@ -178,26 +178,6 @@ LAST_ZEROS = 3
 """Zero twists sent at the end, because one may be lost."""
 
 R = TypeVar("R")
-
-
-def request_real_time(priority: int) -> bool:
-    """Give the calling thread, and those it starts, real-time priority; False when refused.
-
-    Python's interpreter lock has no priorities: a thread that holds it while other programs use the
-    processor delays the control loop. So the daemon requests it for all of its threads.
-    """
-    if not hasattr(os, "sched_setscheduler"):  # macOS
-        return False
-    try:
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
-    except OSError as error:
-        log.info(
-            "no real-time priority (%s): allow it with `ulimit -r` or LimitRTPRIO= if the control "
-            "loop is late under load",
-            error.strerror,
-        )
-        return False
-    return True
 
 
 class Schedule:

@@ -23,7 +23,7 @@ from typing import Any
 import zenoh
 
 from reachd.arms import Arm, ArmError, BusArm
-from reachd.control import Controller, ControlLoop, Cycle, Inputs, request_real_time
+from reachd.control import Controller, ControlLoop, Cycle, Inputs
 from reachd.gate.gate import SafetyGate
 from reachd.gate.settings import Check, SafetySettings
 from reachd.inputs import TouchInput
@@ -37,7 +37,7 @@ from tactile_core.bus.messages import codec
 from tactile_core.bus.session import BusError, close_session, open_session
 from tactile_core.bus.streams import list_alive
 from tactile_core.bus.topics import ARM_STATE, FEATURES, alive_key, commander_key, service_key
-from tactile_core.daemon import Service, StartError
+from tactile_core.daemon import Service, StartError, request_real_time
 from tactile_core.log.recorder import Recorder, RecorderError
 from tactile_core.log.retention import DiskWatch
 from tactile_core.types import Echo, Instant, WallClock, monotonic_now, seconds_between

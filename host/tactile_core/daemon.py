@@ -89,6 +89,26 @@ def run(
     return code
 
 
+def request_real_time(priority: int) -> bool:
+    """Give the calling thread, and those it starts, real-time priority; False when refused.
+
+    Python's interpreter lock has no priorities: a thread that holds it while other programs use the
+    processor delays the control loop. So a daemon that controls requests it for all of its threads.
+    """
+    if not hasattr(os, "sched_setscheduler"):  # macOS
+        return False
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
+    except OSError as error:
+        log.info(
+            "no real-time priority (%s): allow it with `ulimit -r` or LimitRTPRIO= if the control "
+            "loop is late under load",
+            error.strerror,
+        )
+        return False
+    return True
+
+
 def exit_process(code: int) -> NoReturn:
     """End the process with ``code``; the last call of a command.
 

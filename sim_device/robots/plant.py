@@ -18,7 +18,7 @@ import numpy as np
 from armd.driver import Float
 from armd.frames import Transform, cross, rotation_matrix
 from sim_device.skin.elastomer import Contact
-from sim_device.world.base import PHYSICS_STEP, World
+from sim_device.world.base import PHYSICS_STEP, FingerState, World
 from sim_device.world.mujoco_model import MOTOR_TIME
 from sim_device.world.parameters import world_parameters
 from sim_device.world.touch import on_skin
@@ -30,8 +30,11 @@ STEP: Final = 0.002
 STEP_NS: Final = round(STEP * NS_PER_S)
 
 STIFFNESS: Final = (3000.0, 3000.0, 30.0)
-"""N/m and N·m/rad between the robot, which is stiff, and the finger, which gives way as a skin and
-its mount do: what the robot says of its pose is its own, whatever presses on the finger."""
+"""N/m and N·m/rad between robot and finger. The robot is stiff; skin and mount of the finger are
+not. The pose that the robot reports is its own, whatever presses on the finger."""
+
+DAMPING: Final = (100.0, 100.0, 1.3)
+"""N·s/m and N·m·s/rad of the same, a third of critical with the finger's mass in the world."""
 
 MOTOR_FORCE: Final = 150.0
 """N of the robot's own strength, far beyond what a cupboard stands."""
@@ -39,8 +42,10 @@ MOTOR_FORCE: Final = 150.0
 MOTOR_MOMENT: Final = 30.0
 """N·m of the same."""
 
-MAX_CATCH_UP_NS: Final = 250_000_000
-"""Time that is made up for; a process that was stopped for longer stood still."""
+MAX_CATCH_UP_NS: Final = 20_000_000
+"""Time that is made up for at once. A controller does not stand still, as a process on a busy
+machine does. Steps made up for later would all obey the command before them, and trip watchdogs
+that a controller would have fed; so the robot stood still for the rest, which its clock counts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,14 +92,14 @@ class Plant:
         self._measured: Measured | None = None
         self._velocity = [0.0] * 6  # of the pivot in the cupboard, as ramped
         self._moves = (0.0, 0.0, 0.0)
+        self._moved = self._moves  # at the last step of the physics
         self._wrench = (0.0, 0.0, 0.0)
         self._owed = 0.0
         self._offset = (0.0, 0.0, 0.0)
         if world is not None:
             world.limit_wrench(MOTOR_FORCE, MOTOR_MOMENT)
             own = world_parameters(world.scene.parameters)
-            linear, angular = own.finger_mass / MOTOR_TIME, own.finger_inertia / MOTOR_TIME
-            self._gain = (linear, linear, angular)
+            self._mass = (own.finger_mass, own.finger_mass, own.finger_inertia)
 
     @property
     def force(self) -> float:
@@ -209,22 +214,42 @@ class Plant:
         )
 
     def _push(self, world: World) -> None:
+        """Drive the finger through its mount for one step of the physics.
+
+        The motors of a world keep a velocity and make up for the load: a finger driven by them
+        alone would be as stiff as they are strong. What they make up for is therefore taken back,
+        so that a finger which is held is pushed with the force of its mount and no more.
+        """
         finger = world.finger()
-        # The world's motors damp by themselves, with as much as they have gain.
-        asks = [
-            moved + stiff * (own - at) / gain
-            for at, own, moved, stiff, gain in zip(
-                (finger.x, finger.y, finger.heading),
-                self._insists,
-                self._moves,
-                STIFFNESS,
-                self._gain,
-                strict=True,
-            )
-        ]
+        speed = (finger.twist.vx, finger.twist.vy, finger.twist.omega)
+        load = (finger.fx, finger.fy, finger.mz)
+        asks = []
+        for axis, mount in enumerate(self._mount_force(finger)):
+            mass, moves = self._mass[axis], self._moves[axis]
+            gain = mass / MOTOR_TIME
+            # The motor holds back a change of speed within a step as if it were mass.
+            inertia = (mass + gain * PHYSICS_STEP) * (moves - self._moved[axis]) / PHYSICS_STEP
+            asks.append(speed[axis] + (mount + inertia + load[axis]) / gain)
+        self._moved = self._moves
         world.step(PHYSICS_STEP, Twist(*asks))
-        finger = world.finger()
-        self._wrench = (finger.fx, finger.fy, finger.mz)
+        fx, fy, mz = self._mount_force(world.finger())
+        self._wrench = (-fx, -fy, -mz)
+
+    def _mount_force(self, finger: FingerState) -> tuple[float, float, float]:
+        """N, N and N·m with which the mount pushes the finger, which the wrist's sensor feels."""
+        apart = (
+            self._insists[0] - finger.x,
+            self._insists[1] - finger.y,
+            math.remainder(self._insists[2] - finger.heading, math.tau),
+        )
+        speed = (finger.twist.vx, finger.twist.vy, finger.twist.omega)
+        fx, fy, mz = (
+            stiff * gap + damp * (moves - moved)
+            for stiff, gap, damp, moves, moved in zip(
+                STIFFNESS, apart, DAMPING, self._moves, speed, strict=True
+            )
+        )
+        return fx, fy, mz
 
 
 class Truth:

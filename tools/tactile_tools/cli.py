@@ -783,6 +783,12 @@ def _fill_arm_scenes(parser: Parser) -> None:
     parser.add_argument(
         "--first", type=natural, default=0, metavar="N", help="number of the first (default 0)"
     )
+    parser.add_argument(
+        "--lockstep",
+        action="store_true",
+        help="on virtual time instead: the emulated robot's mechanics behind armd's guard, without "
+        "its vendor's client and whatever else runs here",
+    )
     add_scene(parser)
     add_strategy(parser)
     add_path(parser, "--logs", "folder in which to keep the log of each reach that failed")

@@ -34,10 +34,13 @@ Row = dict[str, Any]
 TIME_LIMIT_S: Final = 30.0
 """Of one reach, as in `tactile demo`."""
 
+LOCKSTEP_LIMIT_S: Final = 20.0
+"""Of a reach on virtual time: the parameter set's own."""
+
 HANGS_S: Final = 180.0
 """After which a reach is given up: its limit, and what starting takes on a busy machine."""
 
-SETTINGS: Final = ("scene", "strategy", "time_limit_s", "arms")
+SETTINGS: Final = ("scene", "strategy", "time_limit_s", "arms", "lockstep")
 """What must be the same for a run to go on."""
 
 NUMBERS: Final = re.compile(r"-?\d+(\.\d+)?")
@@ -49,15 +52,16 @@ def run(options: argparse.Namespace) -> int:
     require("scipy", extra="experiments")
     arms = tuple(dict.fromkeys(options.arm or ("simulated", "ur")))
     for arm in arms:
-        if arm in EMULATED and (problem := missing(arm)) is not None:
+        if arm in EMULATED and not options.lockstep and (problem := missing(arm)) is not None:
             raise CommandError(problem)
     if not options.out.resolve().parent.is_dir():
         raise CommandError(f"--out {options.out}: no such folder: create it or name another")
     if options.logs is not None:
         options.logs.mkdir(parents=True, exist_ok=True)
-    settings = dict(
-        zip(SETTINGS, (options.scene, options.strategy, TIME_LIMIT_S, list(arms)), strict=True)
-    )
+    limit_s = LOCKSTEP_LIMIT_S if options.lockstep else TIME_LIMIT_S
+    values = (options.scene, options.strategy, limit_s, list(arms), options.lockstep)
+    settings = dict(zip(SETTINGS, values, strict=True))
+    reach = lockstep_reach if options.lockstep else one_reach
     rows = read_rows(options.out, settings, restart=options.force)
     done = {(row["scene_seed"], row["arm"]) for row in rows}
     scenes = range(options.first, options.first + options.scenes)
@@ -65,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
     with Progress(console=Console(stderr=True)) as bar:
         task = bar.add_task("reaches", total=len(todo))
         for seed, arm in todo:
-            row = one_reach(ReachScene(arm, options.scene, seed, seed), options)
+            row = reach(ReachScene(arm, options.scene, seed, seed), options)
             rows.append(row)
             write(options.out, settings, rows)
             word = "reached" if row["success"] else f"{row['reason']}: {row['text']}"
@@ -124,6 +128,45 @@ def one_reach(scene: ReachScene, options: argparse.Namespace) -> Row:
     row["seconds"] = round(time.monotonic() - started, 1)
     row["load"] = round(os.getloadavg()[0], 1)
     return row
+
+
+def lockstep_reach(scene: ReachScene, options: argparse.Namespace) -> Row:
+    """Reach once on virtual time; an emulated robot is its plant behind armd's guard."""
+    from reachd.strategies.parameters import parameters
+    from sim_device.world.base import World
+    from sim_device.world.scene_loading import load_scene
+    from tactile_core.types import Instant
+    from tactile_tools.reach.guarded_arm import GuardedArm
+    from tactile_tools.reach.lockstep import run_trial
+
+    guarded: list[GuardedArm] = []
+
+    def make_arm(world: World, start: Instant) -> GuardedArm:
+        guarded.append(GuardedArm(world, start))
+        return guarded[0]
+
+    started = time.monotonic()
+    own = parameters(scene.parameter_set)
+    found = run_trial(
+        load_scene(scene.scene, scene.scene_seed), options.strategy, own, scene.seed,
+        make_arm=make_arm if scene.arm in EMULATED else None,
+    )  # fmt: skip
+    outcome = found.outcome
+    row: Row = {
+        "scene_seed": scene.scene_seed,
+        "arm": scene.arm,
+        "success": outcome.success,
+        "reason": str(outcome.reason),
+        "text": outcome.text,
+        "distance": outcome.distance,
+        "time": outcome.time,
+        "peak_load": outcome.peak_load,
+        "interventions": dict(outcome.interventions),
+        "seconds": round(time.monotonic() - started, 1),
+    }
+    latches = [arm.guard.latch for arm in guarded]
+    errors = [f"{latch.mode}: {latch.reason}" for latch in latches if latch is not None]
+    return row | {"armd": errors} if errors else row
 
 
 def _ended(process: subprocess.Popen[bytes]) -> int:

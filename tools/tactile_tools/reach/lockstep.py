@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from sim_device.arm.arm import ArmSettings, SimulatedArm
 from sim_device.world.base import World
 from sim_device.world.mujoco_world import MujocoWorld
 from sim_device.world.scenes import Scene
-from tactile_core.types import Instant, after, record
+from tactile_core.types import ArmLimits, Instant, Twist, after, record
 from tactile_tools.reach.touch_senses import ContactSense, Sense, TaxelSense
 from tactiled.blocks import Cycle
 
@@ -64,6 +64,22 @@ class Result:
     simulated_s: float
 
 
+class LockstepArm(Protocol):
+    """What a trial asks of an arm; see `sim_device.arm.arm.SimulatedArm`."""
+
+    def request_limits(self, limits: ArmLimits) -> ArmLimits:
+        """Ask for ``limits``; returns those in force."""
+        ...
+
+    def command(self, twist: Twist, now: Instant, expiry: float) -> bool:
+        """Move at ``twist`` until ``expiry`` s from ``now``, or the next command."""
+        ...
+
+    def advance(self, now: Instant) -> list[ArmState]:
+        """Simulate up to ``now`` and return the states that came, in order."""
+        ...
+
+
 ENTERED_M = 0.0075
 """Radius of the paper's goal region, m."""
 
@@ -78,18 +94,24 @@ def run_trial(
     world: World | None = None,
     sense: Sense | None = None,
     watch: Callable[[Step], None] | None = None,
+    make_arm: Callable[[World, Instant], LockstepArm] | None = None,
 ) -> Result:
     """Run one trial to its end. StrategyError, ConfigError or WorldError if it cannot be run.
 
     ``seed``: strategy, board and arm draw from generators made from it. ``world``: None for
-    MuJoCo's. ``sense``: None for that of ``depth``. ``watch``: called once per control cycle.
+    MuJoCo's. ``sense``: None for that of ``depth``. ``watch``: called once per control cycle. ``make_arm``:
+    makes another arm than the simulated one, of a world and the instant from which it runs.
     """
     world = MujocoWorld(scene) if world is None else world
     if sense is None:
         sense = ContactSense() if depth == "contacts" else TaxelSense(seed)
     planner = load_strategy(strategy, parameters, np.random.default_rng([seed, 1]))
     now = sense.settle(world, BEGIN)
-    arm = SimulatedArm(world, ArmSettings(), now, np.random.default_rng([seed, 2]))
+    arm: LockstepArm
+    if make_arm is None:
+        arm = SimulatedArm(world, ArmSettings(), now, np.random.default_rng([seed, 2]))
+    else:
+        arm = make_arm(world, now)
     arm.request_limits(parameters.safety.arm_limits)
     gate = SafetyGate(parameters.safety)
     supervisor = Supervisor(planner, parameters)
@@ -128,7 +150,7 @@ def run_trial(
     )
 
 
-def _next(arm: SimulatedArm, now: Instant, period: float) -> tuple[Instant, ArmState]:
+def _next(arm: LockstepArm, now: Instant, period: float) -> tuple[Instant, ArmState]:
     """Advance one control period. Returns the instant and the newest state of an arm without
     faults."""
     now = after(now, period)

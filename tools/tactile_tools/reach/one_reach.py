@@ -33,6 +33,7 @@ FIRST_ADDRESS: Final = 23
 CONFIG: Final = """\
 [robot]
 address = "{address}"
+acceleration = 10.0  # reachd asks for up to 10 m/s² in these scenes; see docs/arm.md
 {port}
 [tool]
 payload = 0.8
