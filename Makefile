@@ -63,9 +63,12 @@ demo-ur: setup  ## the same with an emulated robot of Universal Robots
 arms-scenes: setup  ## 50 scenes with the simulated arm and an emulated UR; an hour, goes on where cut off
 	$(BIN)/tactile arm-scenes --scenes 50 --out docs/results/ur.json
 
-# Every driver against every fault, ten times over; some minutes.
-arms: setup  ## every driver of a robot against every fault
-	ARMS_RUNS=10 $(BIN)/python -m pytest -q tests/armd
+# Every driver against every fault, ARMS_RUNS times over; some minutes a run. FRANKY_SIM=PATH: Franka, too.
+ARMS_RUNS ?= 3
+arms: setup  ## every driver of a robot against every fault, measured into docs/results/arms.json
+	rm -f docs/results/arms.json
+	ARMS_RUNS=$(ARMS_RUNS) ARMS_JSON=docs/results/arms.json $(BIN)/python -m pytest -q tests/armd --deselect tests/armd/test_report.py
+	$(BIN)/python -m tests.support.arms_report
 
 demo-skin: setup  ## press simulated boards, leave a log and a picture
 	$(BIN)/tactile demo-skin

@@ -24,17 +24,17 @@ from tactile_core.daemon import Shutdown, exit_process, run, serve
 log = logging.getLogger(__name__)
 
 SWITCH_INTERVAL_S = 0.0005
-"""Time after which Python hands the interpreter on: threads that read, move and answer share it."""
+"""Python's switch interval, s: threads that read, move and answer share the interpreter."""
 
 EPILOG = (
     "Exit: 0 done (also on Ctrl-C, SIGTERM), 1 a thread failed, 2 usage or configuration, 3 the "
-    "robot is not there or not as it must be. What each driver needs and what was never tried on a "
-    "real robot: docs/arm.md."
+    "robot is not there or not ready. docs/arm.md says what each driver needs, and that none was "
+    "tried on a real robot."
 )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Serve a robot, or teach it where the cupboard is; the exit status.
+    """Serve a robot or teach it where the cupboard is; return the exit status.
 
     Without ``argv`` this is the whole process, which then ends here.
     """

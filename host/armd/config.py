@@ -34,58 +34,61 @@ Direction = tuple[float, float, float]
 Mass = Annotated[float, unit("kg"), Meta(ge=0)]
 
 PAYLOAD_ERROR = 0.05
-"""kg by which the payload that the robot was set up with may differ from the configuration."""
+"""Allowed difference between the robot's payload and the configuration's, kg."""
 
 TOOL_ERROR = 0.002
-"""m of the same for the tool centre."""
+"""Allowed difference between the tool centres, m."""
 
 TOOL_TURN_ERROR = 0.02
-"""rad of the same for its axes."""
+"""Allowed difference between the axes of the tools, rad."""
 
 
 class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[robot]``: how the robot is reached, and how it starts and stops."""
+    """``[robot]``: how to reach the robot, and how it starts and stops."""
 
     address: Annotated[
         str, Meta(description="host name or IP of the robot; Flexiv: its serial number")
     ] = ""
     acceleration: Annotated[
-        MetresPerSecond2, Meta(gt=0, description="with which it starts and stops")
+        MetresPerSecond2,
+        Meta(
+            gt=0, description="with which the robot starts and stops; at least what reachd asks for"
+        ),
     ] = 2.0
     watchdog: Annotated[
         Hertz,
         Meta(
             ge=20,
             le=100,
-            description="rate of commands below which the robot stops by itself; slower would "
-            "stop it too late",
+            description="rate of commands below which the robot stops by itself; a lower one "
+            "would stop it too late",
         ),
     ] = 20.0
     rate: Annotated[
-        Hertz, Meta(ge=100, le=1000, description="at which it is commanded, where that is free")
+        Hertz,
+        Meta(ge=100, le=1000, description="rate of commands, if the driver leaves it free"),
     ] = 125.0
     priority: Annotated[
         int,
         Meta(ge=0, le=98, description="real-time priority where the system grants it; 0: none"),
     ] = 20
     port: (
-        Annotated[
-            int, Meta(ge=1, le=65535, description="TCP port, where it is not the vendor's own")
-        ]
+        Annotated[int, Meta(ge=1, le=65535, description="TCP port, if it is not the vendor's own")]
         | None
     ) = None
     zero_force: Annotated[
-        bool, Meta(description="whether the force is zeroed at the start; nothing may touch then")
+        bool,
+        Meta(description="whether to zero the force at the start; nothing may touch then"),
     ] = True
     simulated: Annotated[
-        bool, Meta(description="whether its clock may run slower than ours, as a simulator's")
+        bool, Meta(description="whether its clock may run slower than ours, as a simulator's does")
     ] = False
-    user: Annotated[str, Meta(description="to log in with, where the robot asks for it")] = ""
-    password: Annotated[str, Meta(description="of that user")] = ""
+    user: Annotated[str, Meta(description="user to log in as, if the robot asks for one")] = ""
+    password: Annotated[str, Meta(description="password of that user")] = ""
 
 
 class LimitsTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[limits]``: what is never gone beyond, whatever is asked."""
+    """``[limits]``: never exceeded, whatever is asked."""
 
     v_max: Annotated[MetresPerSecond, Meta(gt=0, description="speed")] = FACTORY.v_max
     omega_max: Annotated[RadiansPerSecond, Meta(gt=0, description="turning speed")] = (
@@ -96,7 +99,7 @@ class LimitsTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class ToolTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[tool]``: what is on the flange. The robot is refused where it was set up otherwise.
+    """``[tool]``: what is on the flange. A robot that was set up otherwise is refused.
 
     ``ee``: the finger's frame, at its wrist pivot, x along the finger, z up.
     """
@@ -134,7 +137,7 @@ class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
     @property
     def caps(self) -> ArmLimits:
-        """Limits beyond which the arm never goes."""
+        """Limits that the arm never exceeds."""
         own = self.limits
         return ArmLimits(own.v_max, own.omega_max, own.f_max, own.m_max)
 
@@ -145,16 +148,16 @@ class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 def load_config(path: Path) -> ArmConfig:
-    """Read and check; `ConfigError`."""
+    """Read and check the file; `ConfigError`."""
     return load_toml(path, ArmConfig)
 
 
 def plane_of(config: ArmConfig, name: str) -> Plane:
-    """The cupboard's plane before this robot; `ConfigError` where it was not taught, or wrongly."""
+    """The cupboard's plane in front of this robot; `ConfigError` if it was not taught."""
     frame = config.frame
     if frame is None:
         raise ConfigError(
-            f"{name}: it has no [frame], so nobody knows where the cupboard is: touch its three "
+            f"{name}: [frame] is missing, which says where the cupboard is: touch its three "
             f"points with `armd teach --driver KIND --config {name}`"
         )
     try:
@@ -167,14 +170,14 @@ def plane_of(config: ArmConfig, name: str) -> Plane:
 
 
 def check_facts(config: ArmConfig, facts: RobotFacts) -> list[str]:
-    """What could not be checked, in words; `SetupError` where robot and configuration differ."""
+    """Return what could not be checked; `SetupError` if robot and configuration differ."""
     tool, unchecked = config.tool, []
     if facts.payload is None:
         unchecked.append("payload")
     elif not abs(facts.payload - tool.payload) <= PAYLOAD_ERROR:
         raise SetupError(
             f"the robot is set up for a payload of {facts.payload:.2f} kg, the configuration says "
-            f"{tool.payload:.2f}: weigh the tool, and mend the wrong one of the two"
+            f"{tool.payload:.2f}: weigh the tool, and correct whichever is wrong"
         )
     if facts.tool_position is None:
         unchecked.append("tool centre")

@@ -1,8 +1,7 @@
 """One robot on the bus: a thread that reads it, a thread that moves it, and one that watches both.
 
-Only the moving thread calls the robot but for `Driver.read`; what services want of the robot they
-leave to it as jobs. Nobody waits for a robot that does not answer: it is latched, and its own
-watchdog stops it.
+Apart from `Driver.read`, only the moving thread calls the robot; services hand it jobs. Nobody
+waits for a robot that does not answer: it is latched, and its own watchdog stops it.
 """
 
 from __future__ import annotations
@@ -32,16 +31,19 @@ from tactile_core.types import ArmLimits, ArmState, Instant, after, monotonic_no
 log = logging.getLogger(__name__)
 
 LOOK: Final = 0.02
-"""s between looks of the watching thread."""
+"""Period of the watching thread, s."""
 
 ASKED: Final = 0.8
-"""s that a service waits for the robot; whoever asked waits for 1 s."""
+"""Time for which a service waits for the robot, s; its caller waits for 1 s."""
 
 FIRST_STATE: Final = 3.0
-"""s for a robot that was connected to send its first state."""
+"""Time in which a connected robot must send its first state, s."""
+
+CONNECTING: Final = 30.0
+"""s in which a robot must be connected; releasing brakes takes some of it."""
 
 LOST: Final = 5.0
-"""s for which a library may hang before the process gives up: it cannot be freed otherwise."""
+"""Time for which a library may hang before the process gives up, s: nothing else frees it."""
 
 PUBLISH_AT_MOST: Final = 1 / 250
 """s between two states on the bus at least: a robot may send a thousand a second."""
@@ -100,7 +102,7 @@ class Daemon(Service):
         self.port.open()
         self._connecting = True
         try:
-            self._facts = self.driver.connect()
+            self._facts = self._connect()
             unchecked = check_facts(self._config, self._facts)
             if unchecked:
                 log.warning(
@@ -124,6 +126,21 @@ class Daemon(Service):
             )
             thread.start()
             self._threads.append(thread)
+
+    def _connect(self) -> RobotFacts:
+        """Connect; DriverError where the library does not return, as with a silent robot."""
+        facts: list[RobotFacts] = []
+        job = Job(lambda: facts.append(self.driver.connect()))
+        threading.Thread(target=job.run, name="connect", daemon=True).start()
+        if not job.wait(CONNECTING):
+            self._connecting = False  # a library that hangs is not to be closed either
+            raise DriverError(
+                f"the robot at {self._config.robot.address} takes connections and does not answer "
+                f"within {CONNECTING:g} s: look at [robot] address and start the robot again"
+            )
+        if job.error is not None:
+            raise job.error
+        return facts[0]
 
     def _guarded(self, work: Callable[[], None]) -> None:
         """Run a thread; what it raises ends the daemon, and the robot's own watchdog stops it."""
@@ -220,7 +237,8 @@ class Daemon(Service):
                 return
             self._published = now
             self.port.publish(state)
-            self._reading.append(monotonic_now() - state.captured)
+            if not again:
+                self._reading.append(monotonic_now() - state.captured)
 
     # The moving thread.
 
@@ -292,9 +310,11 @@ class Daemon(Service):
             kept = self._guard.request_limits(limits, self.port.arbiter.commander)
         job = Job(lambda: self.driver.limit(kept))
         self._ask(job)
-        if not job.wait(ASKED):
-            raise ServiceError("the robot takes its time with the limits: ask again")
-        if job.error is not None:
+        if not job.wait(ASKED) or job.error is not None:
+            with self._lock:
+                self._guard.forget_limits()
+            if job.error is None:
+                raise ServiceError("the robot takes its time with the limits: ask again")
             raise ServiceError(f"the robot refuses the limits: {job.error}")
         return kept
 

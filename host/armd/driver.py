@@ -1,7 +1,7 @@
-"""The seam between armd and a robot. A driver for another robot is another class like `Driver`.
+"""Interface between armd and a robot: a driver for another robot is a class like `Driver`.
 
-A driver knows one vendor's library and nothing of the cupboard, the bus or who commands. It speaks
-of the robot's **tool centre** in the robot's **base** frame: SI units, rotations as matrices,
+A driver knows one vendor's library, and nothing of the cupboard, the bus or the commander. It uses
+the robot's **tool centre** in the robot's **base** frame: SI units, rotations as matrices,
 spatial vectors as (6,) arrays, linear part first, in the axes of the base.
 """
 
@@ -20,11 +20,11 @@ Float = NDArray[np.float64]
 
 
 class DriverError(Exception):
-    """The robot cannot be had, or does not do as it is told; the message names the remedy."""
+    """The robot is not there or does not obey; the message names the remedy."""
 
 
 class SetupError(DriverError):
-    """What the configuration says and what the robot says differ: nothing may move."""
+    """Configuration and robot disagree: nothing may move."""
 
 
 class RobotMode(StrEnum):
@@ -58,7 +58,7 @@ class RobotState:
 
 @dataclass(frozen=True, slots=True)
 class RobotFacts:
-    """What a robot says of itself when it is connected; None where it does not say.
+    """What a robot reports about itself once connected; None for what it does not report.
 
     ``tool_position`` (3,) m and ``tool_rotation`` (3,) rotation vector, rad: of the tool centre
     from the flange. ``payload`` kg. ``enforces``: those of `ArmLimits` that the robot's own
@@ -92,11 +92,11 @@ class Driver(Protocol):
     """What was and was not verified, in one sentence that is said at each start."""
 
     def connect(self) -> RobotFacts:
-        """Get hold of the robot without moving it; `DriverError`, `SetupError`."""
+        """Take control of the robot without moving it; `DriverError`, `SetupError`."""
         ...
 
     def read(self) -> RobotState | None:
-        """Newest state, None where there is no newer one. Waits for a few ms at most."""
+        """Return the newest state, None if there is no newer one. Waits for a few ms at most."""
         ...
 
     def move(self, velocity: Float) -> None:
@@ -112,13 +112,13 @@ class Driver(Protocol):
         ...
 
     def recover(self) -> None:
-        """Undo a stop because an operator asked for it; `DriverError` says what hinders."""
+        """Undo a stop at an operator's request; `DriverError` says what prevents it."""
         ...
 
     def zero_force(self) -> None:
-        """Take the present wrench for none."""
+        """Take the present wrench as zero."""
         ...
 
     def close(self) -> None:
-        """Let go of the robot, which rests."""
+        """Release the robot, which rests."""
         ...

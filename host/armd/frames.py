@@ -1,4 +1,4 @@
-"""From the cupboard's plane to a robot's base and back: rigid transforms, pure.
+"""Rigid transforms between the cupboard's plane and a robot's base. Pure.
 
 Frames: ``base`` of the robot; ``tool``, its tool centre; ``ee``, at the wrist pivot with x along
 the finger, z up; ``cupboard``, origin at the middle of the front edge at the height in which the
@@ -36,7 +36,7 @@ UPRIGHT: Final = math.radians(30)
 
 
 class FrameError(ValueError):
-    """Points that make no frame; the message says which and what to do."""
+    """Points that do not make a frame; the message says which and what to do."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +92,24 @@ def rotation_vector(matrix: Float) -> Float:
     column = int(np.argmax(np.diag(matrix)))
     found = (matrix + np.eye(3))[:, column]
     return np.asarray(found / np.linalg.norm(found) * angle, dtype=np.float64)
+
+
+def rotation_of(quaternion: Float) -> Float:
+    """(3, 3) of a unit quaternion w, x, y, z."""
+    w, vector = float(quaternion[0]), np.asarray(quaternion[1:4], dtype=np.float64)
+    size = float(np.linalg.norm(vector))
+    if size < 1e-12:
+        return np.eye(3)
+    return rotation_matrix(vector / size * (2 * math.atan2(size, w)))
+
+
+def quaternion_of(rotation: Float) -> list[float]:
+    """w, x, y, z of a rotation matrix."""
+    vector = rotation_vector(rotation)
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return [1.0, 0.0, 0.0, 0.0]
+    return [math.cos(angle / 2), *(vector / angle * math.sin(angle / 2)).tolist()]
 
 
 def cross(a: Float, b: Float) -> Float:

@@ -1,7 +1,7 @@
-"""What armd lets a robot do: limits, expiry, and what stops it for good. Pure.
+"""What armd lets a robot do: limits, expiry, and what latches it. Pure.
 
-Every driver is behind one `Guard`. Any doubt ends at rest. What the robot or its states did wrong
-latches: nothing moves again before an operator's request to clear, made when the cause is gone.
+Every driver is behind one `Guard`. When in doubt, the robot rests. Errors of the robot or of its
+states latch: nothing moves until an operator asks to clear them, once the cause is gone.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ FACTORY: Final = ArmLimits(v_max=0.25, omega_max=1.0, f_max=100.0, m_max=20.0)
 
 @dataclass(frozen=True, slots=True)
 class Latch:
-    """Why nothing moves until an operator clears it. ``mode``: of `ArmState`."""
+    """Why nothing moves until an operator clears it. ``mode``: one of `ArmState`'s."""
 
     mode: str
     reason: str
@@ -92,7 +92,7 @@ class _Active:
 
 
 class Guard:
-    """Of one robot. Not safe for threads by itself: its owner has the lock.
+    """Guard of one robot. Not thread-safe: its owner holds the lock.
 
     ``caps``: limits beyond which it never goes, whatever is asked. ``steady``: whether the robot's
     clock runs as fast as ours; the age of its states is told by it.
@@ -155,6 +155,11 @@ class Guard:
         )
         self._limited_for = commander
         return self._limits
+
+    def forget_limits(self) -> None:
+        """The robot did not take the limits: nothing moves before it has taken some."""
+        self._limited_for = None
+        self._active = None
 
     def stop(self, mode: str, reason: str) -> bool:
         """Latch; True where it is news. An e-stop outranks what was latched before."""
@@ -253,8 +258,8 @@ class Guard:
         return self._active is not None and self._active.twist != ZERO
 
     def check(self, now: Instant, call_lasts: float) -> bool:
-        """Look at what does not come: states, and the end of a call that ``call_lasts`` s; True
-        where it latches now."""
+        """Check for missing states and for a call that has lasted ``call_lasts`` s; True if it
+        latches now."""
         if call_lasts > UNANSWERED:
             return self.stop(
                 "fault", f"the robot's library has not answered for {call_lasts:.2f} s"

@@ -1,4 +1,4 @@
-"""From what `simdevice ur` and its like are asked for to a robot in a world and its boards."""
+"""Build a robot, its world and its boards from the options of `simdevice ur` and the like."""
 
 from __future__ import annotations
 

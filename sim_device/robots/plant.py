@@ -1,9 +1,9 @@
-"""What every emulated robot has in common: a tool that moves in the cupboard, and how it stops.
+"""Mechanics of every emulated robot: a tool that moves in the cupboard, and how it stops.
 
-The tool centre follows a velocity in the robot's base as a stiff robot does: with bounded
-acceleration, and a position that it insists on, so that what it pushes at pushes back. In the
-cupboard's plane it is the finger of a simulated world; height, roll and pitch are free air.
-Robot time passes in steps; a process that is stopped stops its robot. Pure.
+The tool centre follows a velocity in the robot's base with bounded acceleration. The robot is
+stiff; the finger hangs on a mount that gives way. In the cupboard's plane it is the finger of a
+simulated world; height, roll and pitch are free air. Time passes in steps of `STEP`; a process
+that is stopped stops its robot. Pure.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sim_device.world.touch import on_skin
 from tactile_core.types import NS_PER_S, Instant, Twist
 
 STEP: Final = 0.002
-"""s between two cycles of a robot's controller."""
+"""Period of a robot's controller, s."""
 
 STEP_NS: Final = round(STEP * NS_PER_S)
 
@@ -37,10 +37,10 @@ DAMPING: Final = (100.0, 100.0, 1.3)
 """N·s/m and N·m·s/rad of the same, a third of critical with the finger's mass in the world."""
 
 MOTOR_FORCE: Final = 150.0
-"""N of the robot's own strength, far beyond what a cupboard stands."""
+"""Strength of the robot, N: far more than a cupboard stands."""
 
 MOTOR_MOMENT: Final = 30.0
-"""N·m of the same."""
+"""Strength of the robot about the vertical, N·m."""
 
 MAX_CATCH_UP_NS: Final = 20_000_000
 """Time that is made up for at once. A controller does not stand still, as a process on a busy
@@ -224,7 +224,7 @@ class Plant:
         speed = (finger.twist.vx, finger.twist.vy, finger.twist.omega)
         load = (finger.fx, finger.fy, finger.mz)
         asks = []
-        for axis, mount in enumerate(self._mount_force(finger)):
+        for axis, mount in enumerate(self._mount_force(finger, PHYSICS_STEP)):
             mass, moves = self._mass[axis], self._moves[axis]
             gain = mass / MOTOR_TIME
             # The motor holds back a change of speed within a step as if it were mass.
@@ -232,24 +232,24 @@ class Plant:
             asks.append(speed[axis] + (mount + inertia + load[axis]) / gain)
         self._moved = self._moves
         world.step(PHYSICS_STEP, Twist(*asks))
-        fx, fy, mz = self._mount_force(world.finger())
+        fx, fy, mz = self._mount_force(world.finger(), 0.0)
         self._wrench = (-fx, -fy, -mz)
 
-    def _mount_force(self, finger: FingerState) -> tuple[float, float, float]:
-        """N, N and N·m with which the mount pushes the finger, which the wrist's sensor feels."""
-        apart = (
-            self._insists[0] - finger.x,
-            self._insists[1] - finger.y,
-            math.remainder(self._insists[2] - finger.heading, math.tau),
-        )
+    def _mount_force(self, finger: FingerState, ahead: float) -> tuple[float, float, float]:
+        """N, N and N·m with which the mount pushes the finger, which the wrist's sensor feels.
+
+        ``ahead``: s by which the robot is ahead of the world, which moves in longer steps.
+        """
         speed = (finger.twist.vx, finger.twist.vy, finger.twist.omega)
-        fx, fy, mz = (
-            stiff * gap + damp * (moves - moved)
-            for stiff, gap, damp, moves, moved in zip(
-                STIFFNESS, apart, DAMPING, self._moves, speed, strict=True
-            )
-        )
-        return fx, fy, mz
+        at = (finger.x, finger.y, finger.heading)
+        force = []
+        for axis, moves in enumerate(self._moves):
+            own = self._insists[axis] - moves * self._owed
+            gap = own - at[axis] - speed[axis] * ahead
+            if axis == 2:
+                gap = math.remainder(gap, math.tau)
+            force.append(STIFFNESS[axis] * gap + DAMPING[axis] * (moves - speed[axis]))
+        return force[0], force[1], force[2]
 
 
 class Truth:

@@ -29,11 +29,17 @@ log = logging.getLogger(__name__)
 MARKER_PERIOD: Final = 1 / WORLD.rate
 
 MIRRORED: Final = np.diag([-1.0, -1.0, 1.0, 1.0, 1.0, -1.0])
-"""What a robot makes of a velocity whose frame is turned about: x and y are reversed."""
+"""What a robot makes of a velocity if its frame is turned about: x and y are reversed."""
+
+
+COMMON_FAULTS: Final = (
+    "freeze S", "slow GROWTH MOST", "mirror", "true", "place X Y H", "mark"
+)  # fmt: skip
+"""Faults of every emulated robot: those of the network, of its frame, and none."""
 
 
 class FaultError(ValueError):
-    """A fault that is not known, or lacks a number; the message says what is allowed."""
+    """A fault is unknown or lacks a number; the message says what is allowed."""
 
 
 class Emulated(Protocol):
@@ -46,11 +52,11 @@ class Emulated(Protocol):
         ...
 
     def spontaneous(self, servers: Servers, now: Instant) -> None:
-        """Send what nobody asked for: states."""
+        """Send states, which nobody asks for."""
         ...
 
     def befall(self, fault: str, number: float | None, /) -> bool:
-        """Let a fault of this vendor's happen; False when it is not one."""
+        """Apply a fault of this vendor's robots; False if there is none of that name."""
         ...
 
     @property
@@ -173,6 +179,8 @@ class RobotServer:
         number = numbers[0] if numbers else None
         if word == "freeze" and number is not None:
             self.servers.frozen, self._thaw = True, after(now, number)
+        elif word == "slow" and len(numbers) == 2:
+            self.servers.slow(numbers[0], numbers[1], now)
         elif word == "mirror":
             plant.wrong = MIRRORED
         elif word == "true":
@@ -180,7 +188,7 @@ class RobotServer:
         elif word == "place" and len(numbers) == 3:
             plant.place(*numbers)
         elif word != "mark" and not self.robot.befall(word, number):
-            known = ", ".join(("freeze S", "mirror", "true", "place X Y H", "mark"))
+            known = ", ".join(COMMON_FAULTS)
             return f"refused: {word!r}; allowed: {known}, {', '.join(self.robot.faults)}"
         truth.truth.event(plant, word)
         truth.flush()

@@ -1,6 +1,6 @@
-"""Servers of an emulated robot: sockets that never block, delays and a frozen network. Thin shell.
+"""Servers of an emulated robot: non-blocking sockets, delays, a frozen network. Thin shell.
 
-One thread serves all of them in turns of a millisecond, as everything else of the simulator.
+One thread serves all of them every millisecond, like everything else in the simulator.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from tactile_core.types import Instant, after
+from tactile_core.types import Instant, after, seconds_between
 
 READ: Final = 65536
 MAX_WAITING: Final = 1 << 20
-"""Bytes that wait for a client that does not read, before it is hung up on."""
+"""Bytes kept for a client that does not read; beyond that it is disconnected."""
 
 RESENT: Final = 0.2
-"""s that TCP takes to send what was lost once more; all behind it waits."""
+"""Time that TCP takes to resend what was lost, s; everything after it waits."""
 
 
 class Peer(Protocol):
@@ -39,7 +39,7 @@ class Peer(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """How long a message takes, s, and how many in a thousand are lost and sent again."""
+    """``latency``: s that a message takes. ``loss``: part of the messages that are sent again."""
 
     latency: float = 0.0
     loss: float = 0.0
@@ -58,7 +58,7 @@ class Client:
 
 
 class SocketError(Exception):
-    """A port cannot be had; the message names the remedy."""
+    """A port is not available; the message names the remedy."""
 
 
 class Servers:
@@ -79,6 +79,7 @@ class Servers:
         self._network = network
         self._rng = rng
         self._listeners: list[tuple[socket.socket, Callable[[], Peer]]] = []
+        self._slowed: tuple[float, float, Instant] | None = None
 
     def open(self) -> None:
         """Listen; `SocketError`."""
@@ -106,6 +107,11 @@ class Servers:
         for client in self.clients:
             client.link.close()
         self.clients.clear()
+
+    def slow(self, growth: float, most_s: float, now: Instant) -> None:
+        """Let every message take longer from ``now`` on, by ``growth`` s a second up to ``most_s``;
+        0 s takes it away."""
+        self._slowed = (growth, most_s, now) if most_s > 0 else None
 
     def serve(self, now: Instant) -> None:
         """Take in what came and send what is due."""
@@ -145,6 +151,9 @@ class Servers:
 
     def _arrival(self, queued: deque[tuple[Instant, bytes]], now: Instant) -> Instant:
         delay = self._network.latency
+        if self._slowed is not None:
+            growth, most_s, since = self._slowed
+            delay += min(most_s, growth * seconds_between(since, now))
         if self._network.loss and self._rng.random() < self._network.loss:
             delay += RESENT
             self.counters["resent"] += 1

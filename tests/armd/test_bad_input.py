@@ -50,7 +50,7 @@ def refused(done: subprocess.CompletedProcess[str], code: int, says: str) -> Non
 @pytest.mark.parametrize(
     ("driver", "text", "code", "says"),
     [
-        ("mock", GOOD, 2, r"no \[frame\].*armd teach"),
+        ("mock", GOOD, 2, r"frame\] is missing.*armd teach"),
         ("mock", GOOD + FRAME.replace("0.6, -0.2", "0.2, -0.2"), 2, "mirrored"),
         ("mock", GOOD.replace("payload = 0.8", "") + FRAME, 2, "payload is missing"),
         ("mock", GOOD.replace("address", "adress") + FRAME, 2, "did you mean address"),

@@ -17,7 +17,7 @@ from armd.config import ArmConfig, RobotTable, ToolTable, check_facts
 from armd.driver import RobotMode
 from tactile_core.types import ArmLimits
 
-FAKE = Path(__file__).with_name("flexivrdk_fake.py")
+FAKE = Path(__file__).with_name("flexiv") / "flexivrdk_fake.py"
 
 
 def fake_module() -> ModuleType:
@@ -62,6 +62,15 @@ def test_rest_is_the_present_pose_with_limits_above_zero(driver: Any) -> None:
     driver.halt()
     driver.halt()
     assert len(driver._robot.sent) == 2, "once is enough"
+    assert driver._robot.sent[-1].pose_d[:3] == pytest.approx(state.position.tolist())
+
+
+def test_rest_is_the_last_pose_that_was_finite(driver: Any) -> None:
+    state = driver.read()
+    driver._robot._states.tcp_pose = [float("nan")] * 7
+    driver.read()
+    driver.move(np.array([0.03, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    driver.halt()
     assert driver._robot.sent[-1].pose_d[:3] == pytest.approx(state.position.tolist())
 
 

@@ -1,4 +1,4 @@
-"""Drivers by name; the library of each is imported when it is asked for."""
+"""Drivers by name. The vendor's library of each is imported only when the driver is used."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final, cast
 
+from armd.driver import SetupError
 from tactile_core.cli import MissingExtraError
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ REMEDY: Final[dict[str, str]] = {
 
 
 def missing(name: str) -> str | None:
-    """Why the driver called ``name`` cannot be used here; None when it can."""
+    """Why the driver called ``name`` cannot be used here; None if it can."""
     library = DRIVERS[name][2]
     if not library or find_spec(library) is not None:
         return None
@@ -38,10 +39,16 @@ def missing(name: str) -> str | None:
 
 
 def make_driver(name: str, config: ArmConfig) -> Driver:
-    """The driver called ``name``; `MissingExtraError` where its library is not installed."""
+    """The driver called ``name``; `MissingExtraError` where its library is not installed, and
+    `SetupError` where nothing says where its robot is."""
     problem = missing(name)
     if problem is not None:
         raise MissingExtraError(problem)
-    module, kind, _ = DRIVERS[name]
+    module, kind, library = DRIVERS[name]
+    if library and not config.robot.address:
+        raise SetupError(
+            "[robot] address is missing: write the host name or IP of the robot there, for a "
+            "Flexiv its serial number"
+        )
     found: Any = getattr(import_module(f"armd.drivers.{module}"), kind)
     return cast("Driver", found(config))

@@ -9,7 +9,6 @@ not said: limits are always above zero, and rest is "the target is where it is".
 from __future__ import annotations
 
 import contextlib
-import math
 import time
 from typing import Any, Final
 
@@ -18,7 +17,12 @@ import numpy as np
 
 from armd.config import ArmConfig
 from armd.driver import DriverError, Float, RobotFacts, RobotMode, RobotState
-from armd.frames import rotation_matrix, rotation_vector
+from armd.frames import (
+    quaternion_of,
+    rotation_matrix,
+    rotation_of,
+    rotation_vector,
+)
 from tactile_core.types import ArmLimits
 
 LOOK_AHEAD: Final = 0.1
@@ -78,7 +82,7 @@ class FlexivDriver:
         return RobotFacts(
             f"Flexiv {serial}",
             tool_position=location[:3],
-            tool_rotation=rotation_vector(_rotation(location[3:])),
+            tool_rotation=rotation_vector(rotation_of(location[3:])),
             payload=float(tool.mass),
             enforces=frozenset({"f_max", "m_max"}),
         )
@@ -94,8 +98,9 @@ class FlexivDriver:
             states = self._robot.states()[self._group]
         self._stamp = states.timestamp
         pose = np.asarray(states.tcp_pose, dtype=np.float64)
-        rotation = _rotation(pose[3:])
-        self._pose = pose[:3], rotation
+        rotation = rotation_of(pose[3:])
+        if np.isfinite(pose).all():  # else it would be sent back as the target that means rest
+            self._pose = pose[:3], rotation
         mode, detail = self._mode()
         return RobotState(
             _seconds(states.timestamp),
@@ -176,7 +181,7 @@ class FlexivDriver:
         return RobotMode.READY, ""
 
     def _send(self, position: Float, rotation: Float, speed: float, turn: float) -> None:
-        pose = [*position.tolist(), *_quaternion(rotation)]
+        pose = [*position.tolist(), *quaternion_of(rotation)]
         command = flexivrdk.NrtCartesianCmd(pose)
         command.max_linear_vel = max(speed, LEAST_SPEED)
         command.max_angular_vel = max(turn, LEAST_SPEED)
@@ -189,21 +194,3 @@ class FlexivDriver:
 def _seconds(stamp: tuple[int, int]) -> float:
     """s of a time stamp, which is (s, ns)."""
     return float(stamp[0]) + float(stamp[1]) * 1e-9
-
-
-def _rotation(quaternion: Float) -> Float:
-    """(3, 3) of a unit quaternion w, x, y, z."""
-    w, vector = float(quaternion[0]), np.asarray(quaternion[1:4], dtype=np.float64)
-    size = float(np.linalg.norm(vector))
-    if size < 1e-12:
-        return np.eye(3)
-    return rotation_matrix(vector / size * (2 * math.atan2(size, w)))
-
-
-def _quaternion(rotation: Float) -> list[float]:
-    """w, x, y, z of a rotation matrix."""
-    vector = rotation_vector(rotation)
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return [1.0, 0.0, 0.0, 0.0]
-    return [math.cos(angle / 2), *(vector / angle * math.sin(angle / 2)).tolist()]

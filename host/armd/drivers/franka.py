@@ -65,9 +65,11 @@ class FrankaDriver:
                 raise DriverError("the robot has errors: recover it in its desk first")
             state = robot.state
         except franky.Exception as error:
+            remedy = "activate FCI, unlock the joints, end other programs"
+            if "realtime" in str(error):
+                remedy = "boot a kernel with PREEMPT_RT, which Franka's interface needs"
             raise DriverError(
-                f"the robot at {address} gives no control ({error}): activate FCI, unlock the "
-                "joints, end other programs"
+                f"the robot at {address} gives no control ({error}): {remedy}"
             ) from error
         tool = _transform(state.F_T_EE)
         return RobotFacts(

@@ -99,8 +99,8 @@ def run_trial(
     """Run one trial to its end. StrategyError, ConfigError or WorldError if it cannot be run.
 
     ``seed``: strategy, board and arm draw from generators made from it. ``world``: None for
-    MuJoCo's. ``sense``: None for that of ``depth``. ``watch``: called once per control cycle. ``make_arm``:
-    makes another arm than the simulated one, of a world and the instant from which it runs.
+    MuJoCo's. ``sense``: None for that of ``depth``. ``watch``: called once per control cycle.
+    ``make_arm``: makes another arm than the simulated one, of a world and its first instant.
     """
     world = MujocoWorld(scene) if world is None else world
     if sense is None:
