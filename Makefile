@@ -97,7 +97,7 @@ gate-random: setup  ## a million random inputs through the safety gate
 hostile: setup  ## 100,000 hostile items through recorder and pipeline
 	HOSTILE_ITEMS=100000 $(BIN)/python -m pytest -q tests/tactile_core/log/test_recorder_hostile.py tests/tactiled/test_hostile.py -k hostile_items
 
-# Every frame of every recording, none of which may be masked.
+# Every frame of every recording, none of which may be masked; of whole ones where ../shared has them.
 recordings: setup  ## every frame of every recording of a real board
 	RECORDED_FRAMES=1000000000 $(BIN)/python -m pytest -q tests/tactiled/sensing/test_played_readings.py -k never_masked
 

@@ -75,8 +75,9 @@ def make_goal(
     return goal
 
 
-LOOP_TIMEOUT = 1.0
-"""s for the control loop to serve a request; it does so every 10 ms."""
+LOOP_TIMEOUT = 3.0
+"""s for the control loop to serve a request; it does so every 10 ms. A stuck loop ends the daemon
+sooner."""
 
 CONFIRM_TIMEOUT = 0.5
 """s until the arm's state must show the limits that it confirmed."""

@@ -49,13 +49,13 @@ FIND_S = 3.0
 GATHER_S = 0.2
 """Further time for other daemons, once one was found."""
 
-STATUS_S = 3.0
-"""Time for a daemon to answer simple requests."""
+STATUS_S = 10.0
+"""Time for a daemon to answer simple requests, also on a busy machine."""
 
 TARE_S = 120.0
 """Time for a tare: several times eight frames of a board at 0.5 Hz."""
 
-RECORD_S = 10.0
+RECORD_S = 30.0
 """Time to start a recording, or to finish it on the disk."""
 
 

@@ -69,7 +69,7 @@ NAME_TIMEOUT = 0.3
 JOIN_TIMEOUT = 1.0
 """s for the pipeline's thread to end before the log is closed."""
 
-LEAVE_TIMEOUT = 2.0
+LEAVE_TIMEOUT = 5.0
 """Further s for it to end, for a very busy machine, before it is left behind."""
 
 STOPPING = ServiceError("tactiled is stopping")

@@ -37,10 +37,10 @@ LONGEST_S = 86_400.0
 USUAL_LIMIT_S = 3600.0
 """Time limit when none is given, so that a forgotten recording does not fill the disk."""
 
-CLOSE_TIMEOUT_S = 5.0
+CLOSE_TIMEOUT_S = 20.0
 """Time for a recording to reach the disk when it is stopped on request."""
 
-GEOMETRY_TIMEOUT_S = 1.0
+GEOMETRY_TIMEOUT_S = 5.0
 """Time for the pipeline to describe the boards at the start of a recording."""
 
 

@@ -29,7 +29,7 @@ from tactiled.diagnostics import log_summary, summary
 from tactiled.port import Port
 from tactiled.recordings import Recordings, RecordRequest
 
-PIPELINE_TIMEOUT = 1.0
+PIPELINE_TIMEOUT = 5.0
 """s for the pipeline's thread to take up a request; it looks for one every 10 ms."""
 
 TARE_TIMEOUT = 15.0

@@ -137,7 +137,7 @@ def test_taught_points_are_where_the_tip_was(robot: Callable[[str], Any], tmp_pa
         taught.stdin.write("\n")
         taught.stdin.flush()
         said = ""
-    out, _ = taught.communicate(timeout=60)
+    out, _ = taught.communicate(timeout=120)
     assert taught.returncode == 0, out
     frame = load_config(path).frame
     assert frame is not None

@@ -51,7 +51,6 @@ def test_wheel_holds_only_our_packages(wheel: Path) -> None:
     assert "tactile_tools/view/page/index.html" in names
 
 
-@pytest.mark.timeout(300)
 def test_every_command_starts_in_a_clean_environment(wheel: Path, tmp_path: Path) -> None:
     home = tmp_path / "env"
     run(sys.executable, "-m", "venv", "--without-pip", home)

@@ -26,7 +26,7 @@ Until = Callable[..., None]
 
 def test_unrepresentable_stamp_does_not_end_the_log(lab: Any) -> None:
     lab.arm, lab.board()
-    program = lab.reachd("--serve", "--log", "trial.mcap")
+    program = lab.reachd("--serve", "--log", "trial.mcap", *lab.patient())
     wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
     for stamp in (-1, -(1 << 63), (1 << 63) - 1):
         lab.arm.session.put(
@@ -46,7 +46,7 @@ def test_unrepresentable_stamp_does_not_end_the_log(lab: Any) -> None:
 
 def test_no_reach_starts_without_the_requested_log(lab: Any) -> None:
     arm, _ = lab.arm, lab.board()
-    program = lab.reachd("--serve", "--strategy", "straight", "--log", "logs")
+    program = lab.reachd("--serve", "--strategy", "straight", "--log", "logs", *lab.patient())
     wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
     wait_until(lab.arms)
     logs: Path = lab.folder / "logs"
@@ -76,7 +76,7 @@ def test_reach_runs_at_any_system_time(
     )
     monkeypatch.setenv("PYTHONPATH", str(lab.folder))
     arm, _ = lab.arm, lab.board()
-    program = lab.reachd(*NEAR, "--log", "trial.mcap")
+    program = lab.reach(*NEAR, "--log", "trial.mcap", *lab.patient())
     assert program.wait() == 0, program.said
     assert f"the system clock reads {says}" in program.said
     assert arm.travelled > 0.03

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import time
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -17,18 +16,11 @@ from tactile_core.bus.topics import FEATURES, service_key
 from tactile_core.log.info import info
 from tactile_core.log.recovery import recover
 from tactile_core.types import ArmLimits
-from tests.support.waiting import wait_until
+from tests.support.reachd_lab import TRIES
+from tests.support.waiting import PATIENCE_S, wait_until
 
 NEAR = ("--strategy", "straight", "--target", "0.04,0.0", "--seed", "1")
 FAR = ("--strategy", "straight", "--target", "0.36,0.0", "--seed", "1")
-
-Until = Callable[..., None]
-
-
-def stopped(lab: Any) -> bool:
-    """Whether the arm has been commanded to stand still: by ten commands in a row."""
-    last = lab.arm.heard[-10:]
-    return len(last) == 10 and all(h.still for h in last)
 
 
 def test_complete_reach_is_held_in_one_log_file(lab: Any, hardware_limits: ArmLimits) -> None:
@@ -41,11 +33,12 @@ def test_complete_reach_is_held_in_one_log_file(lab: Any, hardware_limits: ArmLi
         return {}
 
     service = declare_service(arm.session, key, publish_geometry)
-    program = lab.reachd(*NEAR, "--log", "trial.mcap", "--json", "outcome.json")
+    words = ("--log", "trial.mcap", "--json", "outcome.json")
+    program = lab.reach(*NEAR, *words, *lab.patient())
     assert program.wait() == 0, program.said
     outcome = json.loads((lab.folder / "outcome.json").read_text())
     assert outcome["success"] is True
-    assert len(asked) == 1
+    assert 1 <= len(asked) <= TRIES, "once by every reachd"
     service.close()
     assert outcome["distance"] <= 0.0075
     assert (outcome["strategy"], outcome["set"], outcome["seed"]) == ("straight", "hardware", 1)
@@ -55,8 +48,9 @@ def test_complete_reach_is_held_in_one_log_file(lab: Any, hardware_limits: ArmLi
     assert all(abs(h.omega) <= 0.1 + 1e-9 for h in arm.heard)
     assert all((h.vx**2 + h.vy**2) ** 0.5 <= arm.limits.v_max + 1e-9 for h in arm.heard)
     lab.wait_until_told_to_stop()
+    lab.wait_for_codes("outcome", "reached")
     assert lab.codes("outcome") == ["reached"]
-    assert {"limits", "arm", "goal"} <= set(lab.codes("operator"))
+    lab.wait_for_codes("operator", "limits", "arm", "goal")
     log = info(lab.folder / "trial.mcap")
     assert log.closed
     topics = {channel.topic for channel in log.channels}
@@ -75,26 +69,22 @@ def test_complete_reach_is_held_in_one_log_file(lab: Any, hardware_limits: ArmLi
 def test_silent_features_stop_the_arm_and_lost_features_end_the_reach(lab: Any) -> None:
     """Rows 4, 13, 14 and 19: a stopped, then a killed, tactiled."""
     _, board = lab.arm, lab.board()
-    program = lab.reachd(*FAR, "--no-log")
-    lab.wait_until_moving(program)
+    program = lab.reach(*FAR, "--no-log", *lab.patient("features_stale", "features_lost"))
     board.signal(signal.SIGSTOP)
-    wait_until(lambda: stopped(lab))
-    assert "features_stale" in lab.codes("intervention")
+    wait_until(lab.stopped)
+    lab.wait_for_codes("intervention", "features_stale")
     board.signal(signal.SIGKILL)
     assert program.wait() == 1, program.said
     assert "NOT REACHED (held)" in program.said
-    assert "features_lost" in lab.codes("intervention")
+    lab.wait_for_codes("intervention", "features_lost")
     lab.wait_until_told_to_stop()
 
 
 def test_short_silence_only_pauses_the_reach(lab: Any) -> None:
     arm, board = lab.arm, lab.board()
-    config = lab.folder / "reach.toml"
-    config.write_text("[parameters.safety]\nfeatures_latch = 30.0\n")
-    program = lab.reachd(*FAR, "--no-log", "--config", str(config))
-    lab.wait_until_moving(program)
+    program = lab.reach(*FAR, "--no-log", *lab.patient("features_stale"))
     board.signal(signal.SIGSTOP)
-    wait_until(lambda: stopped(lab))
+    wait_until(lab.stopped)
     board.signal(signal.SIGCONT)
     wait_until(lambda: arm.moving)
     program.signal(signal.SIGTERM)
@@ -104,20 +94,18 @@ def test_short_silence_only_pauses_the_reach(lab: Any) -> None:
 def test_lost_arm_state_stops_motion_and_ends_the_reach(lab: Any) -> None:
     """Row 24, and the latch after a second."""
     arm, _ = lab.arm, lab.board()
-    program = lab.reachd(*FAR, "--no-log")
-    lab.wait_until_moving(program)
+    program = lab.reach(*FAR, "--no-log", *lab.patient("arm_stale", "arm_lost"))
     arm.paused = True
-    wait_until(lambda: stopped(lab))
+    wait_until(lab.stopped)
     assert program.wait() == 1, program.said
-    assert {"arm_stale", "arm_lost"} <= set(lab.codes("intervention"))
+    lab.wait_for_codes("intervention", "arm_stale", "arm_lost")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_sigterm_stops_arm_before_closing_log(lab: Any, number: signal.Signals) -> None:
     """Row 34."""
     arm, _ = lab.arm, lab.board()
-    program = lab.reachd(*FAR, "--log", "trial.mcap")
-    lab.wait_until_moving(program)
+    program = lab.reach(*FAR, "--log", "trial.mcap", *lab.patient())
     program.signal(number)
     assert program.wait() == 1, program.said
     assert "NOT REACHED (stopped)" in program.said
@@ -129,23 +117,24 @@ def test_sigterm_stops_arm_before_closing_log(lab: Any, number: signal.Signals) 
 def test_kill_9_stops_the_arm_and_a_new_reachd_starts(lab: Any) -> None:
     """Rows 15 and 29: nothing left of it blocks a restart."""
     arm, _ = lab.arm, lab.board()
-    program = lab.reachd(*FAR, "--log", "trial.mcap")
-    lab.wait_until_moving(program)
+    program = lab.reach(*FAR, "--log", "trial.mcap", *lab.patient())
     wait_until(lambda: (lab.folder / "trial.mcap").stat().st_size > 20_000)
     program.signal(signal.SIGKILL)
     program.wait()
     wait_until(lambda: not arm.moving)
     report = recover(lab.folder / "trial.mcap", lab.folder / "whole.mcap")
     assert report.messages > 0
-    again = lab.reachd("--strategy", "straight", "--target", f"{arm.x + 0.17},0", "--no-log")
+    target = ("--strategy", "straight", "--target", f"{arm.x + 0.17},0")
+    again = lab.reach(*target, "--no-log", *lab.patient())
     assert again.wait() == 0, again.said
 
 
 def test_sigstop_and_sigcont_do_not_resume_motion(lab: Any) -> None:
     """Row 14 for reachd itself: the arm stops without it, and waits for an operator."""
     arm, _ = lab.arm, lab.board()
-    program = lab.reachd(*FAR, "--no-log")
-    lab.wait_until_moving(program)
+    program = lab.reach(
+        *FAR, "--no-log", *lab.patient("features_stale", "features_lost", "arm_stale", "arm_lost")
+    )
     program.signal(signal.SIGSTOP)
     time.sleep(1.5)
     assert not arm.moving
@@ -161,7 +150,7 @@ def test_sigstop_and_sigcont_do_not_resume_motion(lab: Any) -> None:
 def test_goals_are_served_over_the_bus(lab: Any) -> None:
     """Goals, refusals, and rows 22, 26 and 35, with one daemon."""
     arm, _ = lab.arm, lab.board()
-    program = lab.reachd("--serve", "--strategy", "straight", "--no-log")
+    program = lab.reachd("--serve", "--strategy", "straight", "--no-log", *lab.patient())
     wait_until(lambda: lab.ask("status")["features"]["accepted"] > 5)
     goal = {"x": 0.36, "y": 0.0}
     for service, request, words in (
@@ -183,7 +172,7 @@ def test_goals_are_served_over_the_bus(lab: Any) -> None:
     lab.ask("goal", goal)
     wait_until(lambda: arm.moving)
     lab.ask("stop", {"reason": "enough"})
-    wait_until(lambda: stopped(lab))
+    wait_until(lab.stopped)
     status = lab.ask("status")
     assert (status["state"], status["armed"]) == ("resetting", True)
     assert status["outcome"]["text"] == "enough"
@@ -207,7 +196,7 @@ def test_goals_are_served_over_the_bus(lab: Any) -> None:
     forger = declare_publisher(arm.session, FEATURES, "board0")
     forger.put(b"forged", 0)
     wait_until(lambda: lab.ask("status")["held"] == "duplicate_publisher")
-    wait_until(lambda: stopped(lab) or not arm.moving)
+    wait_until(lambda: lab.stopped() or not arm.moving)
     wait_until(lab.arms)
 
     program.signal(signal.SIGTERM)
@@ -218,8 +207,11 @@ def test_goals_are_served_over_the_bus(lab: Any) -> None:
 def test_without_features_or_arm_no_reach_starts(lab: Any) -> None:
     """Row 23 as well: a replay does not count as a board."""
     lab.board(prefix="replay")
-    program = lab.reachd(*NEAR, "--no-log", "--wait", "1")
-    assert program.wait() == 3
+    for wait_s in (2, 10, 60):
+        program = lab.reachd(*NEAR, "--no-log", "--wait", str(wait_s))
+        assert program.wait() == 3
+        if "boards on the bus: board0" in program.said:  # it may take its time to come
+            break
     assert "no features came on tactile/board0/features" in program.said
     assert "boards on the bus: board0" in program.said
     assert "no state came on arm/arm/state" in program.said
@@ -228,12 +220,15 @@ def test_without_features_or_arm_no_reach_starts(lab: Any) -> None:
 
 def test_remote_board_must_be_named(lab: Any) -> None:
     arm, _ = lab.arm, lab.board(ahead=500.0)
-    program = lab.reachd(*NEAR, "--no-log", "--wait", "3")
-    assert program.wait() == 3
+    for wait_s in (3, 10, 60):
+        program = lab.reachd(*NEAR, "--no-log", "--wait", str(wait_s))
+        assert program.wait() == 3
+        if 'board_clock = "remote"' in program.said:  # its features may take their time to come
+            break
     assert 'board_clock = "remote"' in program.said
-    config = lab.folder / "reach.toml"
-    config.write_text('[inputs]\nboard_clock = "remote"\n')
-    assert lab.reachd(*NEAR, "--no-log", "--config", str(config)).wait() == 0
+    assert arm.travelled == 0.0
+    remote = lab.patient(more='[inputs]\nboard_clock = "remote"\n')
+    assert lab.reach(*NEAR, "--no-log", *remote).wait() == 0
     assert arm.travelled > 0.02
 
 
@@ -245,14 +240,17 @@ def test_unfit_arm_is_not_armed(lab: Any, trouble: str) -> None:
     arm.force = (3.0, 0.0, 0.0) if trouble == "bias" else (0.0, 0.0, 0.0)
     arm.mode = "fault" if trouble == "fault" else "ready"
     log = ["--log", "/proc/nowhere"] if trouble == "broken log" else ["--no-log"]
-    program = lab.reachd(*NEAR, *log)
-    assert program.wait() == 3
     words = {
         "limits": "f_max is 100 N, 10.6066 asked",
         "bias": "3.00 N and 0.000 N·m in free air",
         "fault": "mode 'fault'",
         "broken log": "cannot write a log",
     }
+    for _ in range(5):
+        program = lab.reachd(*NEAR, *log, *lab.patient(), "--wait", str(PATIENCE_S))
+        assert program.wait() == 3
+        if words[trouble] in program.said:  # else an answer came late: that was said instead
+            break
     assert words[trouble] in program.said
     assert "Traceback" not in program.said
     assert all(h.still for h in arm.heard)
@@ -282,15 +280,15 @@ def test_failing_or_hanging_strategy_stops_the_arm(lab: Any) -> None:
         "            time.sleep(1)\n"
     )
     arm, _ = lab.arm, lab.board()
-    target = ("--target", "0.36,0.0", "--no-log")
-    failing = lab.reachd("--strategy", "own:Own", *target)
+    target = ("--target", "0.36,0.0", "--no-log", *lab.patient())
+    failing = lab.reach("--strategy", "own:Own", *target)
     assert failing.wait() == 1
     assert "RuntimeError: lost my way" in failing.said
     assert arm.travelled > 0.0
-    hung = lab.reachd("--strategy", "own:Hung", *target)
+    hung = lab.reach("--strategy", "own:Hung", *target)
     assert hung.wait() == 1
     assert "stuck" in hung.said
-    wait_until(lambda: arm.heard[-1].still)  # the last twist may still be on its way
+    lab.wait_until_told_to_stop()
 
 
 def test_forged_bytes_never_crash_the_daemon(lab: Any) -> None:

@@ -23,7 +23,7 @@ from tactile_core.bus.services import ServiceError, declare_service
 from tactile_core.bus.session import BusConfig, close_session, open_session
 from tactile_core.bus.streams import declare_publisher
 from tactile_core.bus.topics import ARM_STATE, COMMAND, service_key
-from tactile_core.types import ArmLimits, WallClock, monotonic_now
+from tactile_core.types import NS_PER_S, ArmLimits, Instant, WallClock, monotonic_now
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,11 @@ class Heard:
 
 
 class FakeArm:
-    """Follows each twist without inertia until it expires; its tip starts at the shelf's edge."""
+    """Obeys twists without inertia, each until it expires; its tip starts at the shelf's edge.
+
+    How far it goes depends on when commands come and expire alone, never on when its own threads
+    get the processor.
+    """
 
     def __init__(self, endpoint: str, name: str = "arm") -> None:
         self.name = name
@@ -56,6 +60,8 @@ class FakeArm:
         self.limits = ArmLimits(0.5, 1.0, 100.0, 20.0)
         self.heard: list[Heard] = []
         self.travelled = 0.0
+        self._moved_at = monotonic_now()
+        self._moving = threading.Lock()
         self.session = open_session(BusConfig(listen=(endpoint,), connect=()))
         self._wall = WallClock.take()
         self._stopping = threading.Event()
@@ -75,10 +81,30 @@ class FakeArm:
     @property
     def speed(self) -> tuple[float, float, float]:
         last = self.heard[-1] if self.heard else None
-        if last is None or monotonic_now() >= last.order.expires or self.mode in ("estop", "fault"):
+        if last is None or monotonic_now() >= last.order.expires:
             return (0.0, 0.0, 0.0)
-        vx, vy, omega = self.does((last.vx, last.vy, last.omega))
+        return self._obeyed(last)
+
+    def _obeyed(self, command: Heard) -> tuple[float, float, float]:
+        if self.mode in ("estop", "fault"):
+            return (0.0, 0.0, 0.0)
+        vx, vy, omega = self.does((command.vx, command.vy, command.omega))
         return (vx, vy, omega)
+
+    def _move(self, now: Instant, then: Heard | None = None) -> None:
+        """Go where the command in force leads until ``now``, from when on it is ``then``."""
+        with self._moving:
+            if self.heard:
+                last = self.heard[-1]
+                passed = max(0, min(now, last.order.expires) - self._moved_at) / NS_PER_S
+                vx, vy, omega = self._obeyed(last)
+                self.x += vx * passed
+                self.y += vy * passed
+                self.heading += omega * passed
+                self.travelled += math.hypot(vx, vy) * passed
+            self._moved_at = max(now, self._moved_at)
+            if then is not None:
+                self.heard.append(then)
 
     def close(self) -> None:
         self._stopping.set()
@@ -95,7 +121,7 @@ class FakeArm:
         twist = order.twist
         heard = Heard(time.monotonic(), twist.vx, twist.vy, twist.omega, order)
         assert all(math.isfinite(v) for v in (heard.vx, heard.vy, heard.omega))
-        self.heard.append(heard)
+        self._move(now, heard)
 
     def _limit(self, request: LimitsRequest) -> ArmLimits:
         try:
@@ -110,15 +136,9 @@ class FakeArm:
 
     def _run(self) -> None:
         publisher = declare_publisher(self.session, ARM_STATE, self.name)
-        sequence, last = 0, time.monotonic()
+        sequence = 0
         while not self._stopping.wait(0.005):
-            now = time.monotonic()
-            vx, vy, omega = self.speed
-            self.x += vx * (now - last)
-            self.y += vy * (now - last)
-            self.heading += omega * (now - last)
-            self.travelled += math.hypot(vx, vy) * (now - last)
-            last = now
+            self._move(monotonic_now())
             if not self.paused:
                 sequence += 1
                 data = codec().encode(ARM_STATE, self._state(sequence))

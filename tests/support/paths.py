@@ -9,4 +9,4 @@ ROOT = TESTS.parent
 DATA = TESTS / "data"
 """Small recordings and files in the repository."""
 SHARED = ROOT.parent / "shared"
-"""Data beside the clone, on some machines; tests skip without it."""
+"""More data beside the clone, on machines that have it: whole recordings for `make recordings`."""

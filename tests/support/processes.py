@@ -22,6 +22,7 @@ class Program:
     """A process that runs in ``folder`` with its output in a file there."""
 
     def __init__(self, folder: Path, words: Sequence[str], **environment: str) -> None:
+        self.words = tuple(words)
         self.output = folder / f"{time.monotonic_ns()}.txt"
         with self.output.open("wb") as file:
             self.process = subprocess.Popen(

@@ -18,6 +18,25 @@ from tests.support.processes import Program
 from tests.support.waiting import PATIENCE_S, wait_until
 from tests.support.wire import Wire
 
+AGES = {
+    "features_stale": ("features_age", 30.0),
+    "features_lost": ("features_latch", 60.0),
+    "arm_stale": ("arm_age", 0.5),  # more, and the gate foresees the arm far out of its region
+    "arm_lost": ("arm_latch", 60.0),
+    "loop_late": ("lateness", 30.0),
+    "request_stale": ("request_age", 60.0),
+}
+"""Checks that a starved machine trips, and what they are set to where a test is not about them."""
+
+TIMED = (
+    "arm_frozen", "arm_path", "arm_speed", "arm_tracking", "echo_late", "echo_lost",
+    "features_sparse",
+)  # fmt: skip
+"""Checks that compare what was told with what came of it, which a starved arm is late to do."""
+
+TRIES = 5
+"""Starts of a reachd that found its inputs late; a healthy one on a busy machine needs two."""
+
 
 class ReachdLab:
     """Starts what a test needs and records reachd's publications."""
@@ -64,6 +83,35 @@ class ReachdLab:
         bus = ["--listen", listen or self.reachd_at, "--connect", via or self.arm_at]
         return self._start([sys.executable, "-m", "reachd", *bus, *words], **environment)
 
+    def patient(self, *strict: str, more: str = "") -> tuple[str, str]:
+        """Flags with a configuration under which a starved machine only makes reachd slow.
+
+        ``strict``: codes of the gate's checks that stay as they are, for a test that is about them.
+        ``more``: lines in front, for other tables.
+        """
+        ages = {name: f"{name} = {s}\n" for code, (name, s) in AGES.items() if code not in strict}
+        off = sorted({*TIMED, "arm_stale"} - set(strict))
+        path = self.folder / "patient.toml"
+        path.write_text(
+            f"time_limit = 600.0\n{more}\n[parameters.safety]\ndisabled = {off}\n"
+            + "".join(ages.values())
+        )
+        return "--config", str(path)
+
+    def reach(self, *words: str, **how: Any) -> Program:
+        """A reachd that moves the arm; started anew where a starved machine let it find no input.
+
+        That one says so before anything moves, and ends with 3.
+        """
+        for _ in range(TRIES):
+            program = self.reachd(*words, "--wait", str(PATIENCE_S), **how)
+            wait_until(lambda p=program: self.arm.moving or not p.running)  # type: ignore[misc]
+            if program.running or program.wait() != 3:
+                return program
+            for log in self.folder.glob("*.mcap"):
+                log.unlink()
+        raise AssertionError(program.said)
+
     def ask(self, service: str, request: object = None) -> Any:
         return call(self.arm.session, service_key("reach", service, "reach"), request, PATIENCE_S)
 
@@ -77,10 +125,20 @@ class ReachdLab:
     def codes(self, kind: str) -> list[str]:
         return [event.code for event in list(self.events) if event.kind == kind]
 
-    def wait_until_moving(self, program: Program) -> None:
-        """Wait until the arm moves."""
-        wait_until(lambda: self.arm.moving or program.process.poll() is not None)
-        assert program.process.poll() is None, program.said
+    def wait_for_codes(self, kind: str, *codes: str) -> None:
+        """Wait until reachd has told of events of all these codes."""
+        wait_until(lambda: set(codes) <= set(self.codes(kind)), explain=lambda: self.codes(kind))
+
+    def stopped(self) -> bool:
+        """Whether the arm has been told to stand still for good: ten commands in a row.
+
+        Where reachd has ended meanwhile, it was told so a few times, and stands.
+        """
+        last = self.arm.heard[-10:]
+        if len(last) == 10 and all(h.still for h in last):
+            return True
+        reachd = [p for p in self._programs if "reachd" in p.words]
+        return not self.arm.moving and not any(p.running for p in reachd)
 
     def wait_until_told_to_stop(self) -> None:
         """Wait until the last commands to the arm are zero; they may still be under way when reachd

@@ -180,8 +180,8 @@ class VirtualDaemon:
                 self.port.pump(Instant(self.now + 100_003))
 
     def close(self) -> None:
-        self.port.stop_streaming(self.now)
-        assert self.recorder.close(30)
+        self.port.farewell(self.now)
+        assert self.recorder.close(60)
 
     def _log_raw(self, chunk: Chunk) -> None:
         stamp = WALL.wall_ns(chunk.received)

@@ -18,8 +18,10 @@ from tactile_core.bus.session import BusConfig, close_session, open_session
 from tactile_core.bus.streams import Publisher, declare_alive, declare_publisher
 from tactile_core.bus.topics import ARM_STATE, FEATURES, FORCES, service_key
 from tactile_tools.cli import main
+from tests.support.waiting import PATIENCE_S, wait_until
 
-SLOW_S = 60.0
+SLOW_S = PATIENCE_S
+LAST = 1_000_000
 
 
 def features(sequence: int, normal: float = 1.5) -> bytes:
@@ -76,12 +78,16 @@ def bus(daemon: Daemon) -> Iterator[tr.Bus]:
 
 
 def connected(publisher: Publisher, stream: tr.Stream[Any]) -> None:
-    """Publish until the stream receives, then read everything received."""
-    for number in range(3000):
-        publisher.put(features(number), 0)
-        if stream.get(0.02) is not None:
-            break
-    while stream.get(0.2) is not None:
+    """Publish until the stream hears it, then read all that came."""
+    while stream.get(0.02) is None:
+        publisher.put(features(1), 0)
+    publisher.put(features(LAST), 0)
+    drain(stream)
+
+
+def drain(stream: tr.Stream[Any]) -> None:
+    """Read up to the last message that `connected` published."""
+    while stream.get(SLOW_S).sequence != LAST:
         pass
 
 
@@ -104,13 +110,14 @@ def test_slow_reader_gets_newest_and_counts_dropped(daemon: Daemon, bus: tr.Bus)
     board, publisher = bus.board("left"), daemon.publisher()
     with board.features() as newest, board.features(queue=3) as some:
         connected(publisher, newest)
-        while some.get(0.2) is not None:
-            pass
+        drain(some)
         before = some.received, newest.dropped, some.dropped
+        count = newest.received
         for number in range(100, 110):
             publisher.put(features(number), 0)
-        while some.received < before[0] + 10:
-            threading.Event().wait(0.01)
+        wait_until(
+            lambda: some.received == before[0] + 10 and newest.received == count + 10,
+        )
         assert next(newest).sequence == 109
         assert [next(some).sequence for _ in range(3)] == [107, 108, 109]
         assert (newest.dropped - before[1], some.dropped - before[2]) == (9, 7)

@@ -12,8 +12,6 @@ from tactile_tools.cli import main
 from tests.support.tactiled_lab import FeatureListener
 from tests.support.waiting import wait_until
 
-pytestmark = pytest.mark.timeout(300)
-
 PRESS = """
 [[press]]
 array = "skin"

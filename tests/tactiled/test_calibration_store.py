@@ -93,7 +93,7 @@ def test_replay_uses_its_recorded_calibration(tmp_path: Path, descriptor: Descri
     recorder = Recorder(log)
     recorder.attach("pad.cal.toml", "application/toml", saves(calibration).encode())
     recorder.attach("rim.cal.toml", "application/toml", b"")
-    assert recorder.close(30)
+    assert recorder.close(60)
     store = CalibrationStore([], strict=True)
     store.adopt_from_log(log, "pad")
     chosen = store.choose(pad(descriptor))

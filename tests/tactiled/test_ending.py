@@ -23,8 +23,6 @@ from tactiled.publisher import MessagePublisher
 from tests.support.network import free_endpoint
 from tests.support.tactiled_lab import FeatureListener
 
-pytestmark = pytest.mark.timeout(300)
-
 BURN = "while True: sum(range(10000))"
 
 

@@ -196,7 +196,7 @@ class Rig:
 def recorder(tmp_path: Path) -> Iterator[Recorder]:
     made = Recorder(tmp_path / "a.mcap", RecorderSettings(min_free_bytes=0))
     yield made
-    made.close(30)
+    made.close(60)
 
 
 def hostile_item(rng: random.Random, rig: Rig) -> Any:
@@ -228,7 +228,6 @@ def hostile_item(rng: random.Random, rig: Rig) -> Any:
     return Samples(rng.randrange(4), sequence, ticks, rng.randrange(-32768, 32767), field, status)
 
 
-@pytest.mark.timeout(400)
 def test_pipeline_and_log_survive_many_hostile_items(
     tmp_path: Path, recorder: Recorder, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -253,7 +252,7 @@ def test_pipeline_and_log_survive_many_hostile_items(
     assert not {reason for reason in lost if reason.startswith(("unsent", "spoilt"))}, drops
     assert drops["texts_held_back"] > ITEMS // 100
     assert not [r for r in caplog.records if r.exc_info]
-    assert recorder.close(30)
+    assert recorder.close(60)
     assert recorder.trouble is None
     told = info(tmp_path / "a.mcap")
     assert told.whole
@@ -291,7 +290,7 @@ def test_largest_boards_work_with_every_other_taxel_pressed(
     assert sum(len(m.points) for m in whole if m.ns == "taxels") == count * 128
     drops = rig.session.drops()
     assert not {reason: n for reason, n in drops.items() if n and reason != "patches_cut"}
-    assert recorder.close(30)
+    assert recorder.close(60)
     assert info(tmp_path / "a.mcap").whole
 
 
@@ -384,9 +383,9 @@ def test_text_with_impossible_stamp_is_stamped_on_arrival(
         (Instant(rig.sink.at - 2147483000 * NS_PER_S), "hello from 1955"),
         (Instant(rig.sink.at - NS_PER_S), "hello"),
     ):
-        rig.session.handle(BoardLog(20, captured, text))
-    assert rig.session.drops()["texts_without_time"] == 1
-    assert recorder.close(30)
+        rig.station.handle(BoardLog(20, captured, text))
+    assert rig.station.drops()["texts_without_time"] == 1
+    assert recorder.close(60)
     spoken = [
         (codec().decode(LOG, m.data), m)
         for c, m in read_messages(tmp_path / "a.mcap")

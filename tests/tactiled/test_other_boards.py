@@ -13,8 +13,6 @@ from tactile_core.log.info import info
 from tests.support.tactiled_lab import FeatureListener
 from tests.support.waiting import wait_until
 
-pytestmark = pytest.mark.timeout(300)
-
 
 def test_text_board_declared_board_and_silent_adapter_stream_and_replay(lab: Any) -> None:
     lab.boards(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -25,7 +26,7 @@ from tactiled.arguments import make_parser
 from tactiled.daemon import Daemon
 from tactiled.diagnostics import ALARM_WINDOW_S, DRIFT_N, WINDOWS, DriftWatch
 from tactiled.settings import make_settings
-from tests.support.waiting import wait_until
+from tests.support.waiting import PATIENCE_S, wait_until
 
 
 class Manager:
@@ -34,12 +35,20 @@ class Manager:
     def __init__(self, place: str) -> None:
         self._end = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._end.bind(place)
-        self._end.settimeout(30)
+        self._end.settimeout(PATIENCE_S)
 
     def wait(self, wanted: str) -> None:
         """Wait until the line ``wanted`` is received."""
         while wanted not in self._end.recv(4096).decode().splitlines():
             pass
+
+    def drain(self) -> None:
+        """Hear what has been said by now."""
+        self._end.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                self._end.recv(4096)
+        self._end.settimeout(PATIENCE_S)
 
     def said_within(self, seconds: float) -> list[str]:
         """Lines received in that time."""
@@ -50,7 +59,7 @@ class Manager:
                 said += self._end.recv(4096).decode().splitlines()
             except TimeoutError:
                 break
-        self._end.settimeout(30)
+        self._end.settimeout(PATIENCE_S)
         return said
 
     def close(self) -> None:
@@ -61,7 +70,7 @@ class Manager:
 def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager]:
     place = str(tmp_path / "notify")
     monkeypatch.setenv(supervision.SOCKET_VARIABLE, place)
-    monkeypatch.setenv(supervision.WATCHDOG_VARIABLE, "400000")
+    monkeypatch.setenv(supervision.WATCHDOG_VARIABLE, "1000000")
     monkeypatch.delenv(supervision.WATCHDOG_PID_VARIABLE, raising=False)
     manager = Manager(place)
     yield manager
@@ -116,7 +125,7 @@ def test_tactiled_notifies_ready_alive_and_stopping(manager: Manager, tmp_path: 
             manager.wait("WATCHDOG=1")
         process.send_signal(signal.SIGTERM)
         manager.wait("STOPPING=1")
-        assert process.wait(30) == 0
+        assert process.wait(PATIENCE_S) == 0
     finally:
         process.kill()
         process.wait()
@@ -134,12 +143,12 @@ def test_stuck_pipeline_thread_stops_the_watchdog(manager: Manager, tmp_path: Pa
 
         def stick() -> None:
             reached.set()
-            free.wait(60)
+            free.wait(2 * PATIENCE_S)
 
         daemon._call(stick)
-        assert reached.wait(30)
-        manager.said_within(0.1)  # beats sent before
-        assert "WATCHDOG=1" not in manager.said_within(1.0)
+        assert reached.wait(PATIENCE_S)
+        manager.drain()  # beats that were on their way
+        assert "WATCHDOG=1" not in manager.said_within(1.5)
         free.set()
         manager.wait("WATCHDOG=1")
     finally:
@@ -192,7 +201,7 @@ def test_full_failing_or_hanging_disk_is_reported_without_blocking(tmp_path: Pat
         if free[0] < 0:
             raise OSError(5, "Input/output error")
         if free[0] == 0:
-            hang.wait(60)
+            hang.wait(2 * PATIENCE_S)
         return free[0]
 
     disk = DiskWatch(lambda: tmp_path, usage=usage, every=0.01)
@@ -214,15 +223,21 @@ def test_full_failing_or_hanging_disk_is_reported_without_blocking(tmp_path: Pat
 
 
 def test_health_summarises_a_rig(lab: Any, capsys: pytest.CaptureFixture) -> None:
-    asked = ["health", "--connect", lab.endpoint, "--timeout", "20"]
+    asked = ["health", "--connect", lab.endpoint, "--timeout", str(PATIENCE_S)]
     from tactile_tools.cli import main
 
     lab.boards("--pty", "board0", "--seed", "1", link="board0")
     lab.tactiled("--port", "board0", "--no-log")
-    wait_until(lambda: main([*asked, "--board", "board0"]) == 0, 60)
+    wait_until(lambda: main([*asked, "--board", "board0"]) == 0)
     capsys.readouterr()
-    assert main([*asked, "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+
+    def healthy() -> bool:  # a starved machine makes a board seem slow for a moment
+        code = main([*asked, "--json"])
+        told.update(json.loads(capsys.readouterr().out))
+        return code == 0
+
+    told: dict[str, Any] = {}
+    wait_until(healthy)
     assert told["level"] == "OK"
     assert [(p["kind"], p["name"], p["level"]) for p in told["parts"]] == [
         ("board", "board0", "OK")

@@ -34,6 +34,12 @@ PAGE_S = 20.0
 
 PROCESSES = {False: "three processes", True: "four processes and a robot's own client"}
 
+TRIES = 3
+"""Starts of reachd, which refuses to move anything while a busy machine brings its inputs late."""
+
+INPUTS_S = 60.0
+"""Time for features and the arm's state to come: a busy machine starts programs slowly."""
+
 TIME_LIMIT_S = 30.0
 """The authors' 20 s, and reserve for a busy machine: stale inputs hold the arm there."""
 
@@ -122,7 +128,6 @@ def what_next(log: Path, png: Path) -> str:
 def _run(options: argparse.Namespace, folder: Path) -> int:
     scene = ReachScene(options.arm, options.scene, options.scene_seed, options.seed)
     rig = ReachRig(scene, folder)
-    options.log.unlink(missing_ok=True)
     print(
         f"A cupboard ({options.scene} {options.scene_seed}), the target at {rig.goal} m, "
         f"{PROCESSES[options.arm in EMULATED]}.",
@@ -141,7 +146,13 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
             else:
                 print(f"The live page could not be opened: {said.read_text()[-300:]}", flush=True)
         stack.enter_context(rig)
-        code = _wait_for_exit(rig.reachd(options.strategy, TIME_LIMIT_S, "--log", str(options.log)))
+        words = ("--log", str(options.log), "--wait", f"{INPUTS_S:g}")
+        for left in reversed(range(TRIES)):
+            options.log.unlink(missing_ok=True)
+            code = _wait_for_exit(rig.reachd(options.strategy, TIME_LIMIT_S, *words))
+            if code != 3 or not left or not busy_text():
+                break
+            print("Nothing moved, because this machine is busy: trying again.", flush=True)
         if code == 1:
             print(*rig.arm_errors(), sep="\n", end="")
         if code == 3:

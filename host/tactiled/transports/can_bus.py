@@ -84,15 +84,16 @@ class CanTransport:
 
     ValueError for an invalid spec. ``losses`` also counts each kind of error frame
     (``can_bus-off``, ``can_no-acknowledgement`` …) and every attempt to leave bus-off.
+    ``answer_time``: s that an slcan adapter has to answer a command; None: the usual.
     """
 
-    def __init__(self, spec: str) -> None:
+    def __init__(self, spec: str, *, answer_time: float | None = None) -> None:
         self.spec = CanSpec.parse(spec)
         self._link: CanLink
         if self.spec.interface == "slcan":
-            from tactiled.transports.slcan import SlcanLink
+            from tactiled.transports.slcan import ANSWER_TIME, SlcanLink
 
-            self._link = SlcanLink(self.spec)
+            self._link = SlcanLink(self.spec, ANSWER_TIME if answer_time is None else answer_time)
         else:
             self._link = PythonCanLink(self.spec)
         self._losses = Losses()

@@ -21,15 +21,13 @@ from tactiled.transports.serial_port import SerialTransport
 
 log = logging.getLogger(__name__)
 
-ANSWER_TIME = 0.15
-"""s for an adapter to answer a command; over USB it takes a few milliseconds."""
+ANSWER_TIME = 0.4
+"""s for an adapter to answer a command; over USB it takes a few milliseconds, on a busy host more.
+Some firmware never answers: it is opened so much later, and traffic then shows an adapter."""
 
 MARK = b"N\r"
 """Command with a unique answer: every line before it belongs to earlier commands, however late and
 however many."""
-
-MARK_TIME = 0.3
-"""s to wait for the first answer. Some firmware never answers; then traffic shows an adapter."""
 
 SILENCE = 0.08
 """s without a frame after which the adapter's flags are requested: this finds bus-off in 0.1 s even
@@ -58,8 +56,9 @@ def slcan_commands(spec: CanSpec) -> tuple[bytes, ...]:
 class SlcanLink:
     """Frames through one adapter; see `CanLink` for the contract."""
 
-    def __init__(self, spec: CanSpec) -> None:
+    def __init__(self, spec: CanSpec, answer_time: float = ANSWER_TIME) -> None:
         self._spec = spec
+        self._answer_time = answer_time
         self._setup = slcan_commands(spec)
         self.port = SerialTransport(spec.channel)
         self._decoder = slcan.SlcanDecoder()
@@ -150,20 +149,20 @@ class SlcanLink:
         known = self._decoder.counters
         # Empty lines end a command left unfinished by a previous owner. A closed channel refuses C.
         self._asked = monotonic_now()
-        answers = self._collect(b"\r\rC\r" + MARK, MARK_TIME)
+        answers = self._collect(b"\r\rC\r" + MARK, self._answer_time)
         commands = (*self._setup, b"O")
         if answers and answers[-1][:1] == MARK[:1]:
-            wait = MARK_TIME + 2 * seconds_between(self._asked, monotonic_now())
+            wait = self._answer_time + 2 * seconds_between(self._asked, monotonic_now())
             for command in commands:
                 self._judge(command, self._collect(command + slcan.CR + MARK, wait))
             answers = self._collect(b"F\r" + MARK, wait)
         elif answers:
             # The adapter does not know the command N, so only prompt answers can be matched.
-            while self._collect(b"", ANSWER_TIME):
+            while self._collect(b"", self._answer_time):
                 pass
             for command in commands:
-                self._judge(command, self._collect(command + slcan.CR, ANSWER_TIME, 1))
-            answers = self._collect(b"F\r", ANSWER_TIME, 1)
+                self._judge(command, self._collect(command + slcan.CR, self._answer_time, 1))
+            answers = self._collect(b"F\r", self._answer_time, 1)
         elif self._pending or self._decoder.counters == known:
             log.warning(
                 "the adapter on %s answers no command, as some firmware never does; opened as %s "

@@ -30,7 +30,7 @@ def path(tmp_path: Path, record: Any, payloads: Any) -> Path:
     for i in range(3):
         for topic, data in payloads.items():
             recorder.write(topic, "b0", data, WALL_NS + i, WALL_NS + 2 * i)
-    assert recorder.close(10)
+    assert recorder.close(60)
     return path
 
 

@@ -85,8 +85,11 @@ def test_absent_service_is_reported_after_the_timeout(client: Any) -> None:
 def test_hanging_service_is_distinguished_from_absent_one(bus: Any) -> None:
     port = free_port()
     leave = threading.Event()
-    service = declare_service(bus(listen=port), KEY, lambda request: leave.wait(2 * PATIENCE_S))
+    server = bus(listen=port)
+    service = declare_service(server, KEY, lambda request: leave.wait(2 * PATIENCE_S))
+    quick = declare_service(server, service_key("b0", "status"), lambda request: "here")
     client = bus(connect=port)
+    assert call(client, quick.key, timeout=PATIENCE_S) == "here"
     with pytest.raises(NoAnswerError, match="no answer from"):
         call(client, KEY, timeout=3.0)
     leave.set()

@@ -25,17 +25,15 @@ from tactile_core.log.mcap_file import MAGIC
 from tactile_core.log.reader import LogReader, read_messages
 from tactile_core.log.records import Block
 from tactile_core.log.recovery import recover
-from tests.support.paths import SHARED
+from tests.support.paths import DATA
 
-VECTORS = SHARED / "data" / "mcap_conformance"
+VECTORS = DATA / "mcap_conformance" / "vectors.tar.gz"
 MESSAGES = {"OneMessage": 1, "OneSchemalessMessage": 1, "TenMessages": 10}
 BASE_NS = 1_700_000_000_000_000_000
 
 
 def test_every_conformance_vector_is_read_correctly(tmp_path: Path) -> None:
-    if not (VECTORS / "vectors.tar.gz").exists():
-        pytest.skip("the vectors are not here (../shared/data/mcap_conformance)")
-    with tarfile.open(VECTORS / "vectors.tar.gz") as archive:
+    with tarfile.open(VECTORS) as archive:
         archive.extractall(tmp_path, filter="data")
     wrong, count = [], 0
     for path in sorted(tmp_path.rglob("*.mcap")):

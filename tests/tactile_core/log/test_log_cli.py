@@ -55,7 +55,7 @@ def path(tmp_path: Path, record: Any, payloads: Any) -> Path:
         )
         data = codec().encode(topics.DIAGNOSTICS, array)
         recorder.write(topics.DIAGNOSTICS, "b0", data, BASE_NS, BASE_NS)
-    assert recorder.close(10)
+    assert recorder.close(60)
     return path
 
 
@@ -164,6 +164,6 @@ def test_names_with_markup_are_shown_verbatim(tactile: Any, path: Path, tmp_path
 def test_command_exits_with_the_same_code_without_traceback(path: Path) -> None:
     for place, code in ((path, 0), (path.with_name("none.mcap"), 2)):
         command = [sys.executable, "-m", "tactile_tools.cli", "log", "info", str(place)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
         assert done.returncode == code
         assert "Traceback" not in done.stderr

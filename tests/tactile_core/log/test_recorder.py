@@ -66,7 +66,7 @@ def test_close_writes_the_queue_and_reports_success(
     recorder = record(tmp_path / "a.mcap", flush_period=0.5)
     for i in range(1000):
         recorder.write(topics.FORCES, "b0", payloads[topics.FORCES], BASE_NS + i, BASE_NS + i)
-    assert recorder.close(10)
+    assert recorder.close(60)
     stats = recorder.stats
     assert (stats.state, stats.written, stats.queued, stats.dropped) == ("closed", 1000, 0, {})
     found = info(tmp_path / "a.mcap")
@@ -78,7 +78,7 @@ def test_messages_after_close_are_counted_as_lost(
     tmp_path: Path, record: Any, payloads: Any
 ) -> None:
     recorder = record(tmp_path / "a.mcap")
-    recorder.close(10)
+    recorder.close(60)
     recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
     assert recorder.stats.dropped == {"closed": 1}
 
@@ -97,7 +97,7 @@ def test_full_queue_drops_oldest_and_the_log_locates_the_gap(
     wait_until(lambda: recorder.stats.queued == 0)
     for i in range(400, 410):
         recorder.write(topics.RAW, "b0", payloads[topics.RAW], BASE_NS + i, BASE_NS + i)
-    assert recorder.close(10)
+    assert recorder.close(60)
     assert recorder.stats.dropped == {"queue_full": dropped}
     found = info(tmp_path / "a.mcap")
     gaps = [gap for gap in found.gaps if gap.reason == "queue_full"]
@@ -149,8 +149,8 @@ def test_writing_never_waits_for_a_hanging_disk(
         done.set()
 
     threading.Thread(target=write, daemon=True).start()
-    assert done.wait(20)
-    assert not recorder.close(0.2)  # reported as not closed
+    assert done.wait(120)
+    assert not recorder.close(0.2)  # it says that it could not
 
 
 def test_full_disk_is_reported_and_recorded_in_the_next_file(
@@ -177,7 +177,7 @@ def test_full_disk_is_reported_and_recorded_in_the_next_file(
     disk.room = None
     wait_until(lambda: recorder.stats.written == 50)
     assert recorder.stats.state == "recording"
-    assert recorder.close(10)
+    assert recorder.close(60)
     first, *later = logs(tmp_path)
     assert later
     assert first.messages == 1  # nothing of the incomplete chunk
@@ -205,7 +205,7 @@ def test_messages_lost_to_a_full_disk_are_counted(
     assert recorder.stats.dropped == {"disk_full": 78}
     disk.room = None
     wait_until(lambda: recorder.stats.queued == 0)
-    assert recorder.close(10)
+    assert recorder.close(60)
     found = logs(tmp_path)
     assert sum(gap.messages for log in found for gap in log.gaps) == 78
     assert holes(sequences(tmp_path)["/tactile/b0/forces"], 100) == 78
@@ -222,7 +222,7 @@ def test_io_error_ends_the_file_and_logging_continues_in_the_next(
     assert recorder.stats.errors >= 1
     disk.room = None
     wait_until(lambda: recorder.stats.written == 1)
-    assert recorder.close(10)
+    assert recorder.close(60)
     assert [g.reason for log in logs(tmp_path) for g in log.gaps] == ["io_error"]
 
 
@@ -233,7 +233,7 @@ def test_disk_full_until_the_end_is_reported(
     disk.room = 0
     for i in range(5):
         recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS + i, BASE_NS)
-    assert not recorder.close(10)
+    assert not recorder.close(60)
     stats = recorder.stats
     assert stats.written == 0
     assert stats.dropped == {"disk_full": 5}
@@ -256,13 +256,13 @@ def test_logging_stops_before_the_disk_is_full_and_resumes(
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) == size
     disk.free_bytes = 1 << 40
     wait_until(lambda: recorder.stats.written == 2)
-    assert recorder.close(10)
+    assert recorder.close(60)
     assert [g.reason for g in logs(tmp_path)[-1].gaps] == ["low_space"]
 
 
 def test_stamps_use_the_clock_offset_taken_at_start(tmp_path: Path, record: Any) -> None:
     recorder = record(tmp_path / "a.mcap")
-    recorder.close(10)
+    recorder.close(60)
     offset = int(info(tmp_path / "a.mcap").metadata["software"]["clock_offset_ns"])
     assert abs(offset - WallClock.take().offset_ns) < 60e9
 
@@ -296,7 +296,7 @@ def test_file_size_limit_is_handled_like_a_full_disk(
         [sys.executable, "-c", code, str(tmp_path), str(pause_s)],
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=240,
         check=True,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
     )

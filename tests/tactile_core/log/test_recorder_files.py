@@ -13,7 +13,7 @@ from tactile_core.bus import topics
 from tactile_core.log.info import info
 from tactile_core.log.reader import read_messages
 from tactile_core.log.recorder import Recorder, RecorderError, RecorderSettings
-from tests.support.waiting import wait_until
+from tests.support.waiting import PATIENCE_S, wait_until
 
 BASE_NS = 1_700_000_000_000_000_000
 
@@ -31,7 +31,7 @@ def test_files_split_by_size_are_self_contained(
         data = os.urandom(300)
         recorder.write(topics.RAW, "b0", data, BASE_NS + count, BASE_NS + count)
         time.sleep(0.002)
-    assert recorder.close(10)
+    assert recorder.close(60)
     found = logs(tmp_path)
     assert len(found) >= 4
     for number, log in enumerate(found):
@@ -50,12 +50,12 @@ def test_files_split_by_size_are_self_contained(
 
 def test_files_split_by_time(tmp_path: Path, record: Any, payloads: Any, logs: Any) -> None:
     recorder = record(tmp_path, split_seconds=0.15)
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + PATIENCE_S
     while recorder.stats.files < 3:
         assert time.monotonic() < deadline
         recorder.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
         time.sleep(0.01)
-    assert recorder.close(10)
+    assert recorder.close(60)
     assert all(log.whole for log in logs(tmp_path))
 
 
@@ -72,7 +72,7 @@ def test_changed_geometry_is_the_one_repeated_in_later_files(
         recorder.write(topics.RAW, "b0", os.urandom(300), BASE_NS + count, BASE_NS + count)
         count += 1
         time.sleep(0.002)
-    assert recorder.close(10)
+    assert recorder.close(60)
     rows = [(c.topic, m.data) for c, m in read_messages(sorted(tmp_path.glob("*.mcap"))[1])]
     assert rows[0] == ("/tactile/b0/geometry", new)
 
@@ -81,7 +81,7 @@ def test_retention_keeps_newest_and_current_files(tmp_path: Path, record: Any) -
     stranger = tmp_path / "holiday.mcap"
     stranger.write_bytes(b"not ours")
     recorder = record(tmp_path, split_bytes=3000, chunk_bytes=1000, max_files=3)
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + PATIENCE_S
     count = 0
     while recorder.stats.files < 7:
         assert time.monotonic() < deadline
@@ -89,7 +89,7 @@ def test_retention_keeps_newest_and_current_files(tmp_path: Path, record: Any) -
         count += 1
         time.sleep(0.002)
         assert Path(recorder.stats.path).exists() or recorder.stats.queued
-    assert recorder.close(10)
+    assert recorder.close(60)
     kept = sorted(tmp_path.glob("tactile_*.mcap"))
     assert len(kept) <= 3
     assert kept[-1].stem[-4:] >= "0006"
@@ -104,7 +104,7 @@ def test_retention_includes_files_of_earlier_runs(
     for year in (2001, 2002, 2003):
         first = record(tmp_path / "x.mcap")
         first.write(topics.LOG, "b0", payloads[topics.LOG], BASE_NS, BASE_NS)
-        first.close(10)
+        first.close(60)
         old.append(tmp_path / f"tactile_{year}0101T000000Z_0000.mcap")
         (tmp_path / "x.mcap").rename(old[-1])
     # The last run was killed: its file has no summary but is readable.
@@ -144,7 +144,7 @@ def test_two_daemons_may_log_to_one_directory(
             data = payloads[topics.LOG]
             recorder.write(topics.LOG, f"b{number}", data, BASE_NS + i, BASE_NS)
         time.sleep(0.01)
-    assert all(recorder.close(10) for recorder in both)
+    assert all(recorder.close(60) for recorder in both)
     numbers = sequences(tmp_path)
     assert numbers["/tactile/b0/log"] == numbers["/tactile/b1/log"] == list(range(30))
     assert len({log.metadata["file"]["set"] for log in logs(tmp_path)}) == 2

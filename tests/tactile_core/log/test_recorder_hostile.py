@@ -72,7 +72,7 @@ def test_unrepresentable_stamp_is_replaced_by_log_time(
     recorder.write(topics.LOG, "b0", data, BASE_NS + 1, 1 << 64)
     recorder.write(topics.LOG, "b0", data, BASE_NS + 2, 5)
     recorder.write(topics.LOG, "b0", data, -5, -5)
-    assert recorder.close(10)
+    assert recorder.close(60)
     stamps = [(m.log_ns, m.publish_ns) for _, m in read_messages(tmp_path / "a.mcap")]
     assert stamps[:3] == [(BASE_NS, BASE_NS), (BASE_NS + 1, BASE_NS + 1), (BASE_NS + 2, 5)]
     assert stamps[3][0] == stamps[3][1] > BASE_NS
@@ -86,7 +86,7 @@ def test_gap_record_names_a_bounded_number_of_channels(
     recorder = record(tmp_path / "a.mcap")
     for k in range(200):
         recorder.write(topics.RAW, f"b{k}", bytes(MAX_PAYLOAD + 1), BASE_NS, BASE_NS)
-    assert recorder.close(10)
+    assert recorder.close(60)
     (gap,) = logs(tmp_path)[0].gaps
     assert (gap.messages, len(gap.channels)) == (200, 65)
     assert gap.channels[OTHERS] == 136
@@ -110,7 +110,7 @@ def test_unexpected_writer_failure_opens_next_file_with_a_gap(
     disk.room = None
     wait_until(lambda: recorder.stats.state == "recording")
     recorder.write(topics.LOG, "b0", data, BASE_NS + 2, BASE_NS + 2)
-    recorder.close(10)
+    recorder.close(60)
     stats = recorder.stats
     assert (stats.written, stats.dropped) == (2, {"writer_failed": 1})
     found = [info(path) for path in sorted(tmp_path.glob("*.mcap"))]
@@ -149,7 +149,7 @@ def test_deleted_log_is_continued_in_another_file(
         return recorder.stats.files == 2 and recorder.stats.state == "recording"
 
     wait_until(again)
-    assert recorder.close(10)
+    assert recorder.close(60)
     (path,) = folder.glob("*.mcap")
     found = info(path)
     assert found.messages > 0
@@ -178,7 +178,7 @@ def test_log_is_written_at_any_system_time(
     recorder = Recorder(tmp_path, RecorderSettings(min_free_bytes=0), clock=clock)
     now_ns = clock.wall_ns(time.monotonic_ns())  # type: ignore[arg-type]
     recorder.write(topics.LOG, "b0", payloads[topics.LOG], now_ns, now_ns)
-    assert recorder.close(10)
+    assert recorder.close(60)
     (path,) = tmp_path.glob("*.mcap")
     assert path.name.startswith(named)
     found = info(path)

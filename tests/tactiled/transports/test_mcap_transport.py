@@ -26,6 +26,7 @@ from tactiled.transports.recorded_log import McapTransport, from_raw, to_raw
 
 WALL = WallClock(10**18)
 SERIAL_CHUNKS = [Chunk(Instant(5_000_000_000 + k * 20_000_000), bytes([k] * 40)) for k in range(50)]
+FAR_APART = [SERIAL_CHUNKS[0], Chunk(Instant(10**12), b"much later")]
 CAN_CHUNK = Chunk(
     Instant(1),
     (
@@ -56,7 +57,7 @@ def play(transport: McapTransport) -> list[Chunk]:
     chunks: list[Chunk] = []
     try:
         while True:
-            chunk = transport.read(5)
+            chunk = transport.read(60)
             assert chunk is not None
             chunks.append(chunk)
     except EndOfLog:
@@ -102,10 +103,13 @@ def test_log_is_replayed_at_original_or_higher_speed(tmp_path: Path) -> None:
     transport = McapTransport(path, speed=5)
     transport.open()
     start = time.monotonic()
-    assert transport.read(1) is not None
-    assert transport.read(0) is None
     play(transport)
     assert time.monotonic() - start > 0.9 * 49 * 0.02 / 5
+    transport.close()
+    transport = McapTransport(write_log(tmp_path / "far.mcap", ("b", FAR_APART)), speed=5)
+    transport.open()
+    assert transport.read(60) is not None
+    assert transport.read(0) is None
     transport.close()
 
 
@@ -158,10 +162,9 @@ def test_non_log_file_is_refused(tmp_path: Path) -> None:
 
 
 def test_closing_wakes_a_waiting_reader(tmp_path: Path, run_in_background: Any) -> None:
-    far = [SERIAL_CHUNKS[0], Chunk(Instant(10**12), b"much later")]
-    transport = McapTransport(write_log(tmp_path / "run.mcap", ("b", far)))
+    transport = McapTransport(write_log(tmp_path / "run.mcap", ("b", FAR_APART)))
     transport.open()
-    assert transport.read(1) is not None
+    assert transport.read(60) is not None
     outcome = run_in_background(lambda: transport.read(600))
     time.sleep(0.05)
     transport.close()

@@ -12,6 +12,7 @@ import pytest
 
 from sim_device.ports import BACKLOG, PTY_ROOM, LinkRefused, PtyPort
 from tactiled.transports.serial_port import SerialTransport
+from tests.support.waiting import wait_until
 
 KERNEL_BUFFER = 65_536
 """Bytes that a Linux terminal takes before its line discipline shows them, on a busy machine."""
@@ -27,11 +28,15 @@ def test_unread_port_drops_oldest_messages_and_counts_them(pty: PtyPort, read_by
     assert lost > 0
     assert pty.losses["unread_bytes"] == 100 * lost
     assert not pty.ready
-    got = b""
-    while chunk := read_bytes(host, 1, 0.3):
-        got += chunk
+    got = bytearray()
+
+    def all_read() -> bool:
         pty.flush()
-    lines = got.splitlines(keepends=True)
+        got.extend(read_bytes(host, 1, 0.05))
+        return len(got) >= 100 * (1000 - lost)
+
+    wait_until(all_read)
+    lines = bytes(got).splitlines(keepends=True)
     assert [line for line in lines if line in set(messages)] == lines  # none is broken
     assert len(lines) == 1000 - lost
     assert lines[0] == messages[0]  # it had been sent already

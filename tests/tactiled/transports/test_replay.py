@@ -181,7 +181,7 @@ def test_recording_passes_completely_through_simdevice_and_pty(tmp_path: Path) -
     host.open()
     data = read_to_the_end(host)
     host.close()
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
     assert not os.path.lexists(link)
     samples = decoded(data)

@@ -44,6 +44,12 @@ def transport(pty: PtyPort) -> Any:
     transport.close()
 
 
+def waiting(transport: SerialTransport) -> int:
+    """Bytes that the system holds for whoever reads the port."""
+    assert transport._serial is not None
+    return int(transport._serial.in_waiting)
+
+
 def test_bytes_go_through_unchanged_in_both_directions(
     pty: PtyPort, transport: SerialTransport, read_bytes: Callable[..., bytes]
 ) -> None:
@@ -62,6 +68,7 @@ def test_chunk_holds_all_waiting_bytes_and_is_stamped_on_arrival(
     before = monotonic_now()
     pty.send(b"abc")
     pty.send(b"def")
+    assert becomes_true(lambda: waiting(transport) == 6)
     chunk = transport.read(60)
     assert chunk is not None
     assert chunk.payload == b"abcdef"
@@ -93,7 +100,7 @@ def test_bytes_before_unplugging_are_not_lost(
     assert read_bytes(transport, 10) == b"last words"
     pty.close()
     with pytest.raises(PortGone):
-        transport.read(1)
+        transport.read(60)
     transport.write(b"anybody?")
     assert transport.losses == {"write_gone_bytes": 8}
 
@@ -110,7 +117,7 @@ def test_io_error_counts_as_unplugged(
     pty.send(b"x")
     monkeypatch.setattr(serial_port.os, "read", read)
     with pytest.raises(PortGone, match="plug it in again"):
-        transport.read(1)
+        transport.read(60)
 
 
 def test_replugged_port_is_reopened_by_its_path(
@@ -118,7 +125,7 @@ def test_replugged_port_is_reopened_by_its_path(
 ) -> None:
     pty.close()
     with pytest.raises(PortGone):
-        transport.read(1)
+        transport.read(60)
     with pytest.raises(PortMissing):
         transport.open()
     pty.open()
@@ -247,7 +254,7 @@ def test_moved_board_is_found_by_its_usb_serial_number(
     first.close()
     usb.clear()
     with pytest.raises(PortGone):
-        transport.read(1)
+        transport.read(60)
     with pytest.raises(PortMissing):
         transport.open()
     second.open()
@@ -306,7 +313,7 @@ def test_flood_of_zeros_gives_bounded_chunks_and_no_message(
     messages, total = [], 0
     for _ in range(300):
         pty.send(bytes(PTY_ROOM))
-        chunk = transport.read(1)
+        chunk = transport.read(60)
         assert chunk is not None
         assert isinstance(chunk.payload, bytes)
         assert len(chunk.payload) <= serial_port.READ_LIMIT

@@ -117,7 +117,7 @@ def record(tmp_path, name, presses):
     wizard = Wizard(bench, bench.label, bench.ask, bench.said.append, Timing(2.0, 1.0, 2.0))
     assert wizard.run() == len(presses)
     assert any("Enter again to end" in line for line in bench.said) == (len(presses) < PRESSES)
-    assert recorder.close(10.0)
+    assert recorder.close(60)
     assert not recorder.stats.dropped
     return read_log(tmp_path / name)
 
@@ -164,7 +164,7 @@ def test_recording_with_equal_stamps_is_read(tmp_path):
 
     bench._sample = stalled
     Wizard(bench, bench.label, bench.ask, bench.said.append, Timing(2.0, 1.0, 2.0)).run()
-    assert recorder.close(10.0)
+    assert recorder.close(60)
     recording = read_log(tmp_path / "rec.mcap")
     assert (np.diff(recording.time_s) > 0).all()
     assert (np.diff(recording.label_time_s) > 0).all()

@@ -177,7 +177,7 @@ def test_ctrl_c_keeps_finished_trials(command: Command, tmp_path: Path) -> None:
         assert process.poll() is None
         time.sleep(0.02)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers too
-    out, error = process.communicate(timeout=60)
+    out, error = process.communicate(timeout=120)
     assert process.returncode == 130
     assert "are finished and kept; the same command runs the rest" in " ".join(out.split())
     assert "Traceback" not in out + error

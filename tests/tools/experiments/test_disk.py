@@ -138,7 +138,7 @@ def test_short_write_leaves_whole_lines(alone: Path, tmp_path: Path) -> None:
         capture_output=True,
         text=True,
         check=True,
-        timeout=100,
+        timeout=240,
     )
     assert "finished trials are kept" in done.stdout
     found, damaged = parse_lines((tmp_path / "run" / "trials.jsonl").read_bytes())

@@ -25,7 +25,7 @@ from tactile_core.bus.streams import declare_publisher  # noqa: E402
 from tactile_core.bus.topics import FEATURES, GEOMETRY, LOG, REACH_STATE, Topic, service_key  # noqa: E402
 from tactile_tools.foxglove import Live  # noqa: E402
 
-PATIENCE_S = 30.0
+PATIENCE_S = 120.0
 
 
 def free_port() -> int:

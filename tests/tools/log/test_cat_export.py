@@ -16,8 +16,6 @@ import pytest
 from tactile_core.bus import topics
 from tactile_core.log.recorder import RecorderSettings
 
-pytestmark = pytest.mark.timeout(600)
-
 FEATURES, COMMAND, EVENT = "/tactile/finger/features", "/arm/arm/cmd_vel", "/reach/reach/event"
 
 
@@ -122,7 +120,7 @@ def test_lists_of_numbers_are_columns_lists_or_matrices(log_tool: Any, tmp_path:
         )  # fmt: skip
         data = codec().encode(topics.FORCES, message)
         recorder.write(topics.FORCES, "b", data, 10**18 + i, 10**18 + i)
-    assert recorder.close(10)
+    assert recorder.close(60)
     for kind in ("csv", "parquet", "npz"):
         assert log_tool("export", path, "--to", kind).code == 0
     with (tmp_path / "run_csv" / "tactile_b_forces.csv").open(newline="") as file:

@@ -6,10 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from mcap.writer import Writer
-
-pytestmark = pytest.mark.timeout(600)
 
 
 def test_logs_of_other_programs_are_read_as_far_as_possible(

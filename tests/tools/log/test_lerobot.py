@@ -90,7 +90,7 @@ def write(tmp_path: Path) -> Write:
             if command:
                 message = command_message(Twist(t, -t, 0.5), Instant(at), 0.06, at)
                 recorder.write(COMMAND, "arm", codec().encode(COMMAND, message), at, at)
-        assert recorder.close(10.0)
+        assert recorder.close(60)
         return path
 
     return make

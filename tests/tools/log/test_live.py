@@ -31,10 +31,7 @@ from tactile_tools.processes import running, wait_for
 from tests.support.network import free_port
 from tests.support.paths import ROOT
 from tests.support.processes import command
-from tests.support.waiting import wait_until
-
-pytestmark = pytest.mark.timeout(600)
-
+from tests.support.waiting import PATIENCE_S, wait_until
 
 PRESS = """[[press]]
 array = "left"
@@ -80,7 +77,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
         with running(words, folder / "t.txt") as daemon:
             _disturb(folder, endpoint, daemon)
             daemon.send_signal(signal.SIGTERM)
-            daemon.wait(60)
+            daemon.wait(PATIENCE_S)
     assert daemon.returncode == 0, (folder / "t.txt").read_text()
     return folder
 
@@ -97,7 +94,7 @@ def _disturb(folder: Path, endpoint: str, daemon: subprocess.Popen[bytes]) -> No
     try:
         wait_until(lambda: min(heard.values()) > 100)
         with contextlib.suppress(ServiceError):  # on a busy machine the field may seem to move
-            call(session, service_key("skin", "tare"), {}, timeout=60)
+            call(session, service_key("skin", "tare"), {}, timeout=PATIENCE_S)
         daemon.send_signal(signal.SIGSTOP)
         time.sleep(0.9)
         daemon.send_signal(signal.SIGCONT)
@@ -130,8 +127,8 @@ def test_log_of_a_killed_daemon_is_reproduced_bit_for_bit(lab: Path, log_tool: A
     )
     assert len(rows) == 10
     for topic, _, old, same in rows:
-        # The raw bytes of the last few cycles had not been logged yet.
-        assert int(old) - 40 <= int(same), (topic, outcome.out)
+        # The raw bytes of the last few cycles were to be logged next.
+        assert int(old) - 100 <= int(same), (topic, outcome.out)
         assert int(same) > 5
 
 
@@ -154,9 +151,9 @@ def test_replay_uses_its_own_keys_and_original_spacing(lab: Path, tmp_path: Path
         with running(
             [command("tactile"), *words, "--speed", "4", "--connect", endpoint], tmp_path / "r.txt"
         ) as player:
-            wait_until(lambda: len(heard) > 300)
+            wait_until(lambda: len(heard) > 2000)
             os.kill(player.pid, signal.SIGINT)
-            assert player.wait(60) == 0
+            assert player.wait(PATIENCE_S) == 0
     finally:
         tap.close()
         close_session(session)
@@ -239,7 +236,7 @@ def test_log_contains_what_a_3d_view_needs(trial: Path) -> None:
 def _no_thread_is_left() -> Iterator[None]:
     before = threading.active_count()
     yield
-    wait_until(lambda: threading.active_count() <= before + 2, 10)
+    wait_until(lambda: threading.active_count() <= before + 2)
 
 
 def test_foxglove_layout_names_topics_of_the_log(trial: Path, lab: Path) -> None:

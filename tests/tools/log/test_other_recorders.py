@@ -19,8 +19,6 @@ from tactile_core.log.info import info
 from tactile_core.log.reader import read_messages
 from tactile_core.log.recorder import Recorder, RecorderSettings
 
-pytestmark = pytest.mark.timeout(600)
-
 BASE_NS = 1_700_000_000_000_000_000
 FLOAT = "std_msgs/msg/Float64"
 CDR = b"\x00\x01\x00\x00"
@@ -313,7 +311,7 @@ def test_raw_bytes_are_exported_only_on_request(
     other = Recorder(tmp_path / "raw.mcap", RecorderSettings(min_free_bytes=0))
     for k in range(3):
         other.write(topics.RAW, "finger", CDR, BASE_NS + k, BASE_NS + k)
-    assert other.close(10)
+    assert other.close(60)
     both = tmp_path / "both.mcap"
     log_tool("merge", path, tmp_path / "raw.mcap", "--out", both)
     outcome = log_tool("export", both, "--to", "csv")

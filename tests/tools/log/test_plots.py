@@ -17,8 +17,6 @@ from tactile_tools.plot.series import BoardSeries, Spread, Track, read_boards
 from tests.support import virtual_daemon
 from tests.support.log_rewriting import rewrite
 
-pytestmark = pytest.mark.timeout(600)
-
 
 @pytest.fixture(scope="module")
 def skin_log(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -13,8 +13,6 @@ import pytest
 
 from tactile_core.log.mcap_file import DiskStorage
 
-pytestmark = pytest.mark.timeout(600)
-
 FEATURES, COMMAND, EVENT = "/tactile/finger/features", "/arm/arm/cmd_vel", "/reach/reach/event"
 
 

@@ -16,8 +16,6 @@ from tactile_core.log.reader import read_messages
 from tactile_core.log.recorder import RecorderSettings
 from tactile_core.types import Twist
 
-pytestmark = pytest.mark.timeout(600)
-
 COMMAND = "/arm/arm/cmd_vel"
 
 
@@ -81,7 +79,7 @@ def test_latched_values_start_every_part(
             command_message(Twist(0.0, 0.0, 0.0), at, 0.06, at),
         )
         recorder.write(topics.COMMAND, "arm", command, at, at)
-    assert recorder.close(10)
+    assert recorder.close(60)
     log_tool("split", path, "--every", "0.25", "--out", tmp_path / "parts")
     for each in (tmp_path / "parts").iterdir():
         assert counts(each)["/tactile/finger/geometry"] == 1

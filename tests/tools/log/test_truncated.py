@@ -18,8 +18,6 @@ from tactile_tools.cli import make_parser
 from tactile_tools.log import cat, doctor, export, info, recover
 from tactile_tools.log.terminal import ToolError, fail
 
-pytestmark = pytest.mark.timeout(600)
-
 READ = 6
 
 

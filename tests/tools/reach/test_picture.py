@@ -175,7 +175,7 @@ def test_log_without_a_reach_is_refused(tmp_path: Path) -> None:
     from tactile_core.types import WallClock
 
     path = tmp_path / "empty.mcap"
-    Recorder(path, clock=WallClock(0)).close(10.0)
+    Recorder(path, clock=WallClock(0)).close(60)
     with pytest.raises(LogUnreadableError, match="holds no reach"):
         draw_reach(path, tmp_path / "out.png")
     with pytest.raises(LogUnreadableError):

@@ -20,7 +20,7 @@ from tactile_core.bus.topics import Topic
 from tactile_tools.ros2.bridge import Bridge
 from tactile_tools.ros2.node import RosNode
 
-PATIENCE_S = 30.0
+PATIENCE_S = 120.0
 
 
 def until(done: Callable[[], Any], seconds: float = PATIENCE_S) -> Any:

@@ -7,16 +7,18 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
+import tactile_reach as tr
 from tests.support.paths import ROOT
+from tests.support.waiting import PATIENCE_S
 
-SLOW_S = 90.0
+SLOW_S = PATIENCE_S
 CHROMIUM = Path("/usr/bin/chromium")
 
 
@@ -186,6 +188,21 @@ def streaming() -> Callable[[dict[str, Any]], bool]:
 @pytest.fixture
 def until() -> Callable[..., Any]:
     return wait_until
+
+
+@pytest.fixture
+def recording_of() -> Callable[[Any], dict[str, Any]]:
+    """What a board's daemon says of its recording; asked again while it is starved."""
+
+    def ask(board: Any) -> dict[str, Any]:
+        def told() -> dict[str, Any]:
+            with suppress(tr.RefusedError, tr.NotThereError):
+                return dict(board.status()["recording"])
+            return {}
+
+        return dict(wait_until(told))
+
+    return ask
 
 
 @pytest.fixture(scope="module")

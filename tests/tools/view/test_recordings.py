@@ -10,13 +10,14 @@ import pytest
 
 import tactile_reach as tr
 from tactile_core.bus.rights import may_ask
+from tests.support.waiting import PATIENCE_S
 
 
 @pytest.fixture(scope="module")
 def board(rig: Any) -> Any:
-    with tr.connect(rig.endpoint, find_s=60) as bus:
+    with tr.connect(rig.endpoint, find_s=PATIENCE_S) as bus:
         found = bus.board("pad")
-        found.newest(60)
+        found.newest(PATIENCE_S)
         yield found
 
 
@@ -34,13 +35,13 @@ def test_a_limit_out_of_bounds_is_refused(board: Any, limit_s: float) -> None:
         board.start_recording("x", limit_s=limit_s)
 
 
-def test_one_recording_at_a_time_never_over_an_older_one(
-    rig: Any, board: Any, until: Callable[..., Any]
+def test_one_at_a_time_whole_and_never_over_another(
+    rig: Any, board: Any, until: Callable[..., Any], recording_of: Callable[..., Any]
 ) -> None:
     with board.record("whole") as path:
         with pytest.raises(tr.RefusedError, match=r"already recording to .*whole\.mcap"):
             board.start_recording("other")
-        until(lambda: board.status()["recording"]["messages"] > 500)
+        until(lambda: recording_of(board)["messages"] > 500)
     log = tr.read_log(rig.folder / path)
     assert log.closed
     parts = log.board("pad")
@@ -52,26 +53,28 @@ def test_one_recording_at_a_time_never_over_an_older_one(
         board.stop_recording()
     with pytest.raises(tr.RefusedError, match="exists and is not overwritten"):
         board.start_recording("whole")
-    assert not board.status()["recording"]["recording"]
+    assert not recording_of(board)["recording"]
 
 
-def test_recording_ends_at_its_limit(rig: Any, board: Any, until: Callable[..., Any]) -> None:
+def test_it_ends_by_itself(
+    rig: Any, board: Any, until: Callable[..., Any], recording_of: Callable[..., Any]
+) -> None:
     path = board.start_recording("short", limit_s=0.5)
-    until(lambda: not board.status()["recording"]["recording"])
+    until(lambda: not recording_of(board)["recording"])
     until(lambda: tr.read_log(rig.folder / path).closed)
 
 
-def test_recording_is_closed_when_the_daemon_ends(
-    make_rig: Callable[[], Any], until: Callable[..., Any]
+def test_it_is_finished_when_the_daemon_ends(
+    make_rig: Callable[[], Any], until: Callable[..., Any], recording_of: Callable[..., Any]
 ) -> None:
     rig = make_rig()
-    with tr.connect(rig.endpoint, find_s=60) as bus:
+    with tr.connect(rig.endpoint, find_s=PATIENCE_S) as bus:
         board = bus.board()
-        board.newest(60)
+        board.newest(PATIENCE_S)
         path = board.start_recording()
-        until(lambda: board.status()["recording"]["messages"] > 20)
+        until(lambda: recording_of(board)["messages"] > 20)
     rig.daemon.process.terminate()
-    assert rig.daemon.process.wait(60) == 0
+    assert rig.daemon.process.wait(PATIENCE_S) == 0
     assert Path(path).name.startswith("recording_")
     assert tr.read_log(rig.folder / path).closed
 

@@ -30,8 +30,8 @@ SLOW_S = 30.0
 """Time that a recording may take longer than asked for, until a slow board has sent enough, s."""
 LOOK_S = 0.05
 REFUSED = "tare refused"
-"""How tactiled begins its answer to a tare that it refused."""
-STATUS_S = 3.0
+"""Beginning of what tactiled says of a tare that it did not take."""
+STATUS_S = 10.0
 
 
 class LiveBoard:

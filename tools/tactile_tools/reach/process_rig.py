@@ -29,7 +29,7 @@ from tactile_tools.processes import command, socket_at, wait_for
 
 BOARD, ARM, REACH, WORLD = "finger", "arm", "reach", "world"
 LOCKS = "TACTILE_RUNTIME_DIR"
-WAIT_S = 40.0  # for anything to come about on a busy machine
+WAIT_S = 120.0  # for anything to come about on a busy machine
 WATCHED = (FEATURES, ARM_STATE, COMMAND, REACH_STATE)
 NAMES = {FEATURES: BOARD, ARM_STATE: ARM, COMMAND: ARM, REACH_STATE: REACH}
 MAX_HEARD = 60_000
