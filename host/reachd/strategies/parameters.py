@@ -110,8 +110,9 @@ HARDWARE = Parameters(
     # "on the left or right side of the end-effector … CCW or CW", without exception.
     direction_from="side",
     direction_obedience=1.0,
-    # quick_sweep is not of the paper; in seconds, metres and newtons its values are those found in
-    # authors_sim. Only the turn is slower: no motion of this set exceeds ω_max.
+    # quick_sweep is not of the paper. Its values are those found in authors_sim, not tuned for this
+    # set; only the turn is slower, as no motion of this set exceeds ω_max. This set's gate takes
+    # away motion towards a loaded contact, and with it much of a sweep at 55°.
     jam_time=0.3,
     jam_progress=0.0018,
     jam_force=4.5,
@@ -198,14 +199,14 @@ AUTHORS_SIM = Parameters(
     progress_reference="excavation_start",
     direction_from="cupboard_y",
     direction_obedience=0.75,
-    # quick_sweep is not of the paper. What each value is worth: docs/results/quick_sweep.json.
-    # A free finger gains 1.8 mm in 0.04 s, so 0.3 s without them is no doubt a jam; a later answer
-    # leaves time for fewer tries.
+    # quick_sweep is not of the paper; its parts are compared in docs/results/quick_sweep.json. A
+    # free finger gains 1.8 mm in 0.04 s, so 0.3 s without them is a jam; a later answer leaves time
+    # for fewer tries.
     jam_time=0.3,
     jam_progress=0.0018,
     # Below it objects are still being pushed aside; the arm's own limit is 10 N on each axis.
     jam_force=4.5,
-    # 3 cm at v_max, about half the width of an object. Twice as long costs time and wins no more.
+    # 3 cm at v_max, about half the width of an object; a longer sweep leaves time for fewer tries.
     sweep_time=0.6,
     sweep_angle=math.radians(55.0),
     sweep_omega=0.2,
