@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import Any, Final
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,55 +64,86 @@ class Arrays:
     @property
     def all(self) -> tuple[NDArray[Any], ...]:
         """The arrays in the order in which the kernels take them."""
-        return tuple([getattr(self, field.name) for field in fields(self)])
+        return tuple([getattr(self, name) for name in self.names])
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Their names in that order."""
+        return tuple([field.name for field in fields(self)])
 
 
-def arrays_of(scenes: Sequence[Scene], parameters: Sequence[WorldParameters]) -> Arrays:
-    """Memory of worlds built from ``scenes``, all with room for the largest of them.
+def arrays_of(
+    scenes: Sequence[Scene], parameters: Sequence[WorldParameters], room: int | None = None
+) -> Arrays:
+    """Memory of worlds built from ``scenes``, with ``room`` for objects in each.
 
-    Objects that overlap a wall are first moved out of it, see `settled`.
+    ``room``: None for as many as the largest has.
     """
-    w = len(scenes)
     most = max((len(scene.objects) for scene in scenes), default=0)
-    slots, contacts = most + 2, CONTACTS_PER_OBJECT * (most + 2)
-    arrays = Arrays(
-        wanted=np.zeros((w, 3), REAL),
-        worlds=np.zeros(w, WORLD),
-        bodies=np.zeros((w, slots), BODY),
-        outlines=np.zeros((w, slots, CORNERS, 4), REAL),
-        hulls=np.zeros((w, slots, CORNERS, 4), REAL),
-        contacts=np.zeros((w, contacts), CONTACT),
-        memory=np.zeros((w, contacts), MEMORY),
-        queues=np.zeros((w, slots), np.int64),
-        felt=np.zeros((w, FELT, 8), REAL),
-        readout=np.zeros((w, READOUT), REAL),
-    )
+    arrays = empty(len(scenes), most if room is None else room)
     for index, (scene, figures) in enumerate(zip(scenes, parameters, strict=True)):
         put(arrays, index, scene, figures)
     return arrays
 
 
+def empty(worlds: int, objects: int) -> Arrays:
+    """Memory for so many worlds of at most so many objects."""
+    slots, contacts = objects + 2, CONTACTS_PER_OBJECT * (objects + 2)
+    return Arrays(
+        wanted=np.zeros((worlds, 3), REAL),
+        worlds=np.zeros(worlds, WORLD),
+        bodies=np.zeros((worlds, slots), BODY),
+        outlines=np.zeros((worlds, slots, CORNERS, 4), REAL),
+        hulls=np.zeros((worlds, slots, CORNERS, 4), REAL),
+        contacts=np.zeros((worlds, contacts), CONTACT),
+        memory=np.zeros((worlds, contacts), MEMORY),
+        queues=np.zeros((worlds, slots), np.int64),
+        felt=np.zeros((worlds, FELT, 8), REAL),
+        readout=np.zeros((worlds, READOUT), REAL),
+    )
+
+
+def _named(records: NDArray[Any]) -> NDArray[Any]:
+    """``records`` with fields as attributes in Python, too, where Numba is told not to compile."""
+    disabled = bool(getattr(numba.config, "DISABLE_JIT", False))
+    return records.view(np.recarray) if disabled else records
+
+
 def put(arrays: Arrays, w: int, scene: Scene, parameters: WorldParameters) -> None:
     """Build ``scene`` in row ``w`` of ``arrays``, whatever was there.
 
-    ValueError where it has more objects than there is room for.
+    Objects that overlap a wall are first moved out of it, see `settled`. ValueError where it has
+    more objects than there is room for.
     """
-    room = arrays.bodies.shape[1] - 2
-    if len(scene.objects) > room:
-        raise ValueError(f"{len(scene.objects)} objects in a world with room for {room}")
-    for array in arrays.all:
-        array[w] = np.zeros((), array.dtype)
+    room, count = arrays.bodies.shape[1], len(scene.objects) + 2
+    if count > room:
+        raise ValueError(f"{count - 2} objects in a world with room for {room - 2}")
+    world, bodies, outlines = _built(scene, parameters)
+    arrays.wanted[w] = 0.0
+    arrays.worlds[w] = world
+    arrays.bodies[w, :count], arrays.bodies[w, count:] = bodies, bodies[-1]
+    arrays.outlines[w, :count] = outlines
+    place_all(w, _named(arrays.bodies), arrays.outlines, arrays.hulls)
+    finger = bodies[0]
+    arrays.readout[w] = 0.0
+    arrays.readout[w, :3] = finger["x"], finger["y"], finger["yaw"]
+
+
+@lru_cache(maxsize=1024)
+def _built(
+    scene: Scene, parameters: WorldParameters
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """World, bodies and outlines of ``scene``; kept, for training begins the same scenes again."""
     objects = settled(scene, parameters)
-    _world(arrays.worlds[w], scene, parameters)
-    bodies, outlines = arrays.bodies[w], arrays.outlines[w]
+    world, bodies = np.zeros((), WORLD), np.zeros(len(objects) + 2, BODY)
+    outlines = np.zeros((len(bodies), CORNERS, 4), REAL)
+    _world(world, scene, parameters)
     _finger(bodies[0], outlines[0], scene, parameters)
     softness = shelf_softness(GRAVITY / parameters.inertia_scale)
     for index, item in enumerate(objects, 1):
         _object(bodies[index], outlines[index], item, parameters, softness)
-    bodies["kind"][len(objects) + 1 :] = GROUND
-    place_all(w, arrays.bodies, arrays.outlines, arrays.hulls)
-    finger = bodies[0]
-    arrays.readout[w, :3] = finger["x"], finger["y"], finger["yaw"]
+    bodies[-1]["kind"] = GROUND
+    return world, bodies, outlines
 
 
 def shelf_softness(gravity: float) -> float:

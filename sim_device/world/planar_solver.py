@@ -63,9 +63,17 @@ F = TypeVar("F", bound=Callable[..., Any])
 def compiled(function: F) -> F:
     """``function`` compiled on its first call, kept on disk for the next process.
 
-    Not ``fastmath``, and division as in numpy: the same bits whatever calls it.
+    Not ``fastmath``, and division as in numpy: the same bits whatever calls it. Those whose name
+    begins with _ are called by compiled functions alone.
     """
-    return cast("F", numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    options: dict[str, Any] = {
+        "cache": True,
+        "nogil": True,
+        "error_model": "numpy",
+        "no_cfunc_wrapper": True,
+        "no_cpython_wrapper": function.__name__.startswith("_"),
+    }
+    return cast("F", numba.njit(**options)(function))
 
 
 REAL: Final = np.float64
@@ -640,8 +648,10 @@ def advance(
 
     ``felt[w]``: a row for each contact: weight; x, y m and outward normal in ``ee``; mean force x,
     y N; body. ``readout[w]``: pivot's x, y, heading, vx, vy, omega; mean fx, fy, mz; contacts;
-    ejected; failed; motor work J.
+    ejected; failed; motor work J. A world that failed stays as it is.
     """
+    if worlds[w].failed:
+        return
     world, mine, queue = worlds[w], bodies[w], queues[w]
     outline, hull, found, kept, rows = outlines[w], hulls[w], contacts[w], memory[w], felt[w]
     finger = mine[0]
@@ -650,6 +660,8 @@ def advance(
     total_x, total_y, total_m, work = 0.0, 0.0, 0.0, 0.0
     for _ in range(steps):
         queued = _find_contacts(world, mine, hull, found, queue)
+        if world.failed:
+            break
         # A motor that answers to speed alone gives way under load: make up for the last one.
         drive_x = mass / MOTOR_TIME * (wanted[w, 0] - finger.vx) - world.push_x
         drive_y = mass / MOTOR_TIME * (wanted[w, 1] - finger.vy) - world.push_y
@@ -700,3 +712,37 @@ def place_all(w: int, bodies: Any, outlines: Any, hulls: Any) -> None:
     """Bring sines, cosines and corners of world ``w`` up to date with its poses."""
     for i in range(bodies.shape[1]):
         _place(bodies[w, i], outlines[w, i], hulls[w, i])
+
+
+@compiled
+def advance_some(
+    first: int,
+    end: int,
+    steps: int,
+    wanted: Any,
+    worlds: Any,
+    bodies: Any,
+    outlines: Any,
+    hulls: Any,
+    contacts: Any,
+    memory: Any,
+    queues: Any,
+    felt: Any,
+    readout: Any,
+) -> None:
+    """`advance` the worlds from ``first`` to before ``end``, without the interpreter's lock."""
+    for w in range(first, end):
+        advance(
+            w,
+            steps,
+            wanted,
+            worlds,
+            bodies,
+            outlines,
+            hulls,
+            contacts,
+            memory,
+            queues,
+            felt,
+            readout,
+        )

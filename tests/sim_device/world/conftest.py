@@ -118,3 +118,14 @@ def straight_reach(world: World, limit: float = 20.0) -> Reach:
 @pytest.fixture(scope="session")
 def reach_straight() -> Callable[..., Reach]:
     return straight_reach
+
+
+COMPILING_S = 1200
+"""Time limit of a test that may be the first to use the planar engine, whose kernels take 6 s of a
+processor to compile: minutes on a machine that has much else to do."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if "planar" in item.nodeid:
+            item.add_marker(pytest.mark.timeout(COMPILING_S))

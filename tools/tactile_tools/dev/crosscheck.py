@@ -78,9 +78,9 @@ def run(options: argparse.Namespace) -> int:
             "seeds": [seeds[0], seeds[done - 1]],
             "perturbation_m": PERTURBATION_M,
             "summary": summary,
-            "loads": {names[which]: loads(rows[which]) for which in RUNS},
-            "simulated_s_per_cpu_s": {names[which]: speed(rows[which]) for which in RUNS},
-            "trials": {names[which]: [asdict(t) for t in rows[which]] for which in RUNS},
+            "loads": {which: loads(rows[which]) for which in RUNS},
+            "simulated_s_per_cpu_s": {which: speed(rows[which]) for which in RUNS},
+            "trials": {which: [asdict(t) for t in rows[which]] for which in RUNS},
         }
         options.out.write_text(json.dumps(report) + "\n", encoding="utf-8")
         console.print(f"wrote {options.out}")
