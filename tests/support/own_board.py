@@ -29,7 +29,7 @@ class OwnBoard:
         self._inward = -skin.rotation[0, :, 2]
         self._wanted_n, self._former_n, self._since = 0.0, 0.0, 0.0
         request = BoardsRequest(ptys=(link,), board="anyskin", touched=self._touched)
-        self._runner = Runner([plan.station for plan in plan_boards(request)])
+        self._runner = Runner([plan.server for plan in plan_boards(request)])
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._runner.run, args=(self._stop.is_set,))
         self._runner.open()

@@ -180,7 +180,7 @@ class VirtualDaemon:
                 self.port.pump(Instant(self.now + 100_003))
 
     def close(self) -> None:
-        self.port.farewell(self.now)
+        self.port.stop_streaming(self.now)
         assert self.recorder.close(60)
 
     def _log_raw(self, chunk: Chunk) -> None:

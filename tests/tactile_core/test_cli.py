@@ -36,7 +36,7 @@ EVERY = [each for root in ROOTS for each in cli.load_all(root)]
 MEANINGS = {
     "--board": {"NAME"},
     "--kind": {"KIND", "finger, anyskin"},
-    "--arm": {"NAME", "simulated, ur"},
+    "--arm": {"NAME", "simulated, ur, xarm"},
     "--at": {"TIME"},
     "--calibration": {"FILE", "PATH"},
     "--config": {"FILE"},
@@ -51,7 +51,7 @@ MEANINGS = {
     "--json": {"flag"},
     "--limit": {"N"},
     "--log": {"PATH"},
-    "--name": {"NAME"},
+    "--name": {"NAME", "TEXT"},  # name on the bus; name on the leaderboard
     "--out": {"PATH"},
     "--png": {"PATH"},
     "--port": {"P", "N"},  # port of a board; TCP port of a page or viewer

@@ -383,8 +383,8 @@ def test_text_with_impossible_stamp_is_stamped_on_arrival(
         (Instant(rig.sink.at - 2147483000 * NS_PER_S), "hello from 1955"),
         (Instant(rig.sink.at - NS_PER_S), "hello"),
     ):
-        rig.station.handle(BoardLog(20, captured, text))
-    assert rig.station.drops()["texts_without_time"] == 1
+        rig.session.handle(BoardLog(20, captured, text))
+    assert rig.session.drops()["texts_without_time"] == 1
     assert recorder.close(60)
     spoken = [
         (codec().decode(LOG, m.data), m)

@@ -107,7 +107,7 @@ def test_replay_is_logged_only_on_request(make: Make) -> None:
         (["--port", "a", "--port", "b", "--name", "x"], "1 names for 2 ports"),
         (["--port", "a", "--port", "b", "--name", "x", "--name", "x"], "given twice"),
         (["--port", "a", "--name", "a/b"], "allowed"),
-        (["--can", "can0"], "allowed"),
+        (["--can", "can0"], "expected INTERFACE"),
         (["--can", "socketcan:can0", "--board", "anyskin"], "serial"),
         (["--port", "a", "--mcap", "x.mcap"], "--mcap"),
         (["--port", "a", "--config", "none.toml"], "none.toml"),

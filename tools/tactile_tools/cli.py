@@ -75,7 +75,7 @@ COMMANDS: Final = {
         "tactile_tools.experiments.cli",
     ),
     "benchmark": Command(
-        "run a strategy on fixed scene sets and write its entry for the leaderboard",
+        "judge a strategy on fixed scene sets, for the leaderboard",
         "tactile_tools.experiments.cli:fill_benchmark",
     ),
     "demo": Command(
@@ -102,7 +102,7 @@ COMMANDS: Final = {
         f"{HERE}:_fill_fidelity",
     ),
     "crosscheck": Command(
-        "compare an engine with another, trial by trial on the same scenes",
+        "compare an engine with another, trial by trial",
         f"{HERE}:_fill_crosscheck",
     ),
     "fuzz": Command("corrupt frames and check that none is accepted wrongly", f"{HERE}:_fill_fuzz"),
@@ -118,7 +118,7 @@ COMMANDS: Final = {
         f"{HERE}:_fill_soak",
     ),
     "arm-scenes": Command(
-        "reach in the same scenes with the simulated arm and an emulated robot",
+        "compare arms, emulated robots too, on the same scenes",
         f"{HERE}:_fill_arm_scenes",
     ),
 }
@@ -610,7 +610,7 @@ def _fill_crosscheck(parser: Parser) -> None:
     parser.add_argument(
         "--scene",
         default="authors_sim",
-        metavar="SCENES",
+        metavar="SCENE",
         help="a set of scenes by name, as for `tactile reach` (default %(default)s)",
     )
     parser.add_argument(

@@ -6,7 +6,6 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from armd.driver import SetupError
 from tactile_core.cli import MissingExtraError
 
 if TYPE_CHECKING:
@@ -45,6 +44,8 @@ def make_driver(name: str, config: ArmConfig) -> Driver:
     if problem is not None:
         raise MissingExtraError(problem)
     module, kind, library = DRIVERS[name]
+    from armd.driver import SetupError  # with numpy, which `armd --help` need not wait for
+
     if library and not config.robot.address:
         raise SetupError(
             "[robot] address is missing: write the host name or IP of the robot there, for a "

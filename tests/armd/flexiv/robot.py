@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sim_device.robots.station import RobotStation, TruthFile
 
 from armd.config import load_config, plane_of
 from armd.frames import quaternion_of, rotation_of, rotation_vector
 from sim_device.robots.plant import Mount, Plant, Truth
+from sim_device.robots.robot_server import RobotServer, TruthFile
 from sim_device.robots.sockets import Network, Servers
 from sim_device.runner import Runner
 from tactile_core.geometry import TIP_X
@@ -156,7 +156,7 @@ def main() -> None:
     servers = Servers(
         options.address, {options.port: lambda: Link(robot)}, Network(), np.random.default_rng(0)
     )
-    runner = Runner([RobotStation(robot, servers, truth, None, control=True)])
+    runner = Runner([RobotServer(robot, servers, truth, None, control=True)])
     runner.stations[0].open()
     print("emulated", flush=True)
     runner.run(lambda: False)

@@ -19,7 +19,7 @@ from sim_device.world.planar_world import PlanarWorld
 from sim_device.world.planar_worlds import Worlds
 from sim_device.world.scene_generation import authors_sim
 from sim_device.world.scenes import Pose
-from tactile_core.types import Twist
+from tactile_core.types import Instant, Twist
 from tactile_tools.reach.touch_senses import ContactSense
 from tests.support.paths import ROOT
 
@@ -52,7 +52,7 @@ def test_worlds_are_single_worlds_to_the_bit() -> None:
                     [c.x, c.y, c.normal_x, c.normal_y, c.force_x, c.force_y, c.body]
                     for c in contacts
                 ]
-                touch = ContactSense().feel(world, None)  # type: ignore[arg-type]
+                touch = ContactSense().feel(world, Instant(0))
                 assert features[index].tolist() == [
                     touch.total_force, touch.tip_force, touch.peak_force, touch.peak_x, touch.peak_y
                 ]  # fmt: skip

@@ -150,7 +150,7 @@ def test_non_log_file_is_refused(tmp_path: Path) -> None:
         McapTransport(tmp_path / "none.mcap").open()
     path = tmp_path / "text.mcap"
     path.write_text("not a log, but long enough to look at")
-    with pytest.raises(PortUnsuitable, match="no MCAP file"):
+    with pytest.raises(PortUnsuitable, match="not an MCAP file"):
         McapTransport(path).open()
     with pytest.raises(PortUnsuitable, match="no raw chunks"):
         McapTransport(write_log(tmp_path / "empty.mcap")).open()

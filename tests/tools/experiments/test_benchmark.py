@@ -71,16 +71,16 @@ def test_entry_grows_with_more_scenes_and_limits(
 ) -> None:
     words = ("burrow", *SHORT, "--param", "v_max=0.04", "--out", tmp_path / "run")
     entry = tmp_path / "entry.json"
-    code, out, _ = run(capsys, *words, "--scenes", 1, "--limit", 1, "--entry", entry)
+    code, out, _ = run(capsys, *words, "--scenes", 1, "--time-limit", 1, "--entry", entry)
     assert code == 0
     assert "hardware" in out
     first = read_entry(entry)
     assert [(c["limit_s"], c["scenes"], c["errors"]) for c in first["cases"]] == [(1.0, 1, 0)]
     assert first["commands"] == [
-        "tactile benchmark burrow --sets hardware --engine mujoco --depth contacts --limit 1 "
+        "tactile benchmark burrow --sets hardware --engine mujoco --depth contacts --time-limit 1 "
         "--scenes 1 --param v_max=0.04"
     ]
-    code, out, _ = run(capsys, *words, "--scenes", 2, "--limit", 1, 1.5, "--entry", entry)
+    code, out, _ = run(capsys, *words, "--scenes", 2, "--time-limit", 1, 1.5, "--entry", entry)
     assert code == 0
     assert "resuming: 1 of 4" in out
     grown = read_entry(entry)
@@ -89,8 +89,8 @@ def test_entry_grows_with_more_scenes_and_limits(
     assert case["success"][:2] == [0, 2]
     assert case["time_s"] == {"mean": 1.0, "median_of_reached": None}
     assert case["cpu_s_per_trial"] > 0
-    code, _, err = run(capsys, "straight", *SHORT, "--scenes", 1, "--limit", 1, "--entry", entry,
-                       "--out", tmp_path / "other")  # fmt: skip
+    words = ("straight", *SHORT, "--scenes", 1, "--time-limit", 1, "--entry", entry)
+    code, _, err = run(capsys, *words, "--out", tmp_path / "other")
     assert code == 2
     assert "choose another --entry" in err
 
@@ -100,7 +100,7 @@ def test_entry_grows_with_more_scenes_and_limits(
     [
         (("no_such_strategy", *SHORT), "unknown strategy 'no_such_strategy'"),
         (("burrow", "--sets", "foggy"), "foggy"),
-        (("burrow", "--limit", "-1"), "above 0"),
+        (("burrow", "--time-limit", "-1"), "above 0"),
         (("burrow", *SHORT, "--param", "v_maxx=1"), "v_maxx"),
     ],
 )

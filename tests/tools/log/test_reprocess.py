@@ -21,7 +21,7 @@ from tactile_core.log.recorder import RecorderSettings
 from tactiled.sensing.settings import PipelineSettings
 from tests.support import virtual_daemon as virtual
 
-COUNTED = re.compile(r"^(\S+): (\d+) messages, (\d+) in the log; (\d+) the same to the bit$", re.M)
+COUNTED = re.compile(r"^(\S+): (\d+) messages, (\d+) in the log; (\d+) bit for bit the same$", re.M)
 
 
 def counts(out: str) -> dict[str, tuple[int, int, int]]:

@@ -53,9 +53,9 @@ tactile benchmark my_strategies:Wiggle --name "Wiggle, Some Lab" --entry wiggle.
     --note "URL of the code; tuned on …"
 ```
 
-Without `--sets`, `--engine`, `--depth` and `--limit` it runs everything: about two hours of CPU
-time for a light strategy. A run that was stopped goes on where it was. Several commands may write
-the same `--entry`: it grows by their cases. Send the JSON as a pull request that adds it to
+Without `--sets`, `--engine`, `--depth` and `--time-limit` it runs everything: about two hours of
+CPU time for a light strategy. A run that was stopped goes on where it was. Several commands may
+write the same `--entry`: it grows by their cases. Send the JSON as a pull request that adds it to
 `docs/results/benchmark/`; `make leaderboard` writes this page anew.
 
 1. **Tune on scenes of your own.** Seeds {FIRST_SEED} to {LAST_SEED} and the 60 recorded scenes are

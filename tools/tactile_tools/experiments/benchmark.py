@@ -197,7 +197,7 @@ def command_of(definition: Mapping[str, Any]) -> str:
     """The command that repeats a benchmark."""
     words = ["tactile benchmark", *definition["strategies"]]
     words += ["--sets", *definition["sets"], "--engine", *definition["engines"]]
-    words += ["--depth", *definition["depths"], "--limit"]
+    words += ["--depth", *definition["depths"], "--time-limit"]
     words += [f"{limit:g}" for limit in definition["limits"]]
     words += ["--scenes", str(definition["scenes"])]
     for key, value in definition["parameters"].items():

@@ -177,7 +177,7 @@ def _trial(parser: Parser) -> None:
 BENCHMARK_EXAMPLES = """\
 examples:
   tactile benchmark quick_sweep                          # everything: about two hours of CPU time
-  tactile benchmark my_strategies:Wiggle --sets squeezed --engine mujoco --depth contacts --limit 20
+  tactile benchmark my_strategies:Wiggle --sets squeezed --engine mujoco --time-limit 20
   tactile benchmark quick_sweep --out runs/quick_sweep --entry quick_sweep.json
 
 A run that was stopped or killed goes on where it was when the same command is given again; with
@@ -222,7 +222,8 @@ def fill_benchmark(parser: Parser) -> None:
         help="what is felt (default both)",
     )
     parser.add_argument(
-        "--limit",
+        "--time-limit",
+        dest="limit",
         nargs="+",
         action="extend",
         type=positive("s"),
@@ -241,7 +242,9 @@ def fill_benchmark(parser: Parser) -> None:
     )
     add_path(parser, "--out", "folder of the run (default runs/benchmark-STRATEGY)")
     add_path(parser, "--entry", "entry to write (default: entry.json in the folder of the run)")
-    parser.add_argument("--name", help="name on the leaderboard (default: the strategy's)")
+    parser.add_argument(
+        "--name", metavar="TEXT", help="name on the leaderboard (default: the strategy's)"
+    )
     parser.add_argument(
         "--note",
         default="",
