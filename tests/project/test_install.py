@@ -49,6 +49,7 @@ def test_wheel_holds_only_our_packages(wheel: Path) -> None:
     assert "sensor_proto/PROTOCOL.md" in names
     assert "tactile_core/bus/msg/ContactFeatures.msg" in names
     assert "tactile_tools/view/page/index.html" in names
+    assert not [name for name in names if name.startswith("tactile_tools/dev/")]
 
 
 def test_every_command_starts_in_a_clean_environment(wheel: Path, tmp_path: Path) -> None:
@@ -74,3 +75,7 @@ def test_every_command_starts_in_a_clean_environment(wheel: Path, tmp_path: Path
     for tool in ("log", "plot", "reach", "bench", "demo", "demo-skin", "fuzz"):
         assert tool in tools
         assert run(home / "bin" / "tactile", tool, "--help").stdout.strip()
+    words = [home / "bin" / "tactile", "fuzz", "--frames", "1"]
+    refused = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert refused.returncode == 2
+    assert "run it in a checkout" in refused.stderr
