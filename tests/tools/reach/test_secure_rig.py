@@ -238,7 +238,7 @@ def test_tls_roles_have_only_their_rights_and_viewer_only_reads(
         reaches(rig)
         connect = [word for place in places.values() for word in ("--connect", place)]
         capsys.readouterr()
-        words = ["health", "--keys", str(lab / "viewer"), *connect, "--timeout", str(PATIENCE_S)]
+        words = ["health", "--keys", str(lab / "viewer"), *connect, "--timeout", "10"]
         rig.until(lambda: main([*words, "--board", "board0", "--reach", "reach"]) in (0, 1))
         assert "board board0" in capsys.readouterr().out
 
