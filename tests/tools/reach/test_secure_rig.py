@@ -140,7 +140,11 @@ def reaches(rig: Rig) -> None:
         except ServiceError:
             return False
         rig.until(lambda: any_moves(rig) or rig.ask("status")["state"] != "reaching")
-        return any_moves(rig)
+        if any_moves(rig):
+            return True
+        with contextlib.suppress(ServiceError):  # what held it may press on the finger
+            rig.ask("reset", {}, "world")
+        return False
 
     rig.until(moved)
     with contextlib.suppress(ServiceError):  # it ended by itself meanwhile
