@@ -124,7 +124,7 @@ def _guarded(spec: str, make: Callable[[], Strategy]) -> Strategy:
         return make()
     except StrategyError:
         raise
-    except Exception as error:
+    except Exception as error:  # a plug-in may raise anything
         raise StrategyError(
             f"strategy {spec!r} cannot be loaded ({type(error).__name__}: {error}); available: "
             f"{', '.join(available())}"

@@ -407,7 +407,7 @@ class LogWriter:
             self._define(file, self._channels)
             file.commit()
             file.sync()
-        except Exception:
+        except Exception:  # of any kind: a file begun must not stay open
             file.abandon()
             raise
         self._in_file = set(self._channels)

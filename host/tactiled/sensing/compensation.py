@@ -85,12 +85,12 @@ class Off:
             loaded=np.zeros_like(layout.real),
         )
 
-    def update(  # unused arguments are those of `Compensator.update`
+    def update(
         self,
-        field_ee: FloatArray,  # noqa: ARG002
-        forces: FloatArray,  # noqa: ARG002
-        healthy: Bool,  # noqa: ARG002
-        captured: Instant,  # noqa: ARG002
+        field_ee: FloatArray,  # noqa: ARG002 - as in `Compensator`
+        forces: FloatArray,  # noqa: ARG002 - as in `Compensator`
+        healthy: Bool,  # noqa: ARG002 - as in `Compensator`
+        captured: Instant,  # noqa: ARG002 - as in `Compensator`
     ) -> Estimate:
         """Return the same estimate for every cycle."""
         return self._estimate

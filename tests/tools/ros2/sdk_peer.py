@@ -48,6 +48,7 @@ def build(session: ZenohSession, msgtype: str, values: dict) -> dict:
 
 def main() -> None:
     port, folder, job = int(sys.argv[1]), Path(sys.argv[2]), json.loads(sys.argv[3])
+    # The library offers no way to name the folder, and its own downloads definitions.
     registry._registry = registry.MessageRegistry(str(folder))
     session = ZenohSession.get_instance("127.0.0.1", port)
     end = time.monotonic() + job["seconds"]
