@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import threading
 import time
 import uuid
 from collections.abc import Callable
@@ -132,8 +133,9 @@ class Tap:
     """Passes every sample of a key expression to ``take``, on zenoh's thread: for logs and
     monitors.
 
-    ``take`` must be quick, or samples pile up; control loops use `Latest` instead. ``remote_only``:
-    ignore samples that this session publishes.
+    ``take`` must be quick, or samples pile up; control loops use `Latest` instead. It is called for
+    one sample at a time, and not once `close` has returned: a log closed after its tap loses
+    nothing. ``remote_only``: ignore samples that this session publishes.
     """
 
     def __init__(
@@ -147,18 +149,28 @@ class Tap:
         self._take = take
         self.key = key
         self.refused = 0  # above MAX_PAYLOAD
+        self._lock = threading.RLock()  # re-entrant: ``take`` may close its own tap
+        self._closed = False
         origin = zenoh.Locality.REMOTE if remote_only else zenoh.Locality.ANY
         self._subscriber = session.declare_subscriber(key, self._on_sample, allowed_origin=origin)
 
     def close(self) -> None:
-        """Unsubscribe."""
+        """Unsubscribe, after the sample that is being taken.
+
+        Zenoh may deliver one more while its subscriber ends; it is passed over.
+        """
+        with self._lock:
+            self._closed = True
         self._subscriber.undeclare()
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
-        if len(sample.payload) > MAX_PAYLOAD:
-            self.refused += 1
-        else:
-            self._take(read_sample(sample))
+        with self._lock:
+            if self._closed:
+                return
+            if len(sample.payload) > MAX_PAYLOAD:
+                self.refused += 1
+            else:
+                self._take(read_sample(sample))
 
 
 def latest(session: zenoh.Session, key: str) -> Latest:

@@ -25,7 +25,14 @@ from tactile_core.bus.session import (
     close_session,
     open_session,
 )
-from tactile_core.bus.streams import Tap, declare_alive, declare_publisher, latest, list_alive
+from tactile_core.bus.streams import (
+    BusSample,
+    Tap,
+    declare_alive,
+    declare_publisher,
+    latest,
+    list_alive,
+)
 from tests.support.network import free_port
 from tests.support.waiting import PATIENCE_S, wait_until
 
@@ -152,6 +159,34 @@ def test_slow_reader_gets_newest_and_counts_skipped(bus: Any) -> None:
     assert stream.skipped == skipped + 499
     tap.close()
     assert stream.newest() is None
+
+
+def test_no_sample_is_taken_once_a_tap_is_closed(bus: Any) -> None:
+    """So a log that is closed after its tap has every sample that its owner was given."""
+    port = free_port()
+    publisher = declare_publisher(bus(listen=port), topics.FEATURES, "b0")
+    taking, finish, taken = threading.Event(), threading.Event(), []
+
+    def take(sample: BusSample) -> None:
+        taking.set()
+        finish.wait(PATIENCE_S)
+        taken.append(sample.sequence)
+
+    tap = Tap(bus(connect=port), publisher.key, take)
+    wait_until(lambda: publisher.put(b"x", 1) or taking.is_set())
+    closer = threading.Thread(target=tap.close)
+    closer.start()
+    for _ in range(20):
+        publisher.put(b"x", 1)
+    assert taken == []
+    assert closer.is_alive()
+    finish.set()
+    closer.join(PATIENCE_S)
+    seen = list(taken)
+    assert seen
+    late = latest(bus(connect=port), publisher.key)
+    wait_until(lambda: publisher.put(b"x", 1) or late.newest())
+    assert taken == seen
 
 
 def test_slow_process_acts_on_newest_sample(bus: Any, subscriber: Any) -> None:
