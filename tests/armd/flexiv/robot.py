@@ -156,8 +156,9 @@ def main() -> None:
     servers = Servers(
         options.address, {options.port: lambda: Link(robot)}, Network(), np.random.default_rng(0)
     )
-    runner = Runner([RobotServer(robot, servers, truth, None, control=True)])
-    runner.stations[0].open()
+    server = RobotServer(robot, servers, truth, None, control=True)
+    runner = Runner([server])
+    server.open()
     print("emulated", flush=True)
     runner.run(lambda: False)
 
