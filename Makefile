@@ -103,7 +103,7 @@ recordings: setup  ## every frame of every recording of a real board
 
 # Every branch of the safety gate is taken by its tests, or this fails.
 gate-coverage: setup  ## every branch of the safety gate is taken by its tests
-	REACH_RANDOM_INPUTS=4000 $(BIN)/python -m coverage run --branch --source=host/reachd -m pytest -q tests/reachd/gate tests/reachd/test_supervisor.py
+	REACH_RANDOM_INPUTS=4000 $(BIN)/python -m coverage run --branch --source=host/reachd -m pytest -q tests/reachd/gate tests/reachd/test_supervisor.py tests/reachd/test_settings.py tests/reachd/strategies/test_parameters.py
 	$(BIN)/python -m coverage report -m --fail-under=100 --include='*/gate/*.py'
 
 # An hour of reaching while the machine is loaded and its memory churned.

@@ -169,8 +169,8 @@ class OperatorRequests:
         return mode
 
     def _set_limits(self, limits: ArmLimits) -> None:
-        if self._confirmed(limits):
-            return
+        # Also where the arm shows them already: it may have been asked by an earlier commander, and
+        # armd lets nobody move who has not asked for himself.
         try:
             said = self._arm.request_limits(limits)
         except ArmError as error:

@@ -15,7 +15,6 @@ from reachd.gate.gate import Decision, SafetyGate
 from reachd.gate.settings import Check, SafetySettings
 from reachd.interfaces import ZERO, ArmState, Goal, Strategy, Touch, Twist
 from reachd.strategies.parameters import SETS
-from tactile_core.geometry import Side
 from tactile_core.types import ArmLimits, Instant, after
 
 if TYPE_CHECKING:
@@ -31,44 +30,6 @@ SLOWLY = Twist(0.001, 0.0, 0.0)
 def t0() -> Instant:
     """Begin of the tests' virtual time."""
     return T0
-
-
-@pytest.fixture(scope="session")
-def make_touch() -> Callable[..., Touch]:
-    """Valid touch without contact at ``at``, with values replaced as given."""
-
-    def make(at: Instant = T0, **values: Any) -> Touch:
-        calm = Touch(at, at, True, 0.0, Side.NONE, 0.0, 0.0, 0.0, 0.0)
-        return replace(calm, **values)
-
-    return make
-
-
-@pytest.fixture(scope="session")
-def make_arm() -> Callable[..., ArmState]:
-    """Arm at rest in front of the cupboard at ``at``, with the hardware set's limits."""
-
-    def make(at: Instant = T0, **values: Any) -> ArmState:
-        limits = SETS["hardware"].safety.arm_limits
-        calm = ArmState(
-            captured=at,
-            received=at,
-            x=-0.2,
-            y=0.0,
-            heading=0.0,
-            twist=Twist(0.0, 0.0, 0.0),
-            fx=0.0,
-            fy=0.0,
-            mz=0.0,
-            mode="ready",
-            v_max=limits.v_max,
-            omega_max=limits.omega_max,
-            f_max=limits.f_max,
-            m_max=limits.m_max,
-        )
-        return replace(calm, **values)
-
-    return make
 
 
 @pytest.fixture(scope="session")

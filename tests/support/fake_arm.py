@@ -23,7 +23,7 @@ from tactile_core.bus.services import ServiceError, declare_service
 from tactile_core.bus.session import BusConfig, close_session, open_session
 from tactile_core.bus.streams import declare_publisher
 from tactile_core.bus.topics import ARM_STATE, COMMAND, service_key
-from tactile_core.types import NS_PER_S, ArmLimits, Instant, WallClock, monotonic_now
+from tactile_core.types import NS_PER_S, ZERO, ArmLimits, Instant, WallClock, monotonic_now
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,7 @@ class FakeArm:
         self.frozen: Any = None  # a state repeated under fresh stamps
         self.deaf_to_limits = False
         self.limits = ArmLimits(0.5, 1.0, 100.0, 20.0)
+        self.limited_for: str | None = None  # commander that asked; as armd, it obeys no other
         self.heard: list[Heard] = []
         self.travelled = 0.0
         self._moved_at = monotonic_now()
@@ -118,7 +119,7 @@ class FakeArm:
         order = self.arbiter.newest(now)
         if order is None:  # it expired while this thread was not scheduled
             return
-        twist = order.twist
+        twist = order.twist if self.limited_for == order.commander else ZERO
         heard = Heard(time.monotonic(), twist.vx, twist.vy, twist.omega, order)
         assert all(math.isfinite(v) for v in (heard.vx, heard.vy, heard.omega))
         self._move(now, heard)
@@ -130,6 +131,7 @@ class FakeArm:
             )
         except NotGrantedError as error:
             raise ServiceError(str(error)) from error
+        self.limited_for = self.arbiter.commander
         if not self.deaf_to_limits:
             self.limits = request.limits
         return self.limits

@@ -148,6 +148,7 @@ def test_single_values_are_overridden() -> None:
         ({"safety.features_age": 2.0}, ["features_latch must be at least features_age"]),
         ({"safety.arm_age": 0.01}, ["arm_age must exceed the loop's period"]),
         ({"safety.disabled": ["not_armed"]}, ["not_armed", "cannot be switched off"]),
+        ({"safety.touch_hard": 5.0}, ["touch_hard must exceed touch_soft"]),
         ({"safety.disabled": ["what"]}, ['"what"', "workspace"]),
         ({"safety.disabled": "wrench"}, ["array", "workspace"]),
         ({"safety.tip_region": 3}, ["tip_region = 3", "corners [x, y]"]),
@@ -255,3 +256,10 @@ def test_unreachable_goal_is_refused(x: float, y: float, more: dict, words: str)
     make: Callable = make_goal
     with pytest.raises(ConfigError, match=words):
         make(x, y, HARDWARE, **more)
+
+
+def test_what_is_switched_off_or_beyond_a_cap_is_a_caution() -> None:
+    assert parameters("hardware").safety.cautions == ()
+    risky = parameters("hardware", {"safety.disabled": ["arm_frozen"], "safety.force": 40.0}).safety
+    assert risky.cautions == ("the check arm_frozen is off", "force is 40, beyond the cap of 30")
+    assert risky.arm_limits == HARDWARE.safety.arm_limits
