@@ -564,7 +564,7 @@ KINDS: Final = ("auto", "tactile", "anyskin", "reskin", "eflesh")
 PAPER_STRATEGIES: Final = ("straight", "burrow", "excavate", "hybrid_clock", "hybrid_event")
 """The paper's strategies, which its experiments compare."""
 
-STRATEGIES: Final = (*PAPER_STRATEGIES, "quick_sweep")
+STRATEGIES: Final = (*PAPER_STRATEGIES, "quick_sweep", "learned")
 """Strategies that come with reachd."""
 
 DEFAULT_STRATEGY: Final = "hybrid_event"

@@ -42,5 +42,6 @@ def test_extras_exist_and_all_includes_them() -> None:
     (everything,) = extras["all"]
     held = set(re.search(r"\[(.*)\]", everything)[1].split(","))  # type: ignore[index]
     vendors = {"ur", "franka", "xarm", "flexiv"}  # large, and each for one robot
-    assert held == set(extras) - {"all", "browser", "dev", "docs", "reference"} - vendors
+    apart = {"browser", "docs", "reference", "learn"}  # PyTorch may be several GB
+    assert held == set(extras) - {"all", "dev"} - apart - vendors
     assert "tactile-reach[all]" in extras["dev"]

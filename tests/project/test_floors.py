@@ -96,7 +96,8 @@ INSIDE = {
         "experiments": {"", "plot", "reach"},
         "calibrate": {""},
         "operate": set(),
-        "dev": {"", "log", "plot", "reach", "experiments"},
+        "train": set(),
+        "dev": {"", "log", "plot", "reach", "experiments", "train"},
     },
 }
 """Imports allowed within a package: other rooms, and "" for files beside the rooms."""

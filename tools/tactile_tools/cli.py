@@ -86,6 +86,9 @@ COMMANDS: Final = {
         "press simulated boards, leave a log and a picture",
         f"{HERE}:_fill_demo_skin",
     ),
+    "train": Command(
+        "train the strategy `learned` in the planar engine", "tactile_tools.train.cli"
+    ),
     "bus": Command("make keys for a lab, show the secret of this user's rigs", f"{HERE}:_fill_bus"),
     "service": Command(
         "install the daemons as systemd services, or remove them",

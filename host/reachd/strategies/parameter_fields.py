@@ -146,6 +146,14 @@ class Parameters:
         float, Meta(ge=0, le=1, description="chance that a sweep goes away from the contact")
     ]
 
+    learned_weights: Annotated[
+        str,
+        Meta(
+            max_length=4096,
+            description="file of the weights of `learned`; empty: those of the package",
+        ),
+    ] = ""
+
     safety: SafetySettings
     note: str = ""
 

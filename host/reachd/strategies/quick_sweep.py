@@ -59,6 +59,16 @@ class QuickSweep(ReachingStrategy):
         self._activity = "straight" if self._felt else "waiting"
         return straight(at.aim, at.arm.heading, p) if self._felt else ZERO
 
+    def progress(self, now: Instant) -> tuple[float, float, float]:
+        """Part of a sweep that is left, its side (1 left, −1 right, 0 none), and the part of
+        `jam_time` that has passed without progress."""
+        p = self._parameters
+        stuck = self._stuck_ns / NS_PER_S / p.jam_time
+        if self._sweep is None:
+            return 0.0, 0.0, stuck
+        left = 1.0 - seconds_between(self._sweep.at, now) / p.sweep_time
+        return max(0.0, left), 1.0 if self._sweep.direction == "ccw" else -1.0, stuck
+
     def _count(self, at: Moment, elapsed_ns: int) -> None:
         """Count the time without progress."""
         if at.aim.distance <= self._best - self._parameters.jam_progress:

@@ -18,6 +18,7 @@ from reachd.strategies.builtin import (
     Straight,
     StrategyEvent,
 )
+from reachd.strategies.learned import Learned
 from reachd.strategies.parameter_fields import Parameters
 from reachd.strategies.quick_sweep import QuickSweep
 from tactile_core.types import Instant, record
@@ -34,6 +35,7 @@ BUILT_IN: dict[str, Factory] = {
     "hybrid_clock": HybridClock,
     "hybrid_event": HybridEvent,
     "quick_sweep": QuickSweep,
+    "learned": Learned,
 }
 
 

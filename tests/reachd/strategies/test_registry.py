@@ -46,8 +46,16 @@ def load(spec: str) -> Strategy:
 
 
 def test_built_in_strategies_are_available() -> None:
-    names = ("straight", "burrow", "excavate", "hybrid_clock", "hybrid_event", "quick_sweep")
-    assert available()[:6] == names
+    names = (
+        "straight",
+        "burrow",
+        "excavate",
+        "hybrid_clock",
+        "hybrid_event",
+        "quick_sweep",
+        "learned",
+    )
+    assert available()[: len(names)] == names
     for name in names:
         assert load(name).activity == "straight"
 

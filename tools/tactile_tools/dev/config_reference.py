@@ -17,6 +17,7 @@ from sim_device.skin.indenter import ScriptFile
 from tactile_core.bus.keys import RolesFile
 from tactile_core.calibration.file import CalibrationFile
 from tactile_core.config import Key, Section, describe, written
+from tactile_tools.train.settings import Settings as TrainFile
 from tactiled.settings import ConfigFile as SkinFile
 
 HEAD = """# Configuration
@@ -52,6 +53,11 @@ FILES: tuple[tuple[str, str, type], ...] = (
         "Folder of keys",
         "`roles.toml`, which `tactile bus keys` writes; see [security.md](security.md).",
         RolesFile,
+    ),
+    (
+        "Training",
+        "`tactile train --config FILE`; see [learned.md](learned.md).",
+        TrainFile,
     ),
     (
         "Press script",

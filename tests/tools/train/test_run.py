@@ -1,0 +1,98 @@
+"""A training run: what it learns from, that it goes on where it was cut off, what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="no torch: pip install 'tactile-reach[learn]'")
+pytest.importorskip("numba", reason="no numba: pip install 'tactile-reach[train]'")
+
+from reachd.strategies.learned import load_policy
+from tactile_tools.train.cupboards import PRIVILEGED
+from tactile_tools.train.ppo import Batch, Learner, advantages_of
+from tactile_tools.train.run import Run, RunError
+from tactile_tools.train.settings import Learning, Scenes, Settings
+
+SMALL = Settings(
+    worlds=8,
+    judge_every=1000,
+    learning=Learning(hidden=(16,), decisions=4, minibatches=2),
+    scenes=Scenes(count=2, judged=1),
+)
+
+
+def test_advantages_follow_their_definition() -> None:
+    """δ_k + γλ δ_{k+1} + …, cut where a reach ends (Schulman et al. 2016, equation 16)."""
+    rng = np.random.default_rng(0)
+    t, n, discount, trace = 5, 3, 0.9, 0.8
+    rewards = rng.normal(size=(t, n)).astype(np.float32)
+    values = rng.normal(size=(t + 1, n)).astype(np.float32)
+    ended = np.zeros((t, n), bool)
+    ended[2, 1] = True
+    empty = np.zeros((t, n, 1), np.float32)
+    batch = Batch(empty, empty, empty, rewards, rewards, ended, values)
+    found, returns = advantages_of(batch, discount, trace)
+    for w in range(n):
+        for k in range(t):
+            total, weight = 0.0, 1.0
+            for j in range(k, t):
+                following = 0.0 if ended[j, w] else discount * values[j + 1, w]
+                total += weight * (rewards[j, w] + following - values[j, w])
+                if ended[j, w]:
+                    break
+                weight *= discount * trace
+            assert found[k, w] == pytest.approx(total, abs=1e-5)
+    assert returns == pytest.approx(found + values[:-1])
+
+
+def test_learner_moves_towards_what_was_rewarded() -> None:
+    learner = Learner(Learning(hidden=(16,), epochs=4, rate=3e-3), "cpu", 0)
+    rng = np.random.default_rng(0)
+    t, n = 8, 64
+    for _ in range(15):
+        seen = rng.normal(size=(t, n, 270)).astype(np.float32)[:, :, : learner.actor[0].in_features]
+        hidden = np.zeros((t, n, PRIVILEGED), np.float32)
+        drawn = [learner.act(seen[k], hidden[k], rng) for k in range(t)]
+        actions = np.stack([d[0] for d in drawn])
+        rewards = -((actions[:, :, 0] - 0.6) ** 2)
+        values = np.stack([*(d[2] for d in drawn), drawn[-1][2]])
+        ended = np.ones((t, n), bool)
+        chances = np.stack([d[1] for d in drawn])
+        learner.learn(Batch(seen, hidden, actions, chances, rewards, ended, values), rng)
+    mean = learner.policy({})(rng.normal(size=(200, seen.shape[2])).astype(np.float32)).mean(0)
+    assert mean[0] > 0.25
+    assert abs(mean[1]) < 0.2
+
+
+def test_run_goes_on_where_it_was_cut_off(tmp_path: Path) -> None:
+    said: list[str] = []
+    first = Run(tmp_path / "run", SMALL, "cpu", 1, said.append)
+    first.go(1.0)
+    batches = first.batches
+    assert batches >= 1
+    again = Run(tmp_path / "run", SMALL, "cpu", 1, said.append)
+    assert (again.batches, again.decisions) == (batches, batches * 8 * 4)
+    seen = np.zeros((1, again.learner.actor[0].in_features), np.float32)
+    assert np.array_equal(again.learner.policy({})(seen), first.learner.policy({})(seen))
+    again.go(0.5)
+    assert again.batches > batches
+    rows = [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").open()]
+    assert [r["batch"] for r in rows if "loss" in r] == list(range(1, again.batches + 1))
+    about = load_policy(tmp_path / "run" / "learned.npz").about
+    assert about["settings"]["worlds"] == 8
+    assert about["judged"]["reaches"] == 1
+    assert (tmp_path / "run" / "curve.png").stat().st_size > 5000
+    with pytest.raises(RunError, match="other settings"):
+        Run(tmp_path / "run", Settings(), "cpu", 1, said.append)
+
+
+@pytest.mark.parametrize("name", ["checkpoint.pt", "scenes.jsonl.gz"])
+def test_spoilt_file_of_a_run_is_named(name: str, tmp_path: Path) -> None:
+    Run(tmp_path, SMALL, "cpu", 1, lambda _: None)
+    (tmp_path / name).write_bytes(b"cut off")
+    with pytest.raises(RunError, match=f"{name}.*delete it"):
+        Run(tmp_path, SMALL, "cpu", 1, lambda _: None).go(0.1)

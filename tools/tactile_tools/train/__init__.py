@@ -1,0 +1,1 @@
+"""Train the strategy `learned` in the planar engine."""

@@ -1,0 +1,202 @@
+"""Proximal policy optimisation of the residual on quick sweep, on PyTorch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from reachd.strategies.learned import RESIDUAL_BOUND, Policy
+from reachd.strategies.memory import WIDTH, Rows
+from tactile_tools.train.cupboards import PRIVILEGED, Turn
+from tactile_tools.train.settings import Learning
+
+ACTIONS: Final = 3
+
+
+def network(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:
+    """Fully connected layers with ELU between them; the last begins at zero."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(inputs, width), nn.ELU()]
+        inputs = width
+    last = nn.Linear(inputs, outputs)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    return nn.Sequential(*layers, last)
+
+
+@dataclass(slots=True)
+class Batch:
+    """What was seen and done in ``t`` decisions of ``n`` reaches: arrays (t, n, …)."""
+
+    observations: Rows
+    privileged: Rows
+    actions: Rows
+    chances: Rows  # logarithm of the density with which each action was drawn
+    rewards: Rows
+    ended: NDArray[np.bool_]
+    values: Rows  # (t + 1, n)
+
+
+class Learner:
+    """Actor and critic, what they learn from a batch, and the state of both for a checkpoint."""
+
+    def __init__(self, settings: Learning, device: str, seed: int) -> None:
+        torch.manual_seed(seed)
+        self.settings, self.device = settings, torch.device(device)
+        hidden = tuple(settings.hidden)
+        self.actor = network(WIDTH, hidden, ACTIONS).to(self.device)
+        self.critic = network(WIDTH + PRIVILEGED, hidden, 1).to(self.device)
+        self.spread = nn.Parameter(
+            torch.full((ACTIONS,), float(np.log(settings.spread)), device=self.device)
+        )
+        self._parameters = [*self.actor.parameters(), *self.critic.parameters(), self.spread]
+        self._optimiser = torch.optim.Adam(self._parameters, lr=settings.rate, eps=1e-5)
+        self.rate = settings.rate
+
+    def act(
+        self, observations: Rows, privileged: Rows, rng: np.random.Generator
+    ) -> tuple[Rows, Rows, Rows]:
+        """Actions drawn for (n, ·) observations, the logarithms of their densities, and values."""
+        with torch.no_grad():
+            seen = torch.from_numpy(observations).to(self.device)
+            mean = self.actor(seen).cpu().numpy()
+            spread = self.spread.exp().cpu().numpy()
+            values = self._value(seen, torch.from_numpy(privileged).to(self.device)).cpu().numpy()
+        draws = rng.standard_normal(mean.shape).astype(np.float32)
+        chances = (-0.5 * draws**2 - np.log(spread) - 0.9189385).sum(axis=1)
+        return mean + spread * draws, chances.astype(np.float32), values
+
+    def _value(self, seen: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
+        value: torch.Tensor = self.critic(torch.cat([seen, privileged], dim=1))[:, 0]
+        return value
+
+    def learn(self, batch: Batch, rng: np.random.Generator) -> dict[str, float]:
+        """Improve actor and critic by ``batch``; returns what there is to say of it."""
+        s = self.settings
+        advantages, returns = advantages_of(batch, s.discount, s.trace)
+        count = advantages.size
+        flat: dict[str, torch.Tensor] = {}
+        for name, values in (
+            ("seen", batch.observations),
+            ("privileged", batch.privileged),
+            ("actions", batch.actions),
+            ("chances", batch.chances),
+            ("values", batch.values[:-1]),
+            ("advantages", (advantages - advantages.mean()) / (advantages.std() + 1e-8)),
+            ("returns", returns),
+        ):
+            array = np.ascontiguousarray(values, np.float32)
+            flat[name] = torch.from_numpy(array.reshape(count, *array.shape[2:])).to(self.device)
+        drift, losses = 0.0, []
+        for _ in range(s.epochs):
+            order = torch.from_numpy(rng.permutation(count)).to(self.device)
+            drift = 0.0
+            for part in order.chunk(s.minibatches):
+                loss, away = self._loss({name: values[part] for name, values in flat.items()})
+                self._optimiser.zero_grad()
+                loss.backward()  # type: ignore[no-untyped-call, unused-ignore]
+                nn.utils.clip_grad_norm_(self._parameters, s.clip_norm)
+                self._optimiser.step()
+                with torch.no_grad():
+                    self.spread.clamp_(min=float(np.log(s.least_spread)))
+                losses.append(float(loss.detach()))
+                drift += float(away.detach()) / s.minibatches
+            self._adapt(drift)
+            if drift > 4 * s.drift:
+                break
+        return {
+            "loss": float(np.mean(losses)),
+            "drift": drift,
+            "rate": self.rate,
+            "spread": float(self.spread.detach().exp().mean()),
+        }
+
+    def _loss(self, part: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        s = self.settings
+        mean = self.actor(part["seen"])
+        normal = torch.distributions.Normal(mean, self.spread.exp())
+        chances = normal.log_prob(part["actions"]).sum(dim=1)  # type: ignore[no-untyped-call, unused-ignore]
+        change = chances - part["chances"]
+        ratio = change.exp()
+        gain = part["advantages"]
+        clipped = ratio.clamp(1 - s.clip, 1 + s.clip)
+        policy = -torch.minimum(ratio * gain, clipped * gain).mean()
+        values = self._value(part["seen"], part["privileged"])
+        near = part["values"] + (values - part["values"]).clamp(-0.5, 0.5)
+        error = torch.maximum((values - part["returns"]) ** 2, (near - part["returns"]) ** 2)
+        wide = (mean.abs() - RESIDUAL_BOUND).clamp(min=0).pow(2).sum(dim=1).mean()
+        entropy = normal.entropy().sum(dim=1).mean()  # type: ignore[no-untyped-call, unused-ignore]
+        away = (ratio - 1 - change).mean()  # of Kullback and Leibler, estimated
+        return policy + 0.5 * error.mean() + wide - s.entropy * entropy, away
+
+    def _adapt(self, drift: float) -> None:
+        s = self.settings
+        if drift > 2 * s.drift:
+            self.rate = max(self.rate / 1.5, 1e-5)
+        elif drift < s.drift / 2:
+            self.rate = min(self.rate * 1.5, s.greatest_rate)
+        for group in self._optimiser.param_groups:
+            group["lr"] = self.rate
+
+    def policy(self, about: dict[str, Any]) -> Policy:
+        """The actor as plain arrays."""
+        layers = [
+            (
+                layer.weight.detach().cpu().numpy().T.copy(),
+                layer.bias.detach().cpu().numpy().copy(),
+            )
+            for layer in self.actor
+            if isinstance(layer, nn.Linear)
+        ]
+        return Policy(tuple(layers), about)
+
+    def state(self) -> dict[str, Any]:
+        """Everything that a checkpoint keeps of it."""
+        return {
+            "actor": self.actor.state_dict(),
+            "critic": self.critic.state_dict(),
+            "spread": self.spread.detach(),
+            "optimiser": self._optimiser.state_dict(),
+            "rate": self.rate,
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint's `state`."""
+        self.actor.load_state_dict(state["actor"])
+        self.critic.load_state_dict(state["critic"])
+        with torch.no_grad():
+            self.spread.copy_(state["spread"])
+        self._optimiser.load_state_dict(state["optimiser"])
+        self.rate = float(state["rate"])
+
+
+def advantages_of(batch: Batch, discount: float, trace: float) -> tuple[Rows, Rows]:
+    """Generalised advantages (Schulman et al. 2016, equation 16) and returns, (t, n) each."""
+    t = len(batch.rewards)
+    advantages = np.zeros_like(batch.rewards)
+    following = np.zeros(batch.rewards.shape[1], np.float32)
+    for k in range(t - 1, -1, -1):
+        goes_on = ~batch.ended[k]
+        error = batch.rewards[k] + discount * goes_on * batch.values[k + 1] - batch.values[k]
+        following = error + discount * trace * goes_on * following
+        advantages[k] = following
+    return advantages, advantages + batch.values[:-1]
+
+
+def gather(turns: list[tuple[Rows, Rows, Rows, Rows, Rows, Turn]], last_values: Rows) -> Batch:
+    """A batch of (observations, privileged, actions, chances, values, turn), in order."""
+    return Batch(
+        np.stack([t[0] for t in turns]),
+        np.stack([t[1] for t in turns]),
+        np.stack([t[2] for t in turns]),
+        np.stack([t[3] for t in turns]),
+        np.stack([t[5].rewards for t in turns]),
+        np.stack([t[5].ended for t in turns]),
+        np.stack([*(t[4] for t in turns), last_values]),
+    )

@@ -1,0 +1,250 @@
+"""A training run in a folder: batches, checkpoints, progress. It goes on where it was cut off."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import torch
+
+from reachd.strategies.learned import Policy, save_policy
+from sim_device.world.scene_generation import generate
+from sim_device.world.scenes import Scene
+from tactile_tools.train.cupboards import Bank, Cupboards
+from tactile_tools.train.curve import draw
+from tactile_tools.train.ppo import Learner, gather
+from tactile_tools.train.settings import NO_VARIETY, Settings
+
+CHECKPOINT = "checkpoint.pt"
+PROGRESS = "progress.jsonl"
+CURVE = "curve.png"
+WEIGHTS = "learned.npz"
+SETTINGS = "settings.json"
+SCENES = "scenes.jsonl.gz"
+SAVE_EVERY_S = 60.0
+
+
+class RunError(ValueError):
+    """The folder cannot be trained in; the message names the remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """How a policy did: share that arrived, mean s (limit where it did not), forces in N."""
+
+    arrived: float
+    seconds: float
+    force_p50: float
+    force_p90: float
+    reaches: int
+
+
+def scenes_of(names: tuple[str, ...], first: int, count: int, workers: int) -> list[Scene]:
+    """``count`` scenes, in turn from each generator."""
+    jobs = [(names[i % len(names)], first + i) for i in range(count)]
+    if workers <= 1:
+        return [_scene(job) for job in jobs]
+    with ProcessPoolExecutor(workers) as pool:
+        return list(pool.map(_scene, jobs, chunksize=16))
+
+
+def _scene(job: tuple[str, int]) -> Scene:
+    return generate(*job)
+
+
+def judge(policy: Policy, bank: Bank, threads: int) -> Judged:
+    """One reach in each scene of ``bank``, not mirrored, felt exactly, with the policy's mean."""
+    n = bank.originals
+    rng = np.random.default_rng(0)
+    with Cupboards(
+        bank, n, rng, variety=NO_VARIETY, threads=threads, rows=list(range(n))
+    ) as worlds:
+        seen, _ = worlds.observe()
+        over, arrived = np.zeros(n, bool), np.zeros(n, bool)
+        seconds, force = np.zeros(n), np.zeros(n)
+        while not over.all():
+            turn = worlds.step(policy(seen))
+            seen = turn.observations
+            force = np.where(over, force, np.maximum(force, turn.force_n))
+            now = turn.ended & ~over
+            arrived |= now & turn.arrived
+            seconds[now] = turn.seconds[now]
+            over |= turn.ended
+    return Judged(
+        float(arrived.mean()),
+        float(seconds.mean()),
+        float(np.median(force)),
+        float(np.percentile(force, 90)),
+        n,
+    )
+
+
+class Run:
+    """Training in ``folder``; made anew, or going on from its checkpoint."""
+
+    def __init__(
+        self,
+        folder: Path,
+        settings: Settings,
+        device: str,
+        threads: int,
+        say: Callable[[str], None],
+    ) -> None:
+        self.folder, self.settings, self._say = folder, settings, say
+        self._threads = threads
+        folder.mkdir(parents=True, exist_ok=True)
+        self._keep_settings()
+        self.learner = Learner(settings.learning, device, settings.seed)
+        self.batches, self.decisions, self.cpu_s, self.best = 0, 0, 0.0, -1.0
+        self._load()
+        torch.set_num_threads(threads)
+
+    def _keep_settings(self) -> None:
+        path, mine = self.folder / SETTINGS, json.loads(msgspec.json.encode(self.settings))
+        if path.exists():
+            theirs = json.loads(path.read_text(encoding="utf-8"))
+            if theirs != mine:
+                raise RunError(
+                    f"{path} holds other settings; go on with those, or name a new folder"
+                )
+        else:
+            path.write_text(json.dumps(mine, indent=2) + "\n", encoding="utf-8")
+
+    def _load(self) -> None:
+        path = self.folder / CHECKPOINT
+        if not path.exists():
+            return
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+            self.learner.load(state["learner"])
+        except Exception as error:
+            raise RunError(
+                f"{path} is damaged or of another version; delete it to begin anew"
+            ) from error
+        self.batches, self.decisions = int(state["batches"]), int(state["decisions"])
+        self.cpu_s, self.best = float(state["cpu_s"]), float(state["best"])
+
+    def save(self) -> None:
+        """Write the checkpoint in one step, so that a kill loses a minute at most."""
+        new = self.folder / f".{CHECKPOINT}.new"
+        torch.save(
+            {
+                "learner": self.learner.state(),
+                "batches": self.batches,
+                "decisions": self.decisions,
+                "cpu_s": self.cpu_s,
+                "best": self.best,
+            },
+            new,
+        )
+        new.replace(self.folder / CHECKPOINT)
+
+    def go(self, seconds: float) -> None:
+        """Train for ``seconds`` s by the clock, once the scenes are there."""
+        s = self.settings
+        bank, judged = self._banks()
+        started = time.monotonic()
+        # A run that goes on draws other scenes than the one that was cut off.
+        rng = np.random.default_rng([s.seed, self.batches])
+        if self.batches == 0:
+            self._judge(judged)
+        saved, cpu = time.monotonic(), time.process_time()
+        with Cupboards(
+            bank, s.worlds, rng, variety=s.variety, reward=s.reward, threads=self._threads
+        ) as worlds:
+            seen, privileged = worlds.observe()
+            while time.monotonic() - started < seconds:
+                turns: list[Any] = []
+                ended = arrived = 0
+                for _ in range(s.learning.decisions):
+                    actions, chances, values = self.learner.act(seen, privileged, rng)
+                    turn = worlds.step(np.clip(actions, -2.0, 2.0))
+                    turns.append((seen, privileged, actions, chances, values, turn))
+                    seen, privileged = turn.observations, turn.privileged
+                    ended += int(turn.ended.sum())
+                    arrived += int(turn.arrived.sum())
+                last = self.learner.act(seen, privileged, rng)[2]
+                told = self.learner.learn(gather(turns, last), rng)
+                self.batches += 1
+                self.decisions += s.worlds * s.learning.decisions
+                self.cpu_s += time.process_time() - cpu
+                cpu = time.process_time()
+                told |= {"reaches": ended, "arrived": arrived / max(1, ended)}
+                told["reward"] = float(np.mean([t[5].rewards.mean() for t in turns]))
+                self._progress(told)
+                if self.batches % s.judge_every == 0:
+                    self._judge(judged)
+                if time.monotonic() - saved > SAVE_EVERY_S:
+                    self.save()
+                    saved = time.monotonic()
+        self._judge(judged)
+        self.save()
+        draw(self.folder / PROGRESS, self.folder / CURVE)
+
+    def _banks(self) -> tuple[Bank, Bank]:
+        """Scenes to train on and to judge by; made once, then kept in the folder."""
+        s, path = self.settings.scenes, self.folder / SCENES
+        if path.exists():
+            try:
+                with gzip.open(path, "rt", encoding="utf-8") as file:
+                    scenes = [Scene.from_json(line) for line in file]
+            except (OSError, EOFError, ValueError) as error:
+                raise RunError(f"{path} cannot be read ({error}); delete it") from error
+        else:
+            self._say(f"making {s.count + s.judged} scenes, once: a tenth of a CPU-second each")
+            scenes = [
+                *scenes_of(s.generators, s.first_seed, s.count, self._threads),
+                *scenes_of(s.generators, s.judged_seed, s.judged, self._threads),
+            ]
+            new = path.with_name(f".{SCENES}.new")
+            with gzip.open(new, "wt", encoding="utf-8") as file:
+                file.writelines(scene.to_json() + "\n" for scene in scenes)
+            new.replace(path)
+        return Bank(scenes[: s.count]), Bank(scenes[s.count :])
+
+    def _judge(self, bank: Bank) -> None:
+        policy = self.learner.policy(self.about())
+        found = judge(policy, bank, self._threads)
+        self._progress({"judged": asdict(found)})
+        save_policy(self.folder / f"last-{WEIGHTS}", policy)
+        # Arriving counts; a tenth of a second, or two newtons, for a thousandth of it.
+        worth = found.arrived - found.seconds / 100.0 - found.force_p50 / 2000.0
+        if self.best < 0 or worth > self.best:
+            self.best = worth
+            about = self.about() | {"judged": asdict(found)}
+            save_policy(self.folder / WEIGHTS, Policy(policy.layers, about))
+        self._say(
+            f"batch {self.batches}: {found.arrived:.1%} of {found.reaches} arrive, mean "
+            f"{found.seconds:.1f} s, peak force {found.force_p50:.1f} N (90 %: "
+            f"{found.force_p90:.1f}); {self.decisions / 1e6:.1f} M decisions, "
+            f"{self.cpu_s / 60:.0f} CPU-min"
+        )
+
+    def about(self) -> dict[str, Any]:
+        """How these weights came about; stored with them."""
+        return {
+            "settings": msgspec.to_builtins(self.settings),
+            "batches": self.batches,
+            "decisions": self.decisions,
+            "cpu_minutes": round(self.cpu_s / 60, 1),
+            "torch": torch.__version__,
+            "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+            "device": str(self.learner.device),
+        }
+
+    def _progress(self, told: dict[str, Any]) -> None:
+        row = {"batch": self.batches, "decisions": self.decisions, "cpu_s": round(self.cpu_s, 1)}
+        with (self.folder / PROGRESS).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row | told) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
