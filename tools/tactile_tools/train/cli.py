@@ -30,7 +30,6 @@ def fill(parser: Parser) -> None:
         "engine (docs/learned.md). Without a GPU it takes a night on two cores."
     )
     parser.epilog = EXAMPLES
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     add_path(parser, "--out", "folder of the run (default runs/train)")
     parser.add_argument(
         "--config", type=Path, metavar="FILE", help="settings (docs/configuration.md, Training)"
