@@ -5,6 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 SOAK_MINUTES ?= 60
 KILLS ?= 1000
+RIGS ?= 1
 
 .DEFAULT_GOAL := help
 .PHONY: help setup test test-random test-loaded lint demo demo-ur arms arms-scenes demo-skin bench fuzz crash fidelity mutation gate-random gate-coverage hostile recordings stress soak fuzz-pipeline kills firmware-test docs docs-reference leaderboard pictures clean
@@ -118,9 +119,10 @@ soak: setup  ## an hour of four boards, one replugged each second
 fuzz-pipeline: setup  ## a million hostile frames through the pipeline
 	$(BIN)/tactile fuzz --through pipeline --frames 1000000 --out docs/results/fuzz-pipeline.json
 
-# A thousand kills of simulator, tactiled and reachd while they reach; two to three hours.
+# A thousand kills of simulator, tactiled and reachd while they reach; two hours, with RIGS=2 one. Goes
+# on where it was cut off.
 kills: setup  ## a thousand kills while they reach; two to three hours
-	$(BIN)/tactile crash --processes --kills $(KILLS) --out docs/results/kills.json
+	$(BIN)/tactile crash --processes --rigs $(RIGS) --kills $(KILLS) --out docs/results/kills.json
 
 # The documents as a site in build/site, offline.
 docs: setup  ## the documents as a site in build/site

@@ -53,11 +53,18 @@ def test_killed_process_stops_the_arm_and_its_log_is_readable(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     out = tmp_path / "kills.json"
-    assert main(["crash", "--processes", "--kills", "1", "--seed", "4", "--json", str(out)]) == 0
+    words = ["crash", "--processes", "--seed", "4", "--out", str(out)]
+    assert main([*words, "--kills", "1"]) == 0
     told = json.loads(out.read_text(encoding="utf-8"))
-    assert told["kills"] == 1
-    assert told["problems"] == []
-    assert told["next"] == 1
+    assert told["summary"]["kills"] == 1
+    assert told["summary"]["problems"] == []
+    # The same command goes on, and with another seed it does not mix two runs.
+    before = out.read_bytes()
+    assert main([*words, "--kills", "1"]) == 0
+    assert out.read_bytes() == before
+    assert main(["crash", "--processes", "--seed", "5", "--out", str(out)]) == 2
+    assert "--seed 4" in capsys.readouterr().err
+    assert out.read_bytes() == before
 
 
 @pytest.mark.parametrize(
@@ -65,7 +72,7 @@ def test_killed_process_stops_the_arm_and_its_log_is_readable(
     [
         (["soak", "--boards", "0"], "from 1 to 16"),
         (["soak", "--minutes", "nan"], "above 0"),
-        (["crash", "--processes", "--from-kill", "x"], "a whole number"),
+        (["crash", "--processes", "--rigs", "x"], "a whole number"),
         (["fuzz", "--through", "disk"], "pipeline"),
     ],
 )

@@ -692,14 +692,19 @@ def _fill_crash(parser: Parser) -> None:
         help="kill simulator, tactiled and reachd while they reach, and check that the arm rests",
     )
     parser.add_argument(
-        "--from-kill",
-        type=natural,
-        default=0,
+        "--rigs",
+        type=count,
+        default=1,
         metavar="N",
-        help="with --processes: go on at N (default 0)",
+        help="with --processes: so many simulators, tactileds and reachds at a time (default 1)",
     )
     _add_budget(parser, "with --processes: begin no kill after so many seconds")
     add_report(parser)
+    parser.add_argument(
+        "--force",
+        action="store_true",
+        help="with --processes: begin anew, where the file of --out holds an earlier run",
+    )
     add_path(parser, "--keep", "keep the logs of failed kills in this folder")
     parser.set_defaults(func=later("tactile_tools.dev.crash:run"))
 

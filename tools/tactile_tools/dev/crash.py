@@ -81,34 +81,38 @@ class Result:
 def _run_processes(options: argparse.Namespace) -> int:
     """Kill the three processes. Returns 0 if the arm came to rest each time and every log was
     read."""
-    from tactile_tools.dev.process_kills import run_kills, write_json
+    from tactile_tools.dev.process_kills import read_rows, run_kills, summary, write_json
 
     console = Console(stderr=True)
-
-    def save(values: dict[str, Any]) -> None:
-        if options.out is not None:
-            options.out.parent.mkdir(parents=True, exist_ok=True)
-            write_json(options.out, values)
-
+    said = {"seed": options.seed, "cores": os.cpu_count(), "rigs": options.rigs}
     try:
+        done = read_rows(options.out, options.seed, restart=options.force)
         with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-            task = bar.add_task("killing", total=options.kills)
-            totals = run_kills(
+            task = bar.add_task("killing", total=options.kills, completed=len(done))
+
+            def save(rows: list[dict[str, Any]]) -> None:
+                bar.update(task, completed=len(rows))
+                if options.out is not None:
+                    options.out.parent.mkdir(parents=True, exist_ok=True)
+                    write_json(options.out, said | {"summary": summary(rows)}, rows)
+
+            rows = run_kills(
                 options.kills,
                 options.seed,
-                first=options.from_kill,
+                done,
+                rigs=options.rigs,
                 seconds=options.duration,
-                progress=lambda done: bar.advance(task, done),
                 save=save,
             )
-        save(asdict(totals))
+        save(rows)
     except OSError as error:
         print(f"tactile crash: {error.filename}: {error.strerror}", file=sys.stderr)
         return 3
-    print(json.dumps(asdict(totals), indent=2))
-    if totals.kills < totals.asked:
-        print(f"go on with --from-kill {totals.next}", file=sys.stderr)
-    return 1 if totals.problems else 0
+    found = summary(rows)
+    print(json.dumps(said | found, indent=2))
+    if len(rows) < options.kills:
+        print("the same command goes on where this one ended", file=sys.stderr)
+    return 1 if found["problems"] else 0
 
 
 def run(options: argparse.Namespace) -> int:
