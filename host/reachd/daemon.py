@@ -53,6 +53,12 @@ ASK_COMMANDERS = 0.5
 ASK_AGAIN = 0.02
 """s between queries meanwhile."""
 
+ARM_TRIES = 3
+"""Times that the gate is asked to arm before a reach is given up."""
+
+ARM_AGAIN_S = 0.3
+"""s between these."""
+
 STOP_TIMEOUT = 0.3
 """s for the control loop to end; a cycle takes 10 ms."""
 
@@ -218,12 +224,25 @@ class Daemon(Service):
         if requests is None or touch is None:
             raise RuntimeError("reach() before start()")
         try:
-            requests.arm()
+            self._arm_gate(requests)
             if not touch.calibrated:
                 log.warning("board %s is not calibrated: its forces are rough", self.settings.board)
             requests.reach(goal.x, goal.y, goal.radius, goal.time_limit)
         except RefusedError as error:
             raise StartError(f"nothing moves: {error}") from error
+
+    @staticmethod
+    def _arm_gate(requests: OperatorRequests) -> None:
+        """Arm the gate; again where it is refused, for an input may be late on a busy machine."""
+        for left in reversed(range(ARM_TRIES)):
+            try:
+                requests.arm()
+                return
+            except RefusedError as error:
+                if not left:
+                    raise
+                log.info("not armed yet: %s", error)
+                time.sleep(ARM_AGAIN_S)
 
     def cancel(self, text: str) -> None:
         """Stop a reach under way and give it an outcome; the next cycle sends the zero twist."""
