@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -155,7 +156,8 @@ class Learned(ReachingStrategy):
 
     def __init__(self, parameters: Parameters, rng: np.random.Generator) -> None:
         weights = parameters.learned_weights
-        self._policy = load_policy(Path(weights) if weights else None)
+        policy = load_policy(Path(weights) if weights else None)
+        self._policy: Callable[[Rows], Rows] = policy
         self._sweeps = QuickSweep(parameters, rng)
         self._memory = Memory(1)
         super().__init__(parameters, rng)

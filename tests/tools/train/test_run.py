@@ -12,6 +12,7 @@ pytest.importorskip("torch", reason="no torch: pip install 'tactile-reach[learn]
 pytest.importorskip("numba", reason="no numba: pip install 'tactile-reach[train]'")
 
 from reachd.strategies.learned import load_policy
+from tactile_tools.cli import main
 from tactile_tools.train.cupboards import PRIVILEGED
 from tactile_tools.train.ppo import Batch, Learner, advantages_of
 from tactile_tools.train.run import Run, RunError
@@ -88,6 +89,21 @@ def test_run_goes_on_where_it_was_cut_off(tmp_path: Path) -> None:
     assert (tmp_path / "run" / "curve.png").stat().st_size > 5000
     with pytest.raises(RunError, match="other settings"):
         Run(tmp_path / "run", Settings(), "cpu", 1, said.append)
+
+
+def test_command_trains_and_names_what_it_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, out = tmp_path / "train.toml", tmp_path / "run"
+    config.write_text("worlds = 8\n[learning]\nhidden = [8]\n[scenes]\ncount = 1\njudged = 1\n")
+    words = ["train", "--config", str(config), "--out", str(out), "--minutes", "0.01"]
+    assert main([*words, "--jobs", "1"]) == 0
+    assert f"learned_weights={out / 'learned.npz'}" in capsys.readouterr().out
+    assert load_policy(out / "learned.npz").about["decisions"] >= 8 * 24
+    assert main(["train", "--out", str(out), "--minutes", "0.01"]) == 2
+    assert "other settings" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main(["train", "--minutes", "0"])
 
 
 @pytest.mark.parametrize("name", ["checkpoint.pt", "scenes.jsonl.gz"])

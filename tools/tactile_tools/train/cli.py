@@ -36,7 +36,7 @@ def fill(parser: Parser) -> None:
     )
     parser.add_argument(
         "--minutes",
-        type=positive,
+        type=positive("minutes"),
         default=480.0,
         metavar="MIN",
         help="train for so long now (default %(default)g)",

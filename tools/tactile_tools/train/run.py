@@ -153,7 +153,6 @@ class Run:
         """Train for ``seconds`` s by the clock, once the scenes are there."""
         s = self.settings
         bank, judged = self._banks()
-        started = time.monotonic()
         # A run that goes on draws other scenes than the one that was cut off.
         rng = np.random.default_rng([s.seed, self.batches])
         if self.batches == 0:
@@ -163,6 +162,7 @@ class Run:
             bank, s.worlds, rng, variety=s.variety, reward=s.reward, threads=self._threads
         ) as worlds:
             seen, privileged = worlds.observe()
+            started = time.monotonic()
             while time.monotonic() - started < seconds:
                 turns: list[Any] = []
                 ended = arrived = 0
