@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_device.world.parameters import WorldParameters
 from sim_device.world.scenes import Scene
 from tactile_core.arrays import FloatArray
 from tactile_core.types import Twist, record
@@ -83,6 +84,11 @@ class World(Protocol):
     @property
     def scene(self) -> Scene:
         """Scene it was built from."""
+        ...
+
+    @property
+    def parameters(self) -> WorldParameters:
+        """Physical parameters it was built with."""
         ...
 
     @property

@@ -45,6 +45,7 @@ class MujocoWorld:
     def __init__(self, scene: Scene, parameters: WorldParameters | None = None) -> None:
         parameters = parameters or world_parameters(scene.parameters)
         self._scene = scene
+        self._parameters = parameters
         self._outline = parameters.outline
         start = replace(scene, objects=settled(scene, parameters))
         self._model = model = cupboard_model(start, parameters)
@@ -82,6 +83,11 @@ class MujocoWorld:
     def scene(self) -> Scene:
         """Scene it was built from."""
         return self._scene
+
+    @property
+    def parameters(self) -> WorldParameters:
+        """Physical parameters it was built with."""
+        return self._parameters
 
     @property
     def outline(self) -> tuple[tuple[float, float], ...]:

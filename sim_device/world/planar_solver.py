@@ -148,7 +148,7 @@ SWEEPS: Final = 30
 TOLERANCE_N: Final = 1e-4
 SLEEP_SPEED: Final = 1e-3
 SLEEP_STEPS: Final = 10
-_TURN_LENGTH: Final = 0.06  # m, by which turning is compared with that speed
+TURN_LENGTH: Final = 0.06  # m, by which turning is compared with that speed
 
 _KEY_FEATURES: Final = 32
 _MERGE: Final = MERGE_RADIUS**2
@@ -558,7 +558,7 @@ def _integrate(world: Any, bodies: Any, outlines: Any, hulls: Any, queue: Any, q
         body.vx += STEP * body.ax
         body.vy += STEP * body.ay
         body.omega += STEP * body.alpha
-        speed = max(abs(body.vx), abs(body.vy), _TURN_LENGTH * abs(body.omega))
+        speed = max(abs(body.vx), abs(body.vy), TURN_LENGTH * abs(body.omega))
         body.rest = body.rest + 1 if speed < SLEEP_SPEED else 0
         body.x += STEP * body.vx
         body.y += STEP * body.vy

@@ -31,6 +31,7 @@ class PlanarWorld:
     def __init__(self, scene: Scene, parameters: WorldParameters | None = None) -> None:
         parameters = parameters or world_parameters(scene.parameters)
         self._scene = scene
+        self._parameters = parameters
         self._outline = parameters.outline
         self._arrays = arrays = arrays_of([scene], [parameters])
         # Views, which the kernel writes.
@@ -46,6 +47,11 @@ class PlanarWorld:
     def scene(self) -> Scene:
         """What it was built from."""
         return self._scene
+
+    @property
+    def parameters(self) -> WorldParameters:
+        """Physical parameters it was built with."""
+        return self._parameters
 
     @property
     def outline(self) -> tuple[tuple[float, float], ...]:

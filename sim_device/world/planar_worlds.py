@@ -17,10 +17,20 @@ from numpy.typing import NDArray
 from sim_device.world.base import PHYSICS_STEP, substeps
 from sim_device.world.parameters import WorldParameters, world_parameters
 from sim_device.world.planar_arrays import Arrays, arrays_of, poses_of, put, standing
-from sim_device.world.planar_solver import advance_some
+from sim_device.world.planar_solver import (
+    DISC,
+    FALLEN,
+    POLYGON,
+    SLEEP_SPEED,
+    SLEEP_STEPS,
+    TURN_LENGTH,
+    advance_some,
+    place_all,
+)
 from sim_device.world.scenes import Scene
 from tactile_core.arrays import FloatArray
 from tactile_core.geometry import TIP_X, Side, finger
+from tactile_core.types import record
 
 Device = Literal["cpu", "cuda"]
 
@@ -33,6 +43,25 @@ CELL_M: Final = 1e-4
 FEATURES: Final = ("total_n", "tip_n", "peak_n", "peak_x_m", "peak_y_m")
 """Columns of `Worlds.features`: summed normal force, that on the tip, the greatest and its place
 in ``ee``."""
+
+
+@record
+class Snapshot:
+    """State of a cupboard from which to go on.
+
+    ``finger`` (6,): pivot's x, y m, heading rad, vx, vy m/s, omega rad/s in ``cupboard``.
+    ``wrench`` (3,): N, N, N·m that contacts exert on it. ``poses`` (n, 3): x, y m and yaw rad of
+    the objects; ``speeds`` (n, 3): m/s, m/s, rad/s. ``standing`` (n,): whether each is on the shelf.
+    """
+
+    finger: FloatArray
+    wrench: FloatArray
+    poses: FloatArray
+    speeds: FloatArray
+    standing: NDArray[np.bool_]
+
+
+_MOTION: Final = ("x", "y", "yaw", "vx", "vy", "omega")
 
 
 class Worlds:
@@ -70,7 +99,8 @@ class Worlds:
         if device not in ("cpu", "cuda"):
             raise ValueError(f"device {device!r}; allowed: cpu, cuda")
         self._threads = threads or os.cpu_count() or 1
-        self._pool = ThreadPoolExecutor(self._threads) if self._device is None else None
+        several = self._device is None and self._threads > 1
+        self._pool = ThreadPoolExecutor(self._threads) if several else None
 
     def _figures(self, scene: Scene) -> WorldParameters:
         return self._one or world_parameters(scene.parameters)
@@ -119,6 +149,8 @@ class Worlds:
             ]
             for part in parts:
                 part.result()
+        else:
+            advance_some(0, n, steps, *self._host.all)
         self._steps += steps
         self._reached |= self.distance <= self._radius
 
@@ -139,6 +171,47 @@ class Worlds:
         self._goal[index], self._radius[index] = scene.goal, figures.goal_radius
         self._reached[index], self._steps[index] = False, 0
         self._counts[index] = len(scene.objects)
+
+    def place(self, state: Snapshot) -> None:
+        """Put all worlds, which must be of one scene, into ``state``; their time begins at 0.
+
+        What is slower than `SLEEP_SPEED` rests until something touches it; forces of contacts are
+        found anew in the first step. ValueError where scenes differ or ``state`` is of another.
+        """
+        first, count = self._scenes[0], len(state.poses)
+        if count != len(first.objects) or any(scene != first for scene in self._scenes):
+            raise ValueError(f"a state of {count} objects fits only worlds of that one scene")
+        if self._device is not None:
+            self._device.fetch(*_Gpu.BUILT)
+        host = self._host
+        body, world, out = host.bodies[0], host.worlds[:1], host.readout[0]
+        finger, objects = body[:1], body[1 : count + 1]
+        for name, value in zip(_MOTION, state.finger.tolist(), strict=True):
+            finger[name] = value
+        for column, name in enumerate(_MOTION[:3]):
+            objects[name] = state.poses[:, column]
+        for column, name in enumerate(_MOTION[3:]):
+            objects[name] = state.speeds[:, column]
+        for name in ("fx", "fy", "ft"):
+            objects[name] = 0.0
+        standing_as = np.where(objects["corners"] > 0, POLYGON, DISC)
+        objects["kind"] = np.where(state.standing, standing_as, FALLEN)
+        resting = (np.abs(state.speeds) * (1.0, 1.0, TURN_LENGTH)).max(axis=1) < SLEEP_SPEED
+        objects["rest"] = np.where(resting, SLEEP_STEPS, 0)
+        for name in ("remembered", "failed", "work"):
+            world[name] = 0
+        world["ejected"] = np.count_nonzero(~state.standing)
+        for name, value in zip(("push_x", "push_y", "push_m"), state.wrench.tolist(), strict=True):
+            world[name] = value
+        place_all(0, host.bodies, host.outlines, host.hulls)
+        out[:] = 0.0
+        out[:6], out[6:9], out[10] = state.finger, state.wrench, world["ejected"][0]
+        for array in (host.bodies, host.worlds, host.hulls, host.readout):
+            array[1:] = array[0]
+        if self._device is not None:
+            self._device.send(*_Gpu.BUILT)
+        self._steps[:] = 0
+        self._reached[:] = self.distance <= self._radius
 
     def limit_wrench(self, f_max: float, m_max: float) -> None:
         """Bound all motors, as `World.limit_wrench`; a `reset` brings back a set's own bounds."""

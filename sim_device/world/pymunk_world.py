@@ -115,6 +115,11 @@ class PymunkWorld:
         return self._scene
 
     @property
+    def parameters(self) -> WorldParameters:
+        """Physical parameters it was built with."""
+        return self._parameters
+
+    @property
     def outline(self) -> tuple[tuple[float, float], ...]:
         """Corners of the finger, x, y in ``ee``, m."""
         return self._parameters.outline

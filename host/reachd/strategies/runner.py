@@ -28,6 +28,9 @@ GROUP = "tactile_reach.strategies"
 
 Factory = Callable[[Parameters, np.random.Generator], Strategy]
 
+PrivilegedFactory = Callable[[Parameters, np.random.Generator, object], Strategy]
+"""One that is told the truth of a simulated world, see `load_strategy`."""
+
 BUILT_IN: dict[str, Factory] = {
     "straight": Straight,
     "burrow": Burrow,
@@ -48,13 +51,20 @@ def available() -> tuple[str, ...]:
     return (*BUILT_IN, *sorted(e.name for e in _offered() if e.name not in BUILT_IN))
 
 
-def load_strategy(spec: str, parameters: Parameters, rng: np.random.Generator) -> Strategy:
+def load_strategy(
+    spec: str,
+    parameters: Parameters,
+    rng: np.random.Generator,
+    truth: Callable[[], object] | None = None,
+) -> Strategy:
     """Make the strategy ``spec``: a built-in name, an entry point's name, or ``module:Class``.
 
-    A class is called with (parameters, rng). A package cannot replace a built-in name. Raises
-    StrategyError.
+    A class is called with (parameters, rng). A package cannot replace a built-in name. One that
+    says ``privileged = True`` of itself is called with (parameters, rng, truth()): what a
+    simulation knows of its world, and no arm does. Raises StrategyError, for a privileged one also
+    where there is no ``truth``.
     """
-    strategy = _guarded(spec, lambda: _factory(spec)(parameters, rng))
+    strategy = _guarded(spec, lambda: _made(spec, parameters, rng, truth))
     missing = [name for name in ("start", "step", "activity") if not hasattr(strategy, name)]
     if missing:
         raise StrategyError(
@@ -118,6 +128,24 @@ def _factory(spec: str) -> Factory:
     if not callable(made):
         raise StrategyError(f"strategy {spec!r}: module {module!r} has no class {name!r}")
     return cast(Factory, made)
+
+
+def _made(
+    spec: str,
+    parameters: Parameters,
+    rng: np.random.Generator,
+    truth: Callable[[], object] | None,
+) -> Strategy:
+    factory = _factory(spec)
+    if getattr(factory, "privileged", False) is not True:
+        return factory(parameters, rng)
+    if truth is None:
+        raise StrategyError(
+            f"strategy {spec!r} is privileged: it must be told where every object is, which only "
+            "a simulation in lockstep can; run it with tactile reach, experiment or benchmark, "
+            "and choose another for an arm"
+        )
+    return cast("PrivilegedFactory", factory)(parameters, rng, truth())
 
 
 def _guarded(spec: str, make: Callable[[], Strategy]) -> Strategy:

@@ -25,6 +25,7 @@ from sim_device.arm.arm import ArmSettings, SimulatedArm
 from sim_device.world.base import World
 from sim_device.world.mujoco_world import MujocoWorld
 from sim_device.world.scenes import Scene
+from sim_device.world.view import WorldView
 from tactile_core.types import ArmLimits, Instant, Twist, after, record
 from tactile_tools.reach.touch_senses import ContactSense, Sense, TaxelSense
 from tactiled.blocks import Cycle
@@ -105,7 +106,8 @@ def run_trial(
     world = MujocoWorld(scene) if world is None else world
     if sense is None:
         sense = ContactSense() if depth == "contacts" else TaxelSense(seed)
-    planner = load_strategy(strategy, parameters, np.random.default_rng([seed, 1]))
+    view = WorldView(world)
+    planner = load_strategy(strategy, parameters, np.random.default_rng([seed, 1]), lambda: view)
     now = sense.settle(world, BEGIN)
     arm: LockstepArm
     if make_arm is None:
