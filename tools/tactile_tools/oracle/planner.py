@@ -41,6 +41,9 @@ SPREAD: Final = np.array([0.5, 0.5, 0.25, 0.5, 0.5, 0.25, 0.4, 1.0, 0.25])
 LONGEST_S: Final = 1.0
 """s that a stroke may take."""
 
+NEAR_M: Final = 0.006
+"""m to the goal within which a travelling finger turns and weaves less and less."""
+
 EJECTED_S: Final = 10.0
 """s that an object pushed out costs."""
 
@@ -60,67 +63,14 @@ class Settings:
     parents: int = 6
     horizon_s: float = 2.4
     step_s: float = 0.05
-    ahead: float = 1.5
+    ahead: float = 1.2
+    clutter: float = 0.5
+    lost: float = 0.1
     force_n: float = 20.0
     force_s: float = 0.01
     free: float = 0.93
-
-
-def twists(
-    plans: FloatArray, at_s: float, finger: FloatArray, goal: tuple[float, float], p: Parameters
-) -> FloatArray:
-    """(k, 3) twist of the pivot, in ``cupboard``, that each plan wants ``at_s`` s after it began.
-
-    ``plans`` (k, 9); ``finger`` (k, 3 or more): x, y m and heading rad of the pivots. No plan asks
-    for more than v_max and omega_max of ``p``.
-    """
-    heading = finger[:, 2]
-    cos, sin = np.cos(heading), np.sin(heading)
-    ex = goal[0] - finger[:, 0] - p.tip_length * cos
-    ey = goal[1] - finger[:, 1] - p.tip_length * sin
-    bearing = np.arctan2(ey, ex)
-    first = at_s < plans[:, TIME_1]
-    second = ~first & (at_s < plans[:, TIME_1] + plans[:, TIME_2])
-    weave = np.arctan(plans[:, WEAVE] * np.sin(WEAVE_RATE * at_s + plans[:, PHASE]))
-    off = np.where(first, plans[:, ANGLE_1], np.where(second, plans[:, ANGLE_2], weave))
-    error = bearing + plans[:, LEAN] - heading
-    error = np.arctan2(np.sin(error), np.cos(error))
-    turn = np.where(
-        first,
-        plans[:, TURN_1] * p.omega_max,
-        np.where(second, plans[:, TURN_2] * p.omega_max, TURN_GAIN * error),
-    )
-    omega = np.clip(turn, -p.omega_max, p.omega_max)
-    return _of_pivot(bearing + off, np.full(len(plans), p.v_max), omega, cos, sin, p)
-
-
-def approach(finger: FloatArray, goal: tuple[float, float], dt: float, p: Parameters) -> FloatArray:
-    """(k, 3) straight at the goal, no farther than to it in ``dt`` s, without turning."""
-    cos, sin = np.cos(finger[:, 2]), np.sin(finger[:, 2])
-    ex = goal[0] - finger[:, 0] - p.tip_length * cos
-    ey = goal[1] - finger[:, 1] - p.tip_length * sin
-    speed = np.minimum(p.v_max, np.hypot(ex, ey) / dt)
-    return _of_pivot(np.arctan2(ey, ex), speed, np.zeros(len(finger)), cos, sin, p)
-
-
-def _of_pivot(
-    angle: FloatArray,
-    speed: FloatArray,
-    omega: FloatArray,
-    cos: FloatArray,
-    sin: FloatArray,
-    p: Parameters,
-) -> FloatArray:
-    """Twist of the pivot that moves the commanded point at ``speed`` towards ``angle``."""
-    vx, vy = speed * np.cos(angle), speed * np.sin(angle)
-    if p.commanded_point == "tip":
-        lever = p.tip_length * omega
-        vx, vy = vx + lever * sin, vy - lever * cos
-    return np.stack([vx, vy, omega], axis=1)
-
-
-NEAR_M: Final = 0.006
-"""m to the goal within which a travelling finger no longer turns or weaves."""
+    stuck: float = 0.3
+    escape_s: float = 4.0
 
 
 def wanted(
@@ -131,13 +81,33 @@ def wanted(
     dt: float,
     p: Parameters,
 ) -> FloatArray:
-    """(k, 3) `twists`, and near the goal `approach` where a plan travels; ``dt`` s are ahead."""
-    asked = twists(plans, at_s, finger, goal, p)
-    left = distance(finger, goal, p)
-    near = (left < NEAR_M) & (at_s >= plans[:, TIME_1] + plans[:, TIME_2])
-    if near.any():
-        asked = np.where(near[:, np.newaxis], approach(finger, goal, dt, p), asked)
-    return asked
+    """(k, 3) twist of the pivot, in ``cupboard``, that each plan wants ``at_s`` s after it began.
+
+    ``plans`` (k, 9); ``finger`` (k, 3 or more): x, y m and heading rad of the pivots. No plan asks
+    for more than v_max and omega_max of ``p``. Travel goes no farther than to the goal in the
+    ``dt`` s ahead, and turns and weaves less within `NEAR_M`.
+    """
+    heading = finger[:, 2]
+    cos, sin = np.cos(heading), np.sin(heading)
+    ex = goal[0] - finger[:, 0] - p.tip_length * cos
+    ey = goal[1] - finger[:, 1] - p.tip_length * sin
+    left, bearing = np.hypot(ex, ey), np.arctan2(ey, ex)
+    near = np.minimum(left / NEAR_M, 1.0)
+    first = at_s < plans[:, TIME_1]
+    second = ~first & (at_s < plans[:, TIME_1] + plans[:, TIME_2])
+    travels = ~(first | second)
+    weave = np.arctan(near * plans[:, WEAVE] * np.sin(WEAVE_RATE * at_s + plans[:, PHASE]))
+    angle = bearing + np.where(first, plans[:, ANGLE_1], np.where(second, plans[:, ANGLE_2], weave))
+    error = bearing + plans[:, LEAN] - heading
+    error = np.arctan2(np.sin(error), np.cos(error))
+    stroke = p.omega_max * np.where(first, plans[:, TURN_1], plans[:, TURN_2])
+    omega = np.where(travels, np.clip(TURN_GAIN * error, -p.omega_max, p.omega_max) * near, stroke)
+    speed = np.where(travels, np.minimum(p.v_max, left / dt), p.v_max)
+    vx, vy = speed * np.cos(angle), speed * np.sin(angle)
+    if p.commanded_point == "tip":
+        lever = p.tip_length * omega
+        vx, vy = vx + lever * sin, vy - lever * cos
+    return np.stack([vx, vy, omega], axis=1)
 
 
 def distance(finger: FloatArray, goal: tuple[float, float], p: Parameters) -> FloatArray:
@@ -172,6 +142,8 @@ class Search:
         self.settings = settings or Settings()
         self._p, self._rng, self._goal = p, rng, scene.goal
         self.worlds = Worlds([scene] * self.settings.candidates, world, threads=1)
+        self._half_width = world.finger_width / 2
+        self._radii = np.array([(each.size_x + each.size_y) / 4 for each in scene.objects])
         limits = p.safety.arm_limits
         self.worlds.limit_wrench(limits.f_max, limits.m_max)
 
@@ -179,17 +151,47 @@ class Search:
         """(9,) the plan to follow from ``state`` on; ``last``: what is left of the one before."""
         s = self.settings
         plans = self._first(last)
-        costs, gained = self.rollout(plans, state)
+        costs, gained = self.rollout(plans, state, s.horizon_s)
         if gained[0] >= s.free:
             return plans[0]
+        plans, costs, gained = self._evolved(plans, costs, gained, state, s.horizon_s)
+        if gained[0] < s.stuck:
+            plans = np.concatenate([plans[:2], self._escapes(len(plans) - 2)])
+            costs, gained = self.rollout(plans, state, s.escape_s)
+            plans, costs, gained = self._evolved(plans, costs, gained, state, s.escape_s)
+        return plans[0]
+
+    def _evolved(
+        self,
+        plans: FloatArray,
+        costs: FloatArray,
+        gained: FloatArray,
+        state: Snapshot,
+        horizon_s: float,
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The last of the further generations, cheapest first, with its costs and progress."""
+        s = self.settings
         for generation in range(1, s.generations):
             best = np.argsort(costs, kind="stable")[: s.parents]
-            parents, kept = plans[best], costs[best]
-            children = self._children(parents, SPREAD / generation)
-            found, _ = self.rollout(children, state)
-            plans, costs = np.concatenate([parents, children]), np.concatenate([kept, found])
-        chosen: FloatArray = plans[int(np.argmin(costs))]
-        return chosen
+            children = self._children(plans[best], SPREAD / generation)
+            found, more = self.rollout(children, state, horizon_s)
+            plans = np.concatenate([plans[best], children])
+            costs = np.concatenate([costs[best], found])
+            gained = np.concatenate([gained[best], more])
+        best = np.argsort(costs, kind="stable")[: s.candidates]
+        return plans[best], costs[best], gained[best]
+
+    def _escapes(self, k: int) -> FloatArray:
+        """Plans for a finger that is stuck: long strokes in all directions, then again the goal."""
+        rng = self._rng
+        plans = np.zeros((k, GENES))
+        plans[:, ANGLE_1] = rng.uniform(-math.pi, math.pi, k)
+        plans[:, TIME_1] = rng.uniform(0.3, LONGEST_S, k)
+        plans[:, ANGLE_2] = rng.uniform(-1.8, 1.8, k)
+        plans[:, TIME_2] = rng.uniform(0.3, LONGEST_S, k)
+        plans[:, [TURN_1, TURN_2]] = rng.uniform(-1.3, 1.3, (k, 2))
+        plans[:, LEAN] = np.where(rng.random(k) < 0.5, rng.uniform(-0.6, 0.6, k), 0.0)
+        return self._within(plans)
 
     def _first(self, last: FloatArray | None) -> FloatArray:
         """The first generation: straight, the last plan's rest and its like, and others."""
@@ -236,15 +238,17 @@ class Search:
         plans[:, LEAN] = np.clip(plans[:, LEAN], -1.0, 1.0)
         return plans
 
-    def rollout(self, plans: FloatArray, state: Snapshot) -> tuple[FloatArray, FloatArray]:
+    def rollout(
+        self, plans: FloatArray, state: Snapshot, horizon_s: float
+    ) -> tuple[FloatArray, FloatArray]:
         """Costs (k,) of ``plans`` from ``state``, s; and progress (k,) over that at v_max."""
         s, p, worlds, goal = self.settings, self._p, self.worlds, self._goal
         worlds.place(state)
         start = worlds.distance
         ejected = worlds.ejected
-        steps = round(s.horizon_s / s.step_s)
+        steps = round(horizon_s / s.step_s)
         arrived = np.full(len(plans), np.inf)
-        pressed = np.zeros(len(plans))
+        pressed, lost = np.zeros(len(plans)), np.zeros(len(plans))
         for index in range(steps):
             at = index * s.step_s
             asked = wanted(plans, at, worlds.finger, goal, s.step_s, p)
@@ -256,16 +260,33 @@ class Search:
             total = np.where(used, force, 0.0).sum(axis=1)
             going = ~np.isfinite(arrived)
             pressed += np.where(going, np.maximum(total - s.force_n, 0.0), 0.0) * s.step_s
+            lost += np.where(going, worlds.distance, 0.0) * s.step_s
             arrived[going & worlds.reached] = at + s.step_s
             if np.isfinite(arrived).all():
                 break
         left = worlds.distance
-        at_v_max = s.horizon_s * p.v_max
         cost = np.where(
-            np.isfinite(arrived), arrived, s.horizon_s + s.ahead * left / p.v_max
+            np.isfinite(arrived),
+            arrived,
+            horizon_s + (s.ahead * left + s.clutter * self._in_the_way()) / p.v_max,
         )
-        cost = cost + s.force_s * pressed + EJECTED_S * (worlds.ejected - ejected)
+        cost = cost + s.lost / p.v_max / horizon_s * lost + s.force_s * pressed + EJECTED_S * (worlds.ejected - ejected)
         cost[worlds.failed] = np.inf
-        gained = np.where(np.isfinite(arrived), 1.0, (start - left) / at_v_max)
+        gained = (start - left) / p.v_max / np.minimum(arrived, horizon_s)
         gained[(worlds.ejected > ejected) | worlds.failed] = -np.inf
         return cost, gained
+
+    def _in_the_way(self) -> FloatArray:
+        """(k,) m by which objects reach into the finger's way to the goal, summed over them."""
+        finger, poses, on = self.worlds.finger, self.worlds.poses(), self.worlds.on_shelf()
+        p, goal = self._p, np.array(self._goal)
+        heading = finger[:, 2]
+        tip = finger[:, :2] + p.tip_length * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        way = goal - tip
+        length = np.maximum(np.hypot(way[:, 0], way[:, 1]), 1e-9)
+        along = (way / length[:, np.newaxis])[:, np.newaxis]
+        off = poses[:, :, :2] - tip[:, np.newaxis]
+        reach = np.clip((off * along).sum(axis=2), 0.0, length[:, np.newaxis])
+        gap = np.linalg.norm(off - reach[:, :, np.newaxis] * along, axis=2)
+        into = np.maximum(self._half_width + self._radii - gap, 0.0)
+        return np.asarray(np.where(on, into, 0.0).sum(axis=1), np.float64)
