@@ -51,7 +51,8 @@ class Snapshot:
 
     ``finger`` (6,): pivot's x, y m, heading rad, vx, vy m/s, omega rad/s in ``cupboard``.
     ``wrench`` (3,): N, N, N·m that contacts exert on it. ``poses`` (n, 3): x, y m and yaw rad of
-    the objects; ``speeds`` (n, 3): m/s, m/s, rad/s. ``standing`` (n,): whether each is on the shelf.
+    the objects; ``speeds`` (n, 3): m/s, m/s, rad/s. ``standing`` (n,): whether each is on
+    the shelf.
     """
 
     finger: FloatArray

@@ -104,7 +104,7 @@ def benchmark_study(options: Options, strategy: str, limits_s: Sequence[float] =
     Case by case over the scenes, so that what was stopped early has some of each.
     """
     specs = [
-        _spec(name, engine, depth, limit, index, strategy, options.parameters)
+        _spec(name, engine, depth, limit, _seed(name, index), strategy, options.parameters)
         for index in range(options.scenes)
         for name in options.sets
         if name != "recorded" or index <= LAST_RECORDED - FIRST_RECORDED
@@ -127,17 +127,20 @@ def benchmark_study(options: Options, strategy: str, limits_s: Sequence[float] =
     return Study(definition, tuple(dict.fromkeys(specs)))
 
 
+def _seed(name: str, index: int) -> int:
+    return index + (FIRST_RECORDED if name == "recorded" else FIRST_SEED)
+
+
 def _spec(
     name: str,
     engine: str,
     depth: str,
     limit: float,
-    index: int,
+    seed: int,
     strategy: str,
     changed: Mapping[str, Any],
 ) -> TrialSpec:
     scenes = SCENE_SETS[name]
-    seed = index + (FIRST_RECORDED if name == "recorded" else FIRST_SEED)
     own = parameters(scenes.parameters).time_limit
     timed = {} if limit == own else {"time_limit": limit}
     return TrialSpec(
@@ -151,6 +154,54 @@ def _spec(
         parameters=canonical({**changed, **timed}),
         conditions=scenes.conditions.to_json(),
     )
+
+
+PRIVILEGED = "tactile_tools.oracle:PrivilegedPlanner"
+"""The strategy that sees every object: the ceiling of a scene set."""
+
+
+def oracle_study(options: Options) -> Study:
+    """`PRIVILEGED` in scenes of each set (names of `SCENE_SETS`) and engine, in the set's time."""
+    specs = [
+        _oracle_spec(name, engine, seed, options.parameters)
+        for seed in range(options.seed, options.seed + options.scenes)
+        for name in options.sets
+        for engine in options.engines
+    ]
+    definition = {
+        "study": "oracle",
+        "scenes": options.scenes,
+        "seed": options.seed,
+        "sets": list(options.sets),
+        "engines": list(options.engines),
+        "depths": ["contacts"],
+        "source": None,
+        "parameters": dict(options.parameters),
+    }
+    return Study(definition, tuple(dict.fromkeys(specs)))
+
+
+def _oracle_spec(name: str, engine: str, seed: int, changed: Mapping[str, Any]) -> TrialSpec:
+    limit = parameters(SCENE_SETS[name].parameters, changed).time_limit
+    return _spec(name, engine, "contacts", limit, seed, PRIVILEGED, changed)
+
+
+def oracle_summaries(study: Study, rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """`summary_of` the rows that are there, for each set and engine of an oracle's study."""
+    d = study.definition
+    by_spec = {spec_of(row): row for row in rows}
+    summaries = []
+    for name in d["sets"]:
+        for engine in d["engines"]:
+            specs = [
+                _oracle_spec(name, engine, seed, d["parameters"])
+                for seed in range(d["seed"], d["seed"] + d["scenes"])
+            ]
+            if found := [by_spec[spec] for spec in specs if spec in by_spec]:
+                limit = specs[0].resolved().time_limit
+                case = {"set": name, "engine": engine, "depth": "contacts", "limit_s": limit}
+                summaries.append(case | summary_of(found))
+    return summaries
 
 
 # Entries: what came out, by case.
@@ -170,8 +221,16 @@ def entry_of(study: Study, rows: Sequence[Row], name: str, note: str) -> dict[st
             for depth in d["depths"]:
                 for limit in d["limits"]:
                     specs = [
-                        _spec(scenes, engine, depth, limit, i, d["strategies"][0], d["parameters"])
-                        for i in range(_scenes_in(scenes, d["scenes"]))
+                        _spec(
+                            scenes,
+                            engine,
+                            depth,
+                            limit,
+                            _seed(scenes, index),
+                            d["strategies"][0],
+                            d["parameters"],
+                        )
+                        for index in range(_scenes_in(scenes, d["scenes"]))
                     ]
                     found = [by_spec[spec] for spec in specs if spec in by_spec]
                     if found:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sim_device.world.engines import ENGINES
@@ -29,8 +29,10 @@ AXIS_NAMES = (
 """Names of `axes`, which takes half a second to import; a test checks that they are equal."""
 
 SCENE_SET_NAMES = ("squeezed", "dense", "high_friction", "narrow", "hardware", "recorded")
+ORACLE_SETS = SCENE_SET_NAMES[:-1]
 LIMITS_S = (20.0, 40.0)
-"""As in `benchmark`, likewise."""
+FIRST_SEED = 700_000
+"""As in `benchmark`, likewise; the oracle makes its own scenes."""
 
 HERE = "tactile_tools.experiments.cli"
 
@@ -39,6 +41,9 @@ COMMANDS = {
     "sweep": Command("the paper's 10 × 10 grids of a primitive's parameters", f"{HERE}:_sweep"),
     "robustness": Command(
         "every strategy while one condition at a time is varied", f"{HERE}:_robustness"
+    ),
+    "oracle": Command(
+        "the ceiling of scene sets: a planner that sees every object", f"{HERE}:_oracle"
     ),
     "compare": Command("two runs side by side, trial by trial where paired", f"{HERE}:_compare"),
     "report": Command("report.html and PNGs of a run", f"{HERE}:_report"),
@@ -50,6 +55,7 @@ examples:
   tactile experiment strategies --scenes 300 --set authors_sim --out runs/strategies
   tactile experiment sweep --scenes 50 --primitive burrow --out runs/sweep
   tactile experiment robustness --scenes 30 --axis density width --out runs/robustness
+  tactile experiment oracle --scenes 20 --set squeezed dense --scene-seed 710000
   tactile experiment report runs/strategies
   tactile experiment compare runs/contacts runs/taxels
   tactile experiment trial --scene-seed 12 --strategy hybrid_event --log t.mcap --png t.png
@@ -119,6 +125,15 @@ def _robustness(parser: Parser) -> None:
         metavar="AXIS",
     )
     parser.set_defaults(func=_work("robustness"))
+
+
+def _oracle(parser: Parser) -> None:
+    parser.description = (
+        "The ceiling of scene sets: a privileged planner, which sees every object and tries its "
+        "motions out in copies of the cupboard. In simulation only."
+    )
+    _study_options(parser, scenes=20, sets=ORACLE_SETS)
+    parser.set_defaults(func=_work("oracle"))
 
 
 def _compare(parser: Parser) -> None:
@@ -255,24 +270,29 @@ def fill_benchmark(parser: Parser) -> None:
     parser.set_defaults(func=_work("benchmark"))
 
 
-def _study_options(parser: Parser, *, scenes: int) -> None:
+def _study_options(parser: Parser, *, scenes: int, sets: Sequence[str] = ()) -> None:
+    """Options of a study; with ``sets`` over scene sets of the benchmark instead of any source."""
     parser.former(seed="scene-seed")
     parser.add_argument(
         "--scenes", type=count, default=scenes, metavar="N", help=f"how many (default {scenes})"
     )
+    first = FIRST_SEED if sets else 0
     parser.add_argument(
         "--scene-seed",
         type=seed,
-        default=0,
+        default=first,
         metavar="N",
-        help="of the first scene; the others follow (default 0)",
+        help=f"of the first scene; the others follow (default {first})",
     )
     parser.add_argument(
         "--set",
         nargs="+",
         action="extend",
+        choices=sets or None,
         metavar="SET",
-        help="parameter sets: authors_sim (default), hardware, or both",
+        help=f"scene sets: {', '.join(sets)} (default {sets[0]})"
+        if sets
+        else "parameter sets: authors_sim (default), hardware, or both",
     )
     parser.add_argument(
         "--engine",
@@ -281,19 +301,20 @@ def _study_options(parser: Parser, *, scenes: int) -> None:
         choices=ENGINES,
         help=f"physics engines (default {ENGINES[0]})",
     )
-    parser.add_argument(
-        "--depth",
-        nargs="+",
-        action="extend",
-        choices=("contacts", "taxels"),
-        help="what is felt: the engine's contacts (default), or the whole chain of taxels",
-    )
-    parser.add_argument(
-        "--source",
-        metavar="SCENE",
-        help="scenes of another generator, authors_sim_recorded or recorded:FILE "
-        "(default: the set's)",
-    )
+    if not sets:
+        parser.add_argument(
+            "--depth",
+            nargs="+",
+            action="extend",
+            choices=("contacts", "taxels"),
+            help="what is felt: the engine's contacts (default), or the whole chain of taxels",
+        )
+        parser.add_argument(
+            "--source",
+            metavar="SCENE",
+            help="scenes of another generator, authors_sim_recorded or recorded:FILE "
+            "(default: the set's)",
+        )
     _param_option(parser)
     where = parser.add_mutually_exclusive_group()
     cores = os.cpu_count() or 1

@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -251,6 +251,30 @@ def benchmark(options: argparse.Namespace) -> int:
     return code
 
 
+@_as_command
+def oracle(options: argparse.Namespace) -> int:
+    """``tactile experiment oracle``."""
+    from tactile_tools.experiments import benchmark as board
+
+    require("numba", extra="train", what="the privileged planner")
+    study = board.oracle_study(
+        Options(
+            scenes=options.scenes,
+            seed=options.scene_seed,
+            sets=tuple(dict.fromkeys(options.set or ("squeezed",))),
+            engines=tuple(dict.fromkeys(options.engine or ENGINES[:1])),
+            depths=DEPTHS,
+            source=None,
+            parameters=named_values("--param", options.param),
+        )
+    )
+    options.out = options.out or Path("runs") / "oracle"
+    code = _study(study, options, "oracle")
+    if code != STOPPED:
+        _show_cases(board.oracle_summaries(study, load_run(options.out).rows))
+    return code
+
+
 def _look_here(strategy: str) -> None:
     """Let a strategy module:Class lie in the current folder, here and in the workers."""
     here = os.getcwd()
@@ -260,6 +284,12 @@ def _look_here(strategy: str) -> None:
 
 def _show_entry(entry: dict[str, Any]) -> None:
     """Print an entry, a line a case."""
+    print(entry["name"])
+    _show_cases(entry["cases"])
+
+
+def _show_cases(cases: Sequence[Mapping[str, Any]]) -> None:
+    """Print a line a case."""
     form = "{:13} {:7} {:8} {:>5} {:>17} {:>6} {:>13} {:>4} {:>5}"
     heads = (
         "set",
@@ -272,9 +302,8 @@ def _show_entry(entry: dict[str, Any]) -> None:
         "out",
         "CPU",
     )
-    print(entry["name"])
-    print(form.format(*heads, "CPU"))
-    for case in entry["cases"]:
+    print(form.format(*heads))
+    for case in cases:
         cells = [f"{case['errors']} errors", "", "", "", ""]
         if "success" in case:
             force = case["peak_contact_n"]

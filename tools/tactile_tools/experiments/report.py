@@ -67,6 +67,11 @@ def build(run: Run) -> Document:
         "sweep": sweep_sections,
         "robustness": robustness_sections,
     }
+    if run.kind not in makers:
+        raise TableError(
+            f"{run.directory} is a run of the study {run.kind!r}, which has no report: its command "
+            "prints what came out; given again, it runs nothing that is finished"
+        )
     sections = makers[run.kind](run)
     if failures := _failures(run):
         sections.append(failures)

@@ -8,7 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sim_device.world.engines import world_maker
+from sim_device.world.engines import make_world, world_maker
+from sim_device.world.parameters import world_parameters
+from sim_device.world.scenes import Pose, Scene
+from sim_device.world.view import WorldView
 from tactile_tools.experiments.backends import Backend
 from tactile_tools.experiments.conditions import build_scene, parameters_of
 from tactile_tools.experiments.journal import Journal, disk_error
@@ -45,7 +48,9 @@ def check(study: Study) -> None:
             (("parameters", spec.set, spec.parameters, spec.conditions), parameters_of),
             (
                 ("strategy", spec.strategy, spec.set),
-                lambda s: load_strategy(s.strategy, s.resolved(), np.random.default_rng(0)),
+                lambda s: load_strategy(
+                    s.strategy, s.resolved(), np.random.default_rng(0), lambda: _empty_view(s)
+                ),
             ),
             (("depth", spec.depth), lambda s: s.typed_depth),
             (("source", spec.source), _check_source),
@@ -55,6 +60,14 @@ def check(study: Study) -> None:
             if key not in seen:
                 seen.add(key)
                 examine(spec)
+
+
+def _empty_view(spec: TrialSpec) -> WorldView:
+    """A world without objects for a privileged strategy that is only to be loaded."""
+    start = Pose(-0.2, 0.0, 0.0)
+    figures = world_parameters(spec.set)
+    scene = Scene("empty", spec.set, 0, figures.depth, figures.width, start, (0.3, 0.0), ())
+    return WorldView(make_world(spec.engine, scene))
 
 
 def _check_source(spec: TrialSpec) -> None:

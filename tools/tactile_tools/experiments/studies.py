@@ -202,6 +202,10 @@ def rebuild(directory: Path, definition: Mapping[str, Any]) -> tuple[Study, Opti
 
                 limits = tuple(definition["limits"])
                 study = benchmark_study(options, definition["strategies"][0], limits)
+            case "oracle":
+                from tactile_tools.experiments.benchmark import oracle_study
+
+                study = oracle_study(options)
             case other:
                 raise FolderError(f"{directory} is a study {other!r}, which this version lacks")
     except (KeyError, TypeError, ValueError) as error:

@@ -21,7 +21,6 @@ from sim_device.world.parameters import WorldParameters
 from sim_device.world.planar_worlds import Snapshot, Worlds
 from sim_device.world.scenes import Scene
 from tactile_core.arrays import FloatArray
-from tactile_core.geometry import TIP_X
 
 ANGLE_1, TURN_1, TIME_1, ANGLE_2, TURN_2, TIME_2, WEAVE, PHASE, LEAN = range(9)
 """Columns of a plan: strokes (rad off the goal's direction, part of omega_max, s); travel: sideways
@@ -50,12 +49,18 @@ EJECTED_S: Final = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How hard to search. ``horizon_s``: of a rollout; ``step_s``: for which a twist is held in it.
+    """How hard to search, and what counts.
 
-    ``candidates`` plans in each of ``generations``, of which ``parents`` are kept. ``ahead``:
-    seconds that a metre left at the end counts, over those at v_max. ``force_s``: s that a newton
-    above ``force_n`` (N, summed normal forces) costs for each second. ``free``: part of the
-    progress at v_max from which travelling straight is good enough to need no search.
+    ``candidates`` plans in each of ``generations``, of which ``parents`` are kept, are rolled out
+    for ``horizon_s`` with a new twist each ``step_s``. Where none of the first makes more than
+    ``stuck`` of the progress at v_max, other plans are tried for ``escape_s``. A plan is followed
+    for ``follow_s`` or ``follow_escape_s``. If straight makes ``free`` of the progress at v_max,
+    there is nothing to search.
+
+    Cost, s: time of arrival; for those that do not arrive the horizon, ``ahead`` × the time for
+    what is left at v_max, and ``clutter`` × the time for the sum of what objects reach into the
+    way; ``lost`` × the mean distance at v_max; ``force_s`` a N·s above ``force_n`` (sum of normal
+    forces); `EJECTED_S` an object pushed out.
     """
 
     candidates: int = 40
@@ -71,6 +76,8 @@ class Settings:
     free: float = 0.93
     stuck: float = 0.3
     escape_s: float = 4.0
+    follow_s: float = 0.4
+    follow_escape_s: float = 0.8
 
 
 def wanted(
@@ -145,41 +152,43 @@ class Search:
         self._half_width = world.finger_width / 2
         self._radii = np.array([(each.size_x + each.size_y) / 4 for each in scene.objects])
         limits = p.safety.arm_limits
-        self.worlds.limit_wrench(limits.f_max, limits.m_max)
+        self._one = Worlds([scene], world, threads=1)
+        for worlds in (self.worlds, self._one):
+            worlds.limit_wrench(limits.f_max, limits.m_max)
 
-    def plan(self, state: Snapshot, last: FloatArray | None) -> FloatArray:
-        """(9,) the plan to follow from ``state`` on; ``last``: what is left of the one before."""
+    def plan(self, state: Snapshot, last: FloatArray | None) -> tuple[FloatArray, float]:
+        """(9,) the plan to follow from ``state`` on, and for how long, s.
+
+        ``last``: what is left of the one before.
+        """
         s = self.settings
+        straight = np.zeros((1, GENES))
+        _, free = self.rollout(straight, state, s.horizon_s)
+        if free[0] >= s.free:
+            return np.zeros(GENES), s.follow_s
         plans = self._first(last)
         costs, gained = self.rollout(plans, state, s.horizon_s)
-        if gained[0] >= s.free:
-            return plans[0]
-        plans, costs, gained = self._evolved(plans, costs, gained, state, s.horizon_s)
-        if gained[0] < s.stuck:
-            plans = np.concatenate([plans[:2], self._escapes(len(plans) - 2)])
-            costs, gained = self.rollout(plans, state, s.escape_s)
-            plans, costs, gained = self._evolved(plans, costs, gained, state, s.escape_s)
-        return plans[0]
+        if gained[np.argmin(costs)] >= s.stuck:
+            plans = self._evolved(plans, costs, state, s.horizon_s)
+            return np.array(plans[0]), s.follow_s
+        best = np.argsort(costs, kind="stable")[:4]
+        plans = np.concatenate([plans[best], self._escapes(len(plans) - len(best))])
+        costs, _ = self.rollout(plans, state, s.escape_s)
+        plans = self._evolved(plans, costs, state, s.escape_s)
+        return np.array(plans[0]), s.follow_escape_s
 
     def _evolved(
-        self,
-        plans: FloatArray,
-        costs: FloatArray,
-        gained: FloatArray,
-        state: Snapshot,
-        horizon_s: float,
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The last of the further generations, cheapest first, with its costs and progress."""
+        self, plans: FloatArray, costs: FloatArray, state: Snapshot, horizon_s: float
+    ) -> FloatArray:
+        """The last of the further generations, cheapest first."""
         s = self.settings
         for generation in range(1, s.generations):
             best = np.argsort(costs, kind="stable")[: s.parents]
             children = self._children(plans[best], SPREAD / generation)
-            found, more = self.rollout(children, state, horizon_s)
+            found, _ = self.rollout(children, state, horizon_s)
             plans = np.concatenate([plans[best], children])
             costs = np.concatenate([costs[best], found])
-            gained = np.concatenate([gained[best], more])
-        best = np.argsort(costs, kind="stable")[: s.candidates]
-        return plans[best], costs[best], gained[best]
+        return np.asarray(plans[np.argsort(costs, kind="stable")], np.float64)
 
     def _escapes(self, k: int) -> FloatArray:
         """Plans for a finger that is stuck: long strokes in all directions, then again the goal."""
@@ -242,7 +251,8 @@ class Search:
         self, plans: FloatArray, state: Snapshot, horizon_s: float
     ) -> tuple[FloatArray, FloatArray]:
         """Costs (k,) of ``plans`` from ``state``, s; and progress (k,) over that at v_max."""
-        s, p, worlds, goal = self.settings, self._p, self.worlds, self._goal
+        s, p, goal = self.settings, self._p, self._goal
+        worlds = self._one if len(plans) == 1 else self.worlds
         worlds.place(state)
         start = worlds.distance
         ejected = worlds.ejected
@@ -268,17 +278,22 @@ class Search:
         cost = np.where(
             np.isfinite(arrived),
             arrived,
-            horizon_s + (s.ahead * left + s.clutter * self._in_the_way()) / p.v_max,
+            horizon_s + (s.ahead * left + s.clutter * self._in_the_way(worlds)) / p.v_max,
         )
-        cost = cost + s.lost / p.v_max / horizon_s * lost + s.force_s * pressed + EJECTED_S * (worlds.ejected - ejected)
+        cost = (
+            cost
+            + s.lost / p.v_max / horizon_s * lost
+            + s.force_s * pressed
+            + EJECTED_S * (worlds.ejected - ejected)
+        )
         cost[worlds.failed] = np.inf
         gained = (start - left) / p.v_max / np.minimum(arrived, horizon_s)
         gained[(worlds.ejected > ejected) | worlds.failed] = -np.inf
         return cost, gained
 
-    def _in_the_way(self) -> FloatArray:
+    def _in_the_way(self, worlds: Worlds) -> FloatArray:
         """(k,) m by which objects reach into the finger's way to the goal, summed over them."""
-        finger, poses, on = self.worlds.finger, self.worlds.poses(), self.worlds.on_shelf()
+        finger, poses, on = worlds.finger, worlds.poses(), worlds.on_shelf()
         p, goal = self._p, np.array(self._goal)
         heading = finger[:, 2]
         tip = finger[:, :2] + p.tip_length * np.stack([np.cos(heading), np.sin(heading)], axis=1)

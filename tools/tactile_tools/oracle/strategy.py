@@ -12,9 +12,6 @@ from tactile_core.arrays import FloatArray
 from tactile_core.types import NS_PER_S, Instant
 from tactile_tools.oracle.planner import Search, Settings, shifted, wanted
 
-PLAN_EVERY_S = 0.4
-"""s of a plan that are carried out before the next."""
-
 
 class PrivilegedPlanner:
     """Sees all objects of ``view`` and carries out the best of many motions tried in copies of it.
@@ -43,6 +40,7 @@ class PrivilegedPlanner:
         self._search = Search(view.scene, view.parameters, self._p, self._rng, self._settings)
         self._began = now
         self._plan: FloatArray | None = None
+        self._follow_s = 0.0
         self._before = view.poses()
         self._before_at = now
 
@@ -53,31 +51,32 @@ class PrivilegedPlanner:
             raise RuntimeError("a reach was not begun: call start first")
         period_s = self._p.safety.period
         at_s = (now - self._began) / NS_PER_S
-        if self._plan is None or at_s >= PLAN_EVERY_S - 1e-9:
+        if self._plan is None or at_s >= self._follow_s - 1e-9:
             rest = None if self._plan is None else shifted(self._plan, at_s)
-            self._plan = self._search.plan(self._state(now), rest)
+            self._plan, self._follow_s = self._search.plan(self._state(now), rest)
             self._began, at_s = now, 0.0
-        elif at_s >= PLAN_EVERY_S - 1.5 * period_s:
+        elif at_s >= self._follow_s - 1.5 * period_s:
             self._before, self._before_at = self._view.poses(), now
         finger = np.array([[arm.x, arm.y, arm.heading]])
-        twist = wanted(
-            self._plan[np.newaxis], at_s, finger, (goal.x, goal.y), period_s, self._p
-        )[0]
+        twist = wanted(self._plan[np.newaxis], at_s, finger, (goal.x, goal.y), period_s, self._p)[0]
         return Twist(*twist.tolist())
 
     def _state(self, now: Instant) -> Snapshot:
         """The true state; the objects' speeds from their last two poses."""
-        poses, finger = self._view.poses(), self._view.finger()
         passed_s = (now - self._before_at) / NS_PER_S
-        speeds = (poses - self._before) / passed_s if passed_s > 0 else np.zeros_like(poses)
-        return Snapshot(
-            finger=np.array([finger.x, finger.y, finger.heading, *_three(finger.twist)]),
-            wrench=np.array([finger.fx, finger.fy, finger.mz]),
-            poses=poses,
-            speeds=speeds,
-            standing=self._view.on_shelf(),
-        )
+        moved = self._view.poses() - self._before
+        return snapshot(self._view, moved / passed_s if passed_s > 0 else np.zeros_like(moved))
 
 
-def _three(twist: Twist) -> tuple[float, float, float]:
-    return twist.vx, twist.vy, twist.omega
+def snapshot(view: WorldView, speeds: FloatArray) -> Snapshot:
+    """State of the world behind ``view``, its objects moving at ``speeds`` (n, 3), m/s and
+    rad/s."""
+    finger = view.finger()
+    twist = finger.twist
+    return Snapshot(
+        finger=np.array([finger.x, finger.y, finger.heading, twist.vx, twist.vy, twist.omega]),
+        wrench=np.array([finger.fx, finger.fy, finger.mz]),
+        poses=view.poses(),
+        speeds=speeds,
+        standing=view.on_shelf(),
+    )

@@ -58,6 +58,7 @@ def _run(options: argparse.Namespace) -> int:
     from reachd.strategies.parameters import parameters as parameter_set
     from sim_device.world.engines import make_world
     from sim_device.world.scene_loading import load_scene
+    from sim_device.world.view import WorldView
     from tactile_tools.reach.lockstep import run_trial
     from tactile_tools.reach.trial_log import TrialLog
 
@@ -70,8 +71,8 @@ def _run(options: argparse.Namespace) -> int:
     scene = load_scene(options.scene, scene_seed)
     parameters = parameter_set(options.set or scene.parameters)
     # Before a log is begun: a strategy that cannot be loaded must not leave a log behind.
-    load_strategy(options.strategy, parameters, np.random.default_rng(0))
     world = make_world(options.engine, scene)
+    load_strategy(options.strategy, parameters, np.random.default_rng(0), lambda: WorldView(world))
     trial = partial(
         run_trial, scene, options.strategy, parameters, seed, depth=options.depth, world=world
     )
