@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from typing import cast
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -25,6 +25,8 @@ from tactile_core.types import Instant, record
 
 GROUP = "tactile_reach.strategies"
 """Entry-point group of the strategies of installed packages."""
+
+T = TypeVar("T")
 
 Factory = Callable[[Parameters, np.random.Generator], Strategy]
 
@@ -71,6 +73,11 @@ def load_strategy(
             f"strategy {spec!r} has no {' and no '.join(missing)}; docs/strategies.md shows one"
         )
     return strategy
+
+
+def is_privileged(spec: str) -> bool:
+    """Whether ``spec`` must be told the truth of a simulated world; StrategyError."""
+    return getattr(_guarded(spec, lambda: _factory(spec)), "privileged", False) is True
 
 
 @record
@@ -148,7 +155,7 @@ def _made(
     return cast("PrivilegedFactory", factory)(parameters, rng, truth())
 
 
-def _guarded(spec: str, make: Callable[[], Strategy]) -> Strategy:
+def _guarded(spec: str, make: Callable[[], T]) -> T:
     """Call ``make``; whatever it raises becomes a StrategyError."""
     try:
         return make()

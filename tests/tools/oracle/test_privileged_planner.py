@@ -210,3 +210,16 @@ def test_study_writes_rows_that_can_be_run_again(
     code, _, error = run(capsys, "report", "runs/oracle")
     assert code == 2
     assert "has no report" in error
+
+
+def test_benchmark_wants_it_named_for_what_it_is(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    words = ("benchmark", PRIVILEGED, "--name", "best of all", "--out", str(tmp_path / "run"))
+    try:
+        code = main([*words, "--sets", "hardware"])
+    except SystemExit as stop:
+        code = int(stop.code or 0)
+    assert code == 2
+    assert "must contain 'privileged'" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

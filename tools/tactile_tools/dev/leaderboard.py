@@ -64,7 +64,8 @@ write the same `--entry`: it grows by their cases. Send the JSON as a pull reque
 2. **Judge once.** Run the final version on all 100 scenes of a set. If you look at the result and
    then change the strategy, say in the note how often.
 3. **Touch and arm only.** A strategy sees what `step` is given ([strategies](strategies.md)). One
-   that is told where the objects are is welcome as a ceiling, with "privileged" in its name.
+   that is told where the objects are (`privileged = True`, see [the ceiling](ceiling.md)) is
+   welcome, too: `tactile benchmark` wants "privileged" in its name.
 4. **Report** in the note where the code is, and what it was tuned or trained on and how much that
    took (scenes, CPU or GPU hours). `--param` records what differs from a parameter set.
 5. **Repeatable.** Whoever runs the command of an entry with its version gets the same rows,

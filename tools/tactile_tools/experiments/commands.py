@@ -211,6 +211,7 @@ def _print_summary(
 @_as_command
 def benchmark(options: argparse.Namespace) -> int:
     """``tactile benchmark``."""
+    from reachd.strategies.runner import is_privileged
     from tactile_tools.experiments import benchmark as board
 
     _look_here(options.strategy)
@@ -233,6 +234,11 @@ def benchmark(options: argparse.Namespace) -> int:
     limits = tuple(sorted(dict.fromkeys(options.limit or board.LIMITS_S)))
     study = board.benchmark_study(common, options.strategy, limits)
     name = options.name or options.strategy
+    if is_privileged(options.strategy) and "privileged" not in name.lower():
+        raise ValueError(
+            f"--name {name!r}: strategy {options.strategy!r} is told where the objects are, so its "
+            "name on the leaderboard must contain 'privileged'"
+        )
     options.out = options.out or Path("runs") / f"benchmark-{slug(name)}"
     options.dask = None
     code = _study(study, options, "benchmark")
