@@ -106,6 +106,13 @@ def test_command_trains_and_names_what_it_made(
         main(["train", "--minutes", "0"])
 
 
+def test_missing_gpu_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(RunError, match="no GPU"):
+        Run(tmp_path / "run", SMALL, "cuda", 1, lambda _: None)
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("name", ["checkpoint.pt", "scenes.jsonl.gz"])
 def test_spoilt_file_of_a_run_is_named(name: str, tmp_path: Path) -> None:
     Run(tmp_path, SMALL, "cpu", 1, lambda _: None)

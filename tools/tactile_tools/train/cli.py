@@ -45,7 +45,7 @@ def fill(parser: Parser) -> None:
         "--device",
         choices=DEVICES,
         default="cpu",
-        help="where the network and, with cuda, the cupboards are computed (default %(default)s)",
+        help="what computes the network (default %(default)s); cupboards run on the threads of --jobs",
     )
     cores = os.cpu_count() or 1
     parser.add_argument(

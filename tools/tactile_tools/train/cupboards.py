@@ -1,8 +1,7 @@
 """Many reaches at once in the planar engine: what a strategy is trained in.
 
 One decision holds for ten control cycles, which are compiled with the physics: quick sweep and the
-residual on it choose a twist, the world moves, the skin feels. The functions are plain, so that
-they are compiled for the CPU here and for a GPU by `cupboards_cuda`.
+residual on it choose a twist, the world moves, the skin feels.
 """
 
 from __future__ import annotations

@@ -102,6 +102,11 @@ class Run:
     ) -> None:
         self.folder, self.settings, self._say = folder, settings, say
         self._threads = threads
+        if device == "cuda" and not torch.cuda.is_available():
+            raise RunError(
+                "no GPU that PyTorch can use was found: leave out --device cuda, or install its "
+                "driver and a build of PyTorch for it"
+            )
         folder.mkdir(parents=True, exist_ok=True)
         self._keep_settings()
         self.learner = Learner(settings.learning, device, settings.seed)

@@ -129,7 +129,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     seed: Annotated[int, Meta(ge=0, le=2**62, description="seed of everything drawn")] = 0
     worlds: Annotated[
         Count,
-        Meta(le=200_000, description="reaches side by side; 16384 and more on a GPU"),
+        Meta(le=200_000, description="reaches side by side"),
         allowed_values("a whole number from 1 to 200000"),
     ] = 1024
     judge_every: Annotated[Count, Meta(description="batches between two judgements")] = 60
