@@ -45,7 +45,7 @@ def fill(parser: Parser) -> None:
         "--device",
         choices=DEVICES,
         default="cpu",
-        help="what computes the network (default %(default)s); cupboards run on the threads of --jobs",
+        help="what computes the network (default %(default)s); cupboards run on --jobs threads",
     )
     cores = os.cpu_count() or 1
     parser.add_argument(
