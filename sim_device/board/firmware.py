@@ -112,7 +112,10 @@ MIN_RATE_MHZ = 100
 
 
 class Registers:
-    """Present settings of the chips behind ``skin``; `restore` brings back those of a boot."""
+    """Present settings of the chips behind ``skin``; `restore` brings back those of a boot.
+
+    ``conversion_time``: of the slowest array, s.
+    """
 
     def __init__(self, skin: SkinModel, rate: float) -> None:
         """``rate``: Hz after a boot; ValueError if the chips cannot reach it."""
@@ -127,7 +130,7 @@ class Registers:
         """Set everything as after a boot."""
         skin = self._skin
         self.rate_mhz = self._boot_rate_mhz
-        self._settings = [skin.parameters.chip.setting] * len(skin.geometry.arrays)
+        self._use([skin.parameters.chip.setting] * len(skin.geometry.arrays))
         skin.chips.configure(slice(None), skin.parameters.chip.setting)
 
     @property
@@ -135,10 +138,9 @@ class Registers:
         """Highest rate of the slowest array, mHz."""
         return _max_rate_mhz(self._settings)
 
-    @property
-    def conversion_time(self) -> float:
-        """Time of one conversion of the slowest array, s."""
-        return max(s.conversion_time for s in self._settings)
+    def _use(self, settings: list[ChipSetting]) -> None:
+        self._settings = settings
+        self.conversion_time = max(s.conversion_time for s in settings)
 
     def set_rate(self, rate_mhz: int) -> AckResult:
         """Set the rate, mHz; refused outside `MIN_RATE_MHZ` to `max_rate_mhz`."""
@@ -166,7 +168,7 @@ class Registers:
         settings = [setting if i in chosen else s for i, s in enumerate(self._settings)]
         if self.rate_mhz > _max_rate_mhz(settings):
             return AckResult.BAD_ARGUMENT
-        self._settings = settings
+        self._use(settings)
         for i in chosen:
             self._skin.chips.configure(slices[i], setting)
         return AckResult.OK

@@ -260,6 +260,8 @@ class SerialWire(_Wire[bytes]):
         return first[:head] + second[tail:]
 
     def _arrives(self, frame: bytes, originals: tuple[bytes, ...]) -> bool:
+        if frame is originals[0] and not self._unfinished:
+            return True
         if not self._delimited:
             return frame in originals
         segments = frame.split(b"\0")

@@ -197,6 +197,16 @@ class SkinChanges:
     def surround(self, seconds: float, surroundings: Surroundings) -> Surroundings:
         """Set the magnets as at ``seconds`` s after power-on and return the surroundings then."""
         plan = self._plan
+        if plan.newskin or self._loose or plan.skinoff:
+            self._set_magnets(seconds)
+        leap = sum(size for size, window in plan.leap if window.covers(seconds))
+        if not leap:
+            return surroundings
+        field = surroundings.world_field_ut + leap * LEAP_DIRECTION
+        return replace(surroundings, world_field_ut=field)
+
+    def _set_magnets(self, seconds: float) -> None:
+        plan = self._plan
         scale = np.ones(len(self._scale))
         if any(window.covers(seconds) for window in plan.newskin):
             scale = self._other.copy()
@@ -208,11 +218,6 @@ class SkinChanges:
         if not np.array_equal(scale, self._scale):
             self._scale = scale
             self._skin.magnets.scale(scale)
-        leap = sum(size for size, window in plan.leap if window.covers(seconds))
-        if not leap:
-            return surroundings
-        field = surroundings.world_field_ut + leap * LEAP_DIRECTION
-        return replace(surroundings, world_field_ut=field)
 
     def amplify(self, seconds: float, reading: Reading) -> Reading:
         """``reading`` with the gain that its chips have ``seconds`` s after power-on."""

@@ -53,7 +53,9 @@ class Bounds:
         self._few: bool = bool((layout.counts < PLANE_TAXELS).all())
         self._scale = NOMINAL_SCALE if nominal else MEASURED_SCALE
         self._nominal = nominal
-        self._gain = np.linalg.norm(self._slopes[:, :, 0], axis=1)  # N/µT
+        self._constant = np.ascontiguousarray(self._slopes[:, :, 0])
+        self._tilt = (self._slopes[:, :, 1:] ** 2).sum(axis=(1, 2))  # (N,) N²/µT²
+        self._gain = np.linalg.norm(self._constant, axis=1)  # N/µT
         self._still: FloatArray = np.zeros(layout.taxels)  # N², the part equal in every cycle
         self._drift: FloatArray = np.zeros(layout.taxels)  # N/K rms
 
@@ -81,8 +83,8 @@ class Bounds:
     def taxels(self, estimate: Estimate, drift: FloatArray) -> FloatArray:
         """Additive bound of each taxel's normal force, (N,) N. ``drift``: from `drift_sigma`."""
         a = self._array
-        ambient = (self._slopes[:, :, 0] * estimate.sigma[a]) ** 2
-        slope = (self._slopes[:, :, 1:] ** 2).sum(axis=(1, 2)) * estimate.slope_sigma[a] ** 2
+        ambient = (self._constant * estimate.sigma[a]) ** 2
+        slope = self._tilt * estimate.slope_sigma[a] ** 2
         variance: FloatArray = ambient.sum(axis=1) + slope + self._still + drift**2
         return QUANTILE_95 * np.sqrt(variance)
 
@@ -91,9 +93,9 @@ class Bounds:
         if not taxels:
             return 0.0
         variance = float((self._still[taxels] + drift[taxels] ** 2).sum())
-        arrays = self._array[taxels]
-        for a in np.unique(arrays).tolist():
-            lost = self._slopes[taxels][arrays == a].sum(axis=0)  # (component, coefficient)
+        arrays, slopes = self._array[taxels], self._slopes[taxels]
+        for a in sorted(set(arrays.tolist())):
+            lost = slopes[arrays == a].sum(axis=0)  # (component, coefficient)
             variance += float(((lost[:, 0] * estimate.sigma[a]) ** 2).sum())
             variance += float((lost[:, 1:] ** 2).sum()) * float(estimate.slope_sigma[a]) ** 2
         return QUANTILE_95 * math.sqrt(variance)

@@ -40,7 +40,7 @@ class ForceModel:
         self.layout = layout
         self._cos = np.ones((arrays, n))
         self._sin = np.zeros((arrays, n))
-        self.rest = np.zeros((arrays, 3, n))
+        rest = np.zeros((arrays, 3, n))
         self._drift = np.zeros((arrays, 3, n))
         self._reference = np.zeros((arrays, n))
         self._nominal = calibration.nominal
@@ -50,9 +50,10 @@ class ForceModel:
             blocks[a, :, :m, :, :m] = array.newton_per_ut.reshape(m, 3, m, 3).transpose(1, 0, 3, 2)
             self._cos[a, :m] = np.cos(array.geometry.chip_yaw)
             self._sin[a, :m] = np.sin(array.geometry.chip_yaw)
-            self.rest[a, :, :m] = array.rest_ut.T
+            rest[a, :, :m] = array.rest_ut.T
             self._drift[a, :, :m] = array.drift_ut_per_k.T
             self._reference[a] = array.reference_c
+        self.rest = rest
         self._rested_at = self._reference.copy()
         self._turned = bool(self._sin.any() or (self._cos != 1).any())
         self._drifts = bool(self._drift.any())
@@ -94,6 +95,33 @@ class ForceModel:
         leak = undone - in_ee
         leak[~self._decouples] = 0
         self._plane_leak = leak.reshape(arrays, 3 * n, 9)
+
+    @property
+    def rest(self) -> FloatArray:
+        """Rest field, (A, 3, n) µT in taxel axes. Assign it anew to change it: what follows from
+        it is kept."""
+        return self._rest
+
+    @rest.setter
+    def rest(self, rest_ut: FloatArray) -> None:
+        rest_ut.flags.writeable = False
+        self._rest = rest_ut
+        self._rest_squared: FloatArray | None = None
+        self._rest_size: FloatArray | None = None
+
+    @property
+    def rest_squared(self) -> FloatArray:
+        """Square of the size of the rest field, (A, n) µT²."""
+        if self._rest_squared is None:
+            self._rest_squared = (self._rest**2).sum(axis=1)
+        return self._rest_squared
+
+    @property
+    def rest_size(self) -> FloatArray:
+        """Size of the rest field, (A, n) µT."""
+        if self._rest_size is None:
+            self._rest_size = np.linalg.norm(self._rest, axis=1)
+        return self._rest_size
 
     def rested_at(self, temperature_c: FloatArray) -> None:
         """Note that the rest field was taken at ``temperature_c`` (A, n) °C.

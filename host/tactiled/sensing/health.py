@@ -313,6 +313,11 @@ class Jumps:
         largest = float(self._scales.jump.min())
         return min(largest, ALONE_UT) if self._any_small else largest
 
+    @property
+    def displaced(self) -> bool:
+        """Whether a chip has settled at another level and may return from it."""
+        return self._displaced is not self.never
+
     def accept_rest(self, rest_ut: FloatArray) -> None:
         """Set the rest field, (A, 3, n) µT in chip axes, after a tare."""
         self.rest = rest_ut
@@ -497,6 +502,10 @@ class Thermometers:
     def plain(self, temperature_c: FloatArray) -> bool:
         """Whether temperatures (A, n) °C are near those of the cycle before, so need no check."""
         return float(np.abs(temperature_c - self.last).max()) < STEP_C
+
+    def possible(self, temperature_c: FloatArray) -> bool:
+        """Whether a working chip may send all of the temperatures (A, n) °C."""
+        return float(np.abs(temperature_c - _MIDDLE_C).max()) <= _HALF_RANGE_C
 
     def accept(self, temperature_c: FloatArray) -> None:
         """Take temperatures (A, n) °C that need no check."""
@@ -778,9 +787,9 @@ class HealthMonitor:
             or copied is not None
             or twin is not None
             or np.count_nonzero(status) > 0
-            or not float(np.abs(raw).max()) < scales.top
             or not self._thermometers.plain(temperature_c)
             or not (float(moved.max()) < self._quiet or self._is_motion(raw, moved))
+            or (not float(np.abs(raw).max()) < scales.top and self._is_doubtful(raw, temperature_c))
         ):
             fault = np.zeros_like(self._clear)
             self._mark_flagged(fault, status, present, broken)
@@ -856,6 +865,20 @@ class HealthMonitor:
         if float(moved.max()) > self._jumps.least:
             return False
         return not np.count_nonzero((raw[:, 0] == raw[:, 1]) & (moved >= self._quiet))
+
+    def _is_doubtful(self, raw: FloatArray, temperature_c: FloatArray) -> bool:
+        """Whether fields beyond the smallest range of any axis may hide a fault.
+
+        Magnets whose z exceeds the range of x and y at rest do so in every cycle, and the full
+        check would find nothing but what is looked for here.
+        """
+        low, high = self.scales.rails
+        return bool(
+            self._jumps.displaced
+            or (self._repeating and np.count_nonzero(self._repeats >= ALIKE_CYCLES))
+            or np.count_nonzero((raw >= high) | (raw <= low))
+            or not self._thermometers.possible(temperature_c)
+        )
 
     def _copied(self, raw: FloatArray, moved: FloatArray, present: Bool) -> Bool | None:
         """(A,) arrays whose frame is a copy of an earlier one; None when there are none."""

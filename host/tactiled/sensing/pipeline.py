@@ -430,8 +430,8 @@ class BoardPipeline:
             rest.note_peak(features.peak_force)
         if self.settings.rest_tracking_s is not None and valid and not reasons:
             self._track_rest(field, estimate, healthy, captured)
-        follows = known and rest.state is RestState.KNOWN and not self._net.fitted
-        if follows and self._last_captured is not None:
+        follows = rest.recovers and known and not self._net.fitted
+        if follows and rest.state is RestState.KNOWN and self._last_captured is not None:
             elapsed = max(0.0, (captured - self._last_captured) / NS_PER_S)
             left_over = field - self._model.plane_field(estimate.theta)
             rest.track_release(left_over, healthy, float(self._noise.max()), elapsed)
@@ -537,7 +537,7 @@ class BoardPipeline:
         """Add one cycle to the tare under way; at its end, contacts and fits are reset."""
         healthy = self._layout.real & (health == 0)
         usable = np.where(healthy[:, None], field, 0.0)
-        before = self._model.rest.copy()
+        before = self._model.rest
         stripped = self._rest.suspicion is not None
         shift = self._rest.advance(usable, healthy, whole, captured, sequence)
         report = self._rest.report
@@ -659,7 +659,7 @@ class BoardPipeline:
             return
         shift = self._late.advance(field, late, self._noise, captured)
         if shift is not None:
-            self._model.rest += shift
+            self._model.rest = self._model.rest + shift
             self._rest.unrested = self._rest.unrested & ~late
             self._monitor.set_rest(self._model.chip_rest())
             self._bounds.set_rest(self._layout.flat_vectors(self._model.rest))

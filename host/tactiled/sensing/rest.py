@@ -202,7 +202,8 @@ class RestWatch:
 
     def __init__(self, layout: Layout, model: ForceModel, names: Sequence[str]) -> None:
         self._layout, self._model, self._names = layout, model, names
-        self._small = layout.counts < PLANE_TAXELS
+        self._every = np.repeat(layout.real[:, None], 3, axis=1)
+        self._few: list[int] = np.flatnonzero(layout.counts < PLANE_TAXELS).tolist()
         self._last: tuple[Instant, FloatArray] | None = None
         self._bare_since = np.full(layout.real.shape, -1, np.int64)
         self._gone = np.zeros_like(layout.real)
@@ -217,7 +218,7 @@ class RestWatch:
     def regained(self, field: FloatArray, bare: Bool) -> Reason | None:
         """A reason when a taxel of ``bare`` (A, n) has a magnet again: the skin was changed."""
         reading = np.linalg.norm(field + self._model.rest, axis=1)
-        least = np.maximum(MAGNET_UT, 2.0 * np.linalg.norm(self._model.rest, axis=1))
+        least = np.maximum(MAGNET_UT, 2.0 * self._model.rest_size)
         if not (bare & (reading > least)).any():
             return None
         return why.field_jump(float(reading[bare].max()))
@@ -258,19 +259,17 @@ class RestWatch:
         captured: Instant,
         last: tuple[Instant, FloatArray] | None,
     ) -> Reason | None:
-        rest = self._model.rest
-        magnet = (rest**2).sum(axis=1) > MAGNET_UT**2
-        reading = ((field + rest) ** 2).sum(axis=1)
-        strong = np.linalg.norm(rest, axis=1)
-        fallen = self._lost_field(field, reading, strong, healthy & magnet, captured, last)
-        bare = healthy & magnet & (reading < BARE_UT**2)
-        if not (bare.any() or fallen.any()):
+        strong = self._model.rest_size
+        chips = healthy & (self._model.rest_squared > MAGNET_UT**2)
+        reading = ((field + self._model.rest) ** 2).sum(axis=1)
+        fallen = self._lost_field(field, reading, strong, chips, captured, last)
+        bare = chips & (reading < BARE_UT**2)
+        if not (np.count_nonzero(bare) or np.count_nonzero(fallen)):
             self._bare_since[:] = -1
             return None
         begun = bare & (self._bare_since < 0)
         self._bare_since[begun] = captured
         self._bare_since[~bare] = -1
-        chips = healthy & magnet
         for a in range(len(bare)):
             if chips[a].sum() >= 3 and bare[a].sum() >= BARE_SHARE * chips[a].sum():
                 self.off = True
@@ -296,20 +295,22 @@ class RestWatch:
         """(A, n) chips that have lost most of their field at once, which no press does."""
         if last is None or seconds_between(last[0], captured) > SCRAMBLE_S:
             return np.zeros_like(chips)
+        low: Bool = chips & (reading < (GONE_SHARE * strong) ** 2)
+        if not np.count_nonzero(low):
+            return low
         step = np.linalg.norm(field - last[1], axis=1)
-        low = reading < (GONE_SHARE * strong) ** 2
-        return np.asarray(chips & low & (strong > 2 * MAGNET_UT) & (step > AT_ONCE * strong))
+        return np.asarray(low & (strong > 2 * MAGNET_UT) & (step > AT_ONCE * strong))
 
     def lost(self, before: FloatArray) -> Bool:
         """(A, n) taxels whose magnet is gone, from the rest fields ``before`` (A, 3, n) and now."""
         magnet = (before**2).sum(axis=1) > MAGNET_UT**2
-        low = (self._model.rest**2).sum(axis=1) < BARE_UT**2
+        low = self._model.rest_squared < BARE_UT**2
         gone, self._gone = self._gone, np.zeros_like(self._gone)
         return np.asarray(magnet & (low | gone))
 
     def covered(self) -> Bool:
         """(A, n) taxels whose present rest field is as large as a magnet's."""
-        return np.asarray((self._model.rest**2).sum(axis=1) > 4 * MAGNET_UT**2)
+        return np.asarray(self._model.rest_squared > 4 * MAGNET_UT**2)
 
     def _jumped(self, estimate: Estimate) -> Reason | None:
         size = float(estimate.leap.max())
@@ -322,11 +323,14 @@ class RestWatch:
 
     def _gain(self, field: FloatArray, healthy: Bool) -> Reason | None:
         rest = self._model.rest
-        use = healthy[:, None] & np.ones_like(rest, dtype=bool)
-        there = float((rest[use] ** 2).sum())
-        if there == 0.0 or there < healthy.sum() * MAGNET_UT**2:
+        use = self._every
+        if healthy is not self._layout.real:
+            use = np.broadcast_to(healthy[:, None], rest.shape)
+        known = rest[use]
+        there = float((known**2).sum())
+        if there == 0.0 or there < np.count_nonzero(healthy) * MAGNET_UT**2:
             return None
-        gain = float((rest[use] * field[use]).sum()) / there
+        gain = float((known * field[use]).sum()) / there
         if abs(gain) < GAIN_STEP:
             return None
         left = np.where(use, field - gain * rest, 0.0)
@@ -346,8 +350,10 @@ class RestWatch:
     ) -> Reason | None:
         if last is None or seconds_between(last[0], captured) > SCRAMBLE_S:
             return None
+        if not self._few:
+            return None
         moved = np.linalg.norm(field - last[1], axis=1)
-        for a in np.flatnonzero(self._small).tolist():
+        for a in self._few:
             use = healthy[a]
             if use.sum() < 3 or (moved[a][use] < SCRAMBLE_UT).any():
                 continue
@@ -425,7 +431,8 @@ class Recovery:
 
     def __init__(self, layout: Layout) -> None:
         self._small = layout.counts < PLANE_TAXELS
-        self._any = bool(self._small.any())
+        self.any = bool(self._small.any())
+        """Whether the board has such arrays."""
         self.reset(layout)
 
     def reset(self, layout: Layout) -> None:
@@ -440,8 +447,6 @@ class Recovery:
 
         ``left_over``: (A, 3, n) µT in taxel axes after compensation. ``noise_ut``: µT rms.
         """
-        if not self._any:
-            return None
         size = np.where(healthy, np.linalg.norm(left_over, axis=1), 0.0).max(axis=1)
         self._peak = np.maximum(size, self._peak * math.exp(-elapsed / PEAK_MEMORY_S))
         away = left_over - self._mean
@@ -545,7 +550,7 @@ class RestField:
 
     def restore(self, rest_ut: FloatArray, unrested: Bool, rough: bool) -> None:
         """Use a recorded rest field, (A, 3, n) µT; ``unrested``: (A, n) bool."""
-        self._model.rest[:] = rest_ut
+        self._model.rest = rest_ut.copy()
         self.unrested[:] = unrested
         self.known, self.rough = True, rough
         self._tare = None
@@ -591,21 +596,26 @@ class RestField:
             self._tare = tare.again()
         return None
 
+    @property
+    def recovers(self) -> bool:
+        """Whether the board has arrays whose release is tracked."""
+        return self._recovery.any
+
     def track_release(
         self, left_over: FloatArray, healthy: Bool, noise_ut: float, elapsed: float
     ) -> None:
         """Track a skin that was released; see `Recovery.step`."""
         change = self._recovery.step(left_over, healthy, noise_ut, elapsed)
         if change is not None:
-            self._model.rest += change
+            self._model.rest = self._model.rest + change
 
     def track(self, left_over: FloatArray, free: Bool, share: float) -> None:
         """Move the rest field of ``free`` (A, n) taxels by a share of what compensation left."""
-        self._model.rest += np.where(free[:, None], share * left_over, 0.0)
+        self._model.rest = self._model.rest + np.where(free[:, None], share * left_over, 0.0)
 
     def _accept(self, tare: Tare, sequence: int, trouble: str | None = None) -> FloatArray:
         shift = np.where(tare.healthy[:, None], tare.mean, 0.0)
-        self._model.rest += shift
+        self._model.rest = self._model.rest + shift
         largest = float(np.abs(shift).max())
         left = self._layout.real & ~tare.healthy
         self.unrested &= left

@@ -119,7 +119,8 @@ class Scales:
 
     ``steps``: (A, 3, 1) µT per count, NaN where unknown. ``jump``: (A, 3, 1) µT from one reading to
     the next that no contact causes, or that may be a wrap. ``rails``: lowest and highest count,
-    (A, 3, 1) µT each. ``top``: the smallest highest count, µT.
+    (A, 3, 1) µT each. ``top``: the smallest highest count, µT: below it no reading is near any end
+    of a range.
     """
 
     def __init__(self, real: Bool) -> None:

@@ -7,8 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
+from tactile_core.geometry import finger
+from tactile_core.types import Instant
 from tactiled.blocks import TaxelHealth
+from tactiled.sensing.health import HealthMonitor
+from tactiled.sensing.layout import Layout
 from tactiled.sensing.pipeline import BoardPipeline, PipelineSettings
+from tactiled.sensing.reasons import Fault
 
 
 @pytest.fixture
@@ -108,3 +113,69 @@ def test_masked_taxel_in_contact_does_not_read_zero_force(flow, noise, board, fi
     cycle = flow.one(noise() + pressed, status)
     assert np.isnan(cycle.force[33]).all()
     assert cycle.features.taxels_masked == 1
+
+
+STRONG = np.array([300.0, -200.0, 6000.0])  # µT; z lies beyond the range of x and y
+
+
+@pytest.fixture
+def strong():
+    """A monitor of 16 chips whose magnets read `STRONG`, and a function that makes its cycles."""
+    layout = Layout(finger_tip())
+    rng = np.random.default_rng(5)
+    rest = np.repeat(STRONG[None, :, None], layout.width, axis=2)
+    monitor = HealthMonitor(layout, 0.5, 50_000.0, rest)
+    monitor.set_scale(0, (0.15, 0.242))
+
+    def cycle(spoil=lambda raw, temperature: None):
+        raw = rest + rng.normal(0, 4, rest.shape)
+        temperature = np.full(layout.real.shape, 25.0)
+        spoil(raw, temperature)
+        cycle.now += 10_000_000
+        status = np.zeros(layout.real.shape, np.uint8)
+        monitor.update(raw, temperature, status, np.ones(1, bool), Instant(cycle.now))
+        return monitor.fault[0]
+
+    cycle.now = 0
+    return cycle
+
+
+def finger_tip():
+    geometry = finger()
+    return dataclasses.replace(geometry, arrays=(geometry.arrays[2],))
+
+
+def test_strong_fields_alone_are_no_fault(strong):
+    for _ in range(40):
+        assert not strong().any()
+
+
+def test_the_end_of_an_axis_is_found_among_strong_fields(strong):
+    def spoil(raw, temperature):
+        raw[0, 2, 5] = 32_767 * 0.242
+
+    strong()
+    strong()
+    fault = strong(spoil)
+    assert fault[5] == Fault.RAIL
+    assert np.count_nonzero(fault) == 1
+
+
+def test_a_chip_that_reads_zero_from_the_start_is_found_among_strong_fields(strong):
+    def spoil(raw, temperature):
+        raw[0, :, 5] = 0.0
+
+    faults = [strong(spoil)[5] for _ in range(10)]
+    assert faults[-1] in (Fault.ZEROS, Fault.JUMPED)
+
+
+def test_a_thermometer_that_creeps_out_of_its_range_is_found_among_strong_fields(strong):
+    def hot(degrees):
+        def spoil(raw, temperature):
+            temperature[0, 5] = degrees
+
+        return spoil
+
+    for degrees in range(25, 131, 5):
+        assert strong(hot(degrees))[5] == 0
+    assert strong(hot(135.0))[5] == Fault.TEMPERATURE
