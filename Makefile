@@ -60,8 +60,8 @@ demo: setup  ## reach into a simulated cupboard, leave a log and a picture
 demo-ur: setup  ## the same with an emulated robot of Universal Robots
 	$(BIN)/tactile demo --arm ur --seed 36
 
-# The same fifty scenes with the simulated arm and with the emulated robot; an hour, resumable.
-arms-scenes: setup  ## 50 scenes with the simulated arm and an emulated UR; an hour, goes on where cut off
+# The same fifty scenes with the simulated arm and with the emulated robot; half an hour, resumable.
+arms-scenes: setup  ## 50 scenes with the simulated arm and an emulated UR; half an hour, goes on where cut off
 	$(BIN)/tactile arm-scenes --scenes 50 --out docs/results/ur.json
 
 # Every driver against every fault, ARMS_RUNS times over; some minutes a run. FRANKY_SIM=PATH: Franka, too.
