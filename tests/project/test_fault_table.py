@@ -11,7 +11,7 @@ from tests.support.paths import TESTS
 
 ROW = re.compile(r"\| (\d+) \|")
 NAMED = re.compile(r"`((?:[a-z_0-9]+/)+test_\w+\.py)(?:::(test_\w+))?`")
-ROWS = 54
+ROWS = 56
 """Number of rows."""
 
 
