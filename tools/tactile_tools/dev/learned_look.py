@@ -163,7 +163,7 @@ def _draw(axes: Any, found: Track, title: str) -> None:
         dy = np.sin(heading) * ahead + np.cos(heading) * aside
         axes.quiver(
             tip[strong, 1], tip[strong, 0], dy, dx, color="tab:purple", angles="xy",
-            scale_units="xy", scale=40, width=0.006, zorder=4,
+            scale_units="xy", scale=25, width=0.004, headwidth=3, zorder=4,
         )  # fmt: skip
     axes.plot(found.scene.goal[1], found.scene.goal[0], "*", color="tab:red", ms=9, zorder=5)
     half = found.scene.width / 2
