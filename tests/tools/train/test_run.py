@@ -99,7 +99,7 @@ def test_command_trains_and_names_what_it_made(
     words = ["train", "--config", str(config), "--out", str(out), "--minutes", "0.01"]
     assert main([*words, "--jobs", "1"]) == 0
     assert f"learned_weights={out / 'learned.npz'}" in capsys.readouterr().out
-    assert load_policy(out / "learned.npz").about["decisions"] >= 8 * 24
+    assert load_policy(out / "last-learned.npz").about["decisions"] >= 8 * 24
     assert main(["train", "--out", str(out), "--minutes", "0.01"]) == 2
     assert "other settings" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
