@@ -132,7 +132,7 @@ class Run:
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
             self.learner.load(state["learner"])
-        except Exception as error:
+        except Exception as error:  # of any kind: PyTorch says what is wrong by many
             raise RunError(
                 f"{path} is damaged or of another version; delete it to begin anew"
             ) from error
