@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import random
-from collections.abc import Callable, Iterable
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +14,7 @@ from hypothesis import settings
 
 from reachd.interfaces import ArmState, Touch, Twist
 from reachd.strategies.parameters import SETS
+from tactile_core.bus.runtime import RUNTIME_VARIABLE
 from tactile_core.geometry import Side
 from tactile_core.types import Instant
 
@@ -22,6 +25,22 @@ settings.register_profile("random", deadline=None, database=None, print_blob=Tru
 settings.load_profile("same")
 
 T0 = Instant(5_000_000_000)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_runtime_folder() -> Iterator[None]:
+    """Locks and sockets of this process's rigs, apart from those of other tests and of users.
+
+    In the system's folder of temporary files, because the path of a socket must be short.
+    """
+    with tempfile.TemporaryDirectory(prefix="tactile-test-") as folder:
+        before = os.environ.get(RUNTIME_VARIABLE)
+        os.environ[RUNTIME_VARIABLE] = folder
+        yield
+        if before is None:
+            del os.environ[RUNTIME_VARIABLE]
+        else:
+            os.environ[RUNTIME_VARIABLE] = before
 
 
 @pytest.fixture

@@ -38,6 +38,22 @@ TRIES = 5
 """Starts of a reachd that found its inputs late; a healthy one on a busy machine needs two."""
 
 
+def patient_config(folder: Path, *strict: str, more: str = "") -> tuple[str, str]:
+    """Flags with a configuration under which a starved machine only makes reachd slow.
+
+    ``strict``: codes of the gate's checks that stay as they are, for a test that is about them.
+    ``more``: lines in front, for other tables.
+    """
+    ages = {name: f"{name} = {s}\n" for code, (name, s) in AGES.items() if code not in strict}
+    off = sorted({*TIMED, "arm_stale"} - set(strict))
+    path = folder / "patient.toml"
+    path.write_text(
+        f"time_limit = 600.0\n{more}\n[parameters.safety]\ndisabled = {off}\n"
+        + "".join(ages.values())
+    )
+    return "--config", str(path)
+
+
 class ReachdLab:
     """Starts what a test needs and records reachd's publications."""
 
@@ -84,19 +100,8 @@ class ReachdLab:
         return self._start([sys.executable, "-m", "reachd", *bus, *words], **environment)
 
     def patient(self, *strict: str, more: str = "") -> tuple[str, str]:
-        """Flags with a configuration under which a starved machine only makes reachd slow.
-
-        ``strict``: codes of the gate's checks that stay as they are, for a test that is about them.
-        ``more``: lines in front, for other tables.
-        """
-        ages = {name: f"{name} = {s}\n" for code, (name, s) in AGES.items() if code not in strict}
-        off = sorted({*TIMED, "arm_stale"} - set(strict))
-        path = self.folder / "patient.toml"
-        path.write_text(
-            f"time_limit = 600.0\n{more}\n[parameters.safety]\ndisabled = {off}\n"
-            + "".join(ages.values())
-        )
-        return "--config", str(path)
+        """Flags of `patient_config` in the lab's folder."""
+        return patient_config(self.folder, *strict, more=more)
 
     def reach(self, *words: str, **how: Any) -> Program:
         """A reachd that moves the arm; started anew where a starved machine let it find no input.

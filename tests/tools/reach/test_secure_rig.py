@@ -28,6 +28,7 @@ from tactile_core.bus.topics import ARM_STATE, COMMAND, FEATURES, service_key
 from tactile_tools.cli import main
 from tactile_tools.reach.process_rig import is_moving
 from tests.support.network import free_port
+from tests.support.reachd_lab import patient_config
 from tests.support.waiting import PATIENCE_S, wait_until
 
 
@@ -69,18 +70,14 @@ def running_rig(folder: Path, places: dict[str, str], keys: Path | None = None) 
     rig = Rig(folder, places, flags)
     words = {
         "cupboard": [
-            "sim_device",
-            "cupboard",
-            "--scene",
-            "authors_sim",
-            "--seed",
-            "3",
-            "--pty",
-            "board0",
+            "sim_device", "cupboard", "--scene", "authors_sim", "--seed", "3", "--pty", "board0",
+            "--rate", "50", "--engine", "planar",
         ],
         "tactiled": ["tactiled.cli", "--port", "board0", "--no-log", "--wait"],
-        "reachd": ["reachd", "--serve", "--strategy", "straight", "--no-log"],
-    }
+        "reachd": [
+            "reachd", "--serve", "--strategy", "straight", "--no-log", *patient_config(folder),
+        ],
+    }  # fmt: skip
     with contextlib.ExitStack() as stack:
         for name in ROLES:
             output = stack.enter_context((folder / f"{name}.txt").open("wb"))
@@ -126,30 +123,35 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 def reaches(rig: Rig) -> None:
     """The operator arms, gives a goal, and the arm moves; then it is told to stop.
 
-    Again, where it is not at rest yet, or where a starved machine held it before it moved.
+    Again, where a starved machine held it before it moved.
     """
-    goal = rig.ask("reset", {}, "world")["goal"]
 
     def moved() -> bool:
         try:
-            if rig.ask("status")["state"] == "resetting":
-                rig.ask("reset")
+            at_rest(rig)
+            goal = rig.ask("reset", {}, "world")["goal"]  # what held it may press on the finger
             rig.ask("arm")
             rig.states.clear()
             rig.ask("goal", {"x": goal[0], "y": goal[1]})
         except ServiceError:
             return False
-        rig.until(lambda: any_moves(rig) or rig.ask("status")["state"] != "reaching")
-        if any_moves(rig):
-            return True
-        with contextlib.suppress(ServiceError):  # what held it may press on the finger
-            rig.ask("reset", {}, "world")
-        return False
+        rig.until(lambda: any_moves(rig) or rig.ask("status")["state"] not in UNDER_WAY)
+        return any_moves(rig)
 
     rig.until(moved)
-    with contextlib.suppress(ServiceError):  # it ended by itself meanwhile
-        rig.ask("stop")
+    at_rest(rig)
+
+
+UNDER_WAY = ("homing", "reaching")
+
+
+def at_rest(rig: Rig) -> None:
+    """End the reach, if there is one, and wait until the arm stands and another may begin."""
+    for request in ("stop", "reset"):
+        with contextlib.suppress(ServiceError):  # nothing to stop, or to reset
+            rig.ask(request)
     rig.until(lambda: not is_moving(rig.states[-1].twist, 1e-3))
+    rig.until(lambda: rig.ask("status")["state"] == "idle")
 
 
 def any_moves(rig: Rig) -> bool:
