@@ -60,6 +60,10 @@ a jammed arm reports none."""
 CREEP = 0.001
 """m/s, rad/s of reported motion that contradicts a pose that does not change at all."""
 
+SURE = 3.0
+"""Standard errors by which the mean of reported rates may be off: a finger that chatters against
+objects turns to and fro by ten times the rate that is meant."""
+
 SAME = 1e-5
 """m, rad within which a pose does not change; jammed arms tremble by more."""
 
@@ -348,14 +352,14 @@ class MotionWatch:
             pushed = sum([a.fx * dx + a.fy * dy for a in states]) / (n * math.hypot(dx, dy))
             aside = pushed >= s.free_air_force
             went, moves = moved[0] * ux + moved[1] * uy, mx * ux + my * uy
-            reported = sum([a.twist.vx * ux + a.twist.vy * uy for a in lately]) / len(lately)
+            reports = [a.twist.vx * ux + a.twist.vy * uy for a in states]
             words = f"{length * 1e3:.1f} mm", f"{went * 1e3:.1f}"
         else:
             sign = math.copysign(1.0, length)
             pushed = math.copysign(1.0, moved[2] - length) * sum([a.mz for a in states]) / n
             aside = pushed >= s.free_air_torque
             went, moves, length = moved[2] * sign, mh * sign, abs(length)
-            reported = sign * sum([a.twist.omega for a in lately]) / len(lately)
+            reports = [sign * a.twist.omega for a in states]
             words = f"{math.degrees(length):.2f}°", f"{math.degrees(went):.2f}"
         pace = length / seconds
         dead = abs(moves) < DEAD * pace * TRACK_NS / NS_PER_S
@@ -369,7 +373,10 @@ class MotionWatch:
             )
         else:
             explained = aside or self._gives_way(index)
-        lies = reported >= REPORTED * pace or (_moving(lately) and self._pose_is_constant(index))
+        reported = sum(reports[-len(lately) :]) / len(lately)
+        lies = (
+            reported >= REPORTED * pace and _at_least(reports) - went / seconds >= REPORTED * pace
+        ) or (_moving(lately) and self._pose_is_constant(index))
         if explained and not (dead and lies):
             return None
         if dead:
@@ -383,6 +390,14 @@ class MotionWatch:
             f"the arm was told to go {words[0]} and went {words[1]} that way within {seconds:.1f} "
             "s, and no load explains it",
         )
+
+
+def _at_least(rates: list[float]) -> float:
+    """Mean of two ``rates`` or more, less what their scatter may have added to it."""
+    n = len(rates)
+    mean = math.fsum(rates) / n
+    variance = math.fsum([(rate - mean) ** 2 for rate in rates]) / (n - 1)
+    return mean - SURE * math.sqrt(variance / n)
 
 
 def _moving(states: list[ArmState]) -> bool:

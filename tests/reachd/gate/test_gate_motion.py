@@ -138,6 +138,23 @@ def test_jammed_arm_may_tremble(rig: Callable) -> None:
         assert lying.run(100, wanted)[1].held is Check.ARM_FROZEN
 
 
+@pytest.mark.parametrize("held_still", [False, True])
+def test_wedged_finger_may_chatter_but_not_claim_to_turn(held_still: bool, rig: Callable) -> None:
+    """Rates sampled while it turns to and fro have a mean by chance, those of a lie have one."""
+    plant = Plant(rig(*OFF, Check.WRENCH), lambda _: ZERO, mz=-2.0)
+    plant.noise = 3e-5
+    rng = np.random.default_rng(3)
+    when = None
+    for k in range(200):
+        rate = 0.02 + rng.normal(0.0, 0.004) if held_still else rng.normal(0.0, 0.04)
+        plant.state["twist"] = Twist(0.0, 0.0, rate)
+        if plant.step(Twist(0.0, 0.0, 0.02)).held is not None:
+            when = k
+            break
+    assert (when is not None) == held_still
+    assert when is None or when <= 50
+
+
 def test_unloaded_arm_moving_half_the_way_latches(rig: Callable) -> None:
     plant = Plant(rig(*OFF), lambda t: Twist(0.4 * t.vx, 0.4 * t.vy, t.omega))
     when, decision = plant.run(60)
