@@ -14,7 +14,7 @@ pytest.importorskip("numba", reason="no numba: pip install 'tactile-reach[train]
 from reachd.strategies.learned import load_policy
 from tactile_tools.cli import main
 from tactile_tools.train.cupboards import PRIVILEGED
-from tactile_tools.train.ppo import Batch, Learner, advantages_of
+from tactile_tools.train.ppo import ACTIONS, Batch, Learner, Noise, advantages_of
 from tactile_tools.train.run import Run, RunError
 from tactile_tools.train.settings import Learning, Scenes, Settings
 
@@ -57,7 +57,8 @@ def test_learner_moves_towards_what_was_rewarded() -> None:
     for _ in range(15):
         seen = rng.normal(size=(t, n, 270)).astype(np.float32)[:, :, : learner.actor[0].in_features]
         hidden = np.zeros((t, n, PRIVILEGED), np.float32)
-        drawn = [learner.act(seen[k], hidden[k], rng) for k in range(t)]
+        draws = rng.standard_normal((t, n, ACTIONS)).astype(np.float32)
+        drawn = [learner.act(seen[k], hidden[k], draws[k]) for k in range(t)]
         actions = np.stack([d[0] for d in drawn])
         rewards = -((actions[:, :, 0] - 0.6) ** 2)
         values = np.stack([*(d[2] for d in drawn), drawn[-1][2]])
@@ -67,6 +68,19 @@ def test_learner_moves_towards_what_was_rewarded() -> None:
     mean = learner.policy({})(rng.normal(size=(200, seen.shape[2])).astype(np.float32)).mean(0)
     assert mean[0] > 0.25
     assert abs(mean[1]) < 0.2
+
+
+@pytest.mark.parametrize("lasting", [0.0, 0.5, 1.0])
+def test_noise_is_standard_normal_and_the_lasting_share_decays(lasting: float) -> None:
+    """Correlation over k decisions: share · exp(-k · 0.1 s / time constant)."""
+    noise = Noise(4000, lasting, 0.5, np.random.default_rng(0))
+    draws = np.stack([noise.draw() for _ in range(12)])
+    assert draws.dtype == np.float32
+    assert draws.mean() == pytest.approx(0.0, abs=0.01)
+    assert draws.std() == pytest.approx(1.0, abs=0.01)
+    for k in (1, 5, 10):
+        together = float((draws[k:] * draws[:-k]).mean())
+        assert together == pytest.approx(lasting * np.exp(-0.1 * k / 0.5), abs=0.015)
 
 
 def test_run_goes_on_where_it_was_cut_off(tmp_path: Path) -> None:

@@ -35,6 +35,10 @@ TARGET = "#F0E442"
 
 M_AT_1_N = 0.0105
 """Width of the circle for 1 N, m; its area is proportional to the force."""
+KEY_FORCES_N = (5.0, 2.0, 1.0, 0.5, 0.2, 0.1)
+"""Forces that the key may show, the largest whose circle fits beside its words."""
+KEY_CIRCLE = 2.0
+"""Largest width of that circle, as a multiple of the size of the letters."""
 SHEAR_M_PER_N = 0.008
 SHEAR_FROM_N = 0.3  # shorter arrows would look like dots
 MOVED_M = 0.004  # an object that moved less is drawn once
@@ -377,7 +381,7 @@ def _legends(sheet: Sheet, axes: Axes, activities: Sequence[str], moved: bool) -
         for a in activities
     ]
     circle = Line2D([], [], ls="", marker="o", mec=TOUCHED, mfc=TOUCHED, alpha=0.45,
-                    label="contact, 5 N normal")  # fmt: skip
+                    label=f"contact, {KEY_FORCES_N[0]:g} N normal")  # fmt: skip
     things = [
         circle,
         Line2D([], [], color="black", marker=">", ms=4 * thin, markevery=[1],
@@ -402,12 +406,17 @@ def _legends(sheet: Sheet, axes: Axes, activities: Sequence[str], moved: bool) -
     )  # fmt: skip
 
     def size() -> None:
-        """Make circles of the key as large as those in the picture."""
+        """Make the circle of the key as large as those in the picture, of a force that fits."""
         box = axes.get_window_extent()
         per_m = box.width / (axes.get_xlim()[1] - axes.get_xlim()[0]) * 72.0 / sheet.figure.dpi
         index = things.index(circle)
         key: Any = legend.legend_handles[index]
-        key.set_markersize(M_AT_1_N * math.sqrt(5.0) * per_m)
+        for force_n in KEY_FORCES_N:
+            size_pt = M_AT_1_N * math.sqrt(force_n) * per_m
+            if size_pt <= KEY_CIRCLE * sheet.look.font_pt:
+                break
+        key.set_markersize(size_pt)
+        legend.get_texts()[index].set_text(f"contact, {force_n:g} N normal")
 
     sheet.defer(size)
 

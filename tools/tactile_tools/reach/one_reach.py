@@ -118,7 +118,8 @@ class ReachRig:
             cupboard = [
                 *(command("simdevice"), scene.arm, "--config", str(config), "--address", address),
                 *(*scene.words, "--seed", seed, "--pty", str(self.board)),
-                *("--world", "world", "--connect", self.arm),
+                # To reachd itself, which logs the world: peers do not pass messages on.
+                *("--world", "world", "--connect", self.arm, "--connect", self.reach),
             ]
         said = self.folder / "cupboard.txt"
         first = self._stack.enter_context(running(cupboard, said))

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 def draw(progress: Path, out: Path) -> None:
     """Draw the rows of ``progress``: who arrived in training and when judged, time, force."""
     rows = [json.loads(line) for line in progress.read_text(encoding="utf-8").splitlines()]
-    trained = [row for row in rows if "arrived" in row]
+    trained = [row for row in rows if "arrived" in row and not row.get("early")]
     judged = [row for row in rows if "judged" in row]
     figure = Figure(figsize=(7.0, 6.0), layout="constrained")
     share, seconds, force = figure.subplots(3, 1, sharex=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from reachd.strategies.learned import RESIDUAL_BOUND, Policy
-from reachd.strategies.memory import WIDTH, Rows
+from reachd.strategies.memory import DECISION_S, WIDTH, Rows
 from tactile_tools.train.cupboards import PRIVILEGED, Turn
 from tactile_tools.train.settings import Learning
 
@@ -28,6 +28,32 @@ def network(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)
     return nn.Sequential(*layers, last)
+
+
+class Noise:
+    """Standard normal draws for (n, actions) residuals, a share of which lasts.
+
+    Noise that is drawn anew ten times a second cancels before a finger has moved. Noise of which
+    a part lasts explores better (Hollenstein et al. 2024, "Colored Noise in PPO"); each draw alone
+    is standard normal, and counts as such.
+    """
+
+    def __init__(self, n: int, lasting: float, lasts_s: float, rng: np.random.Generator) -> None:
+        self._rng, self._lasting = rng, lasting
+        self._keeps = float(np.exp(-DECISION_S / lasts_s))
+        self._slow = self._fresh(n)
+
+    def _fresh(self, n: int) -> Rows:
+        return self._rng.standard_normal((n, ACTIONS)).astype(np.float32)
+
+    def draw(self) -> Rows:
+        """The draws of the next decision."""
+        n, keeps = len(self._slow), self._keeps
+        self._slow = np.float32(keeps) * self._slow + np.float32(
+            np.sqrt(1.0 - keeps * keeps)
+        ) * self._fresh(n)
+        slow, fast = np.sqrt(self._lasting), np.sqrt(1.0 - self._lasting)
+        return np.float32(slow) * self._slow + np.float32(fast) * self._fresh(n)
 
 
 @dataclass(slots=True)
@@ -59,18 +85,25 @@ class Learner:
         self._optimiser = torch.optim.Adam(self._parameters, lr=settings.rate, eps=1e-5)
         self.rate = settings.rate
 
-    def act(
-        self, observations: Rows, privileged: Rows, rng: np.random.Generator
-    ) -> tuple[Rows, Rows, Rows]:
-        """Actions drawn for (n, ·) observations, the logarithms of their densities, and values."""
+    def act(self, observations: Rows, privileged: Rows, draws: Rows) -> tuple[Rows, Rows, Rows]:
+        """Actions for (n, ·) observations with the `Noise` ``draws``, the logarithms of their
+        densities, and values."""
         with torch.no_grad():
             seen = torch.from_numpy(observations).to(self.device)
             mean = self.actor(seen).cpu().numpy()
             spread = self.spread.exp().cpu().numpy()
-            values = self._value(seen, torch.from_numpy(privileged).to(self.device)).cpu().numpy()
-        draws = rng.standard_normal(mean.shape).astype(np.float32)
+        values = self.values(observations, privileged)
         chances = (-0.5 * draws**2 - np.log(spread) - 0.9189385).sum(axis=1)
         return mean + spread * draws, chances.astype(np.float32), values
+
+    def values(self, observations: Rows, privileged: Rows) -> Rows:
+        """What the critic expects from (n, ·) observations on."""
+        with torch.no_grad():
+            seen, hidden = (
+                torch.from_numpy(rows).to(self.device) for rows in (observations, privileged)
+            )
+            values: Rows = self._value(seen, hidden).cpu().numpy()
+        return values
 
     def _value(self, seen: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
         value: torch.Tensor = self.critic(torch.cat([seen, privileged], dim=1))[:, 0]

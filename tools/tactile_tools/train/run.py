@@ -22,7 +22,7 @@ from sim_device.world.scene_generation import generate
 from sim_device.world.scenes import Scene
 from tactile_tools.train.cupboards import Bank, Cupboards
 from tactile_tools.train.curve import draw
-from tactile_tools.train.ppo import Learner, gather
+from tactile_tools.train.ppo import Learner, Noise, gather
 from tactile_tools.train.settings import NO_VARIETY, Settings
 
 CHECKPOINT = "checkpoint.pt"
@@ -167,24 +167,27 @@ class Run:
             bank, s.worlds, rng, variety=s.variety, reward=s.reward, threads=self._threads
         ) as worlds:
             seen, privileged = worlds.observe()
-            started = time.monotonic()
+            noise = Noise(s.worlds, s.learning.lasting, s.learning.lasts, rng)
+            started, over = time.monotonic(), 0
             while time.monotonic() - started < seconds:
                 turns: list[Any] = []
                 ended = arrived = 0
                 for _ in range(s.learning.decisions):
-                    actions, chances, values = self.learner.act(seen, privileged, rng)
+                    actions, chances, values = self.learner.act(seen, privileged, noise.draw())
                     turn = worlds.step(np.clip(actions, -2.0, 2.0))
                     turns.append((seen, privileged, actions, chances, values, turn))
                     seen, privileged = turn.observations, turn.privileged
                     ended += int(turn.ended.sum())
                     arrived += int(turn.arrived.sum())
-                last = self.learner.act(seen, privileged, rng)[2]
+                last = self.learner.values(seen, privileged)
                 told = self.learner.learn(gather(turns, last), rng)
                 self.batches += 1
                 self.decisions += s.worlds * s.learning.decisions
                 self.cpu_s += time.process_time() - cpu
                 cpu = time.process_time()
                 told |= {"reaches": ended, "arrived": arrived / max(1, ended)}
+                told["early"] = over < s.worlds  # all began at once: who arrives, ends first
+                over += ended
                 told["reward"] = float(np.mean([t[5].rewards.mean() for t in turns]))
                 self._progress(told)
                 if self.batches % s.judge_every == 0:

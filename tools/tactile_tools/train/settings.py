@@ -45,6 +45,16 @@ class Learning(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     ] = 0.35
     least_spread: Annotated[Positive, Meta(le=1, description="least of it")] = 0.08
     entropy: Annotated[float, Meta(ge=0, le=1, description="worth of the spread's entropy")] = 0.001
+    lasting: Annotated[
+        Fraction,
+        Meta(description="share of the variance of residuals' noise that lasts for `lasts`"),
+    ] = 0.5
+    lasts: Annotated[
+        Positive,
+        Meta(
+            description="time constant of that share, s; what is drawn ten times a second cancels"
+        ),
+    ] = 0.5
 
 
 class Scenes(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
