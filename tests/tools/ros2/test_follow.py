@@ -21,6 +21,7 @@ from tactile_core.bus.streams import latest
 from tactile_core.bus.topics import REACH_STATE, service_key
 from tactile_tools.ros2.follow import WANTED, FollowTwist, planar_twist
 from tactile_tools.ros2.names import dds_type
+from tests.support.reachd_lab import patient_config
 
 
 def start(folder: Path, name: str, *words: str) -> subprocess.Popen[bytes]:
@@ -42,7 +43,8 @@ def rig(tmp_path: Path, router: Any) -> Iterator[Path]:
     words = ("--port", "board0", "--name", "board0", "--calibration", "board0.cal.toml")
     running.append(start(tmp_path, "tactiled", *words, "--wait", "--no-log"))
     strategy = "tactile_tools.ros2.follow:FollowTwist"
-    running.append(start(tmp_path, "reachd", "--strategy", strategy, "--no-log", "--wait", "60"))
+    reachd = ("--strategy", strategy, "--no-log", "--wait", "60", *patient_config(tmp_path))
+    running.append(start(tmp_path, "reachd", *reachd))
     bridge = (
         "ros2",
         "bridge",
