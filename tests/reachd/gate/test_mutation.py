@@ -69,3 +69,11 @@ def test_detected_mutant_is_killed_and_another_survives(tmp_path: Path) -> None:
     )
     assert mutation.judge(mutation.PACKAGE, caught, [str(test)], 60.0) == "killed"
     assert mutation.judge(mutation.PACKAGE, missed, [str(test)], 60.0) == "survived"
+
+
+def test_copied_tests_pass_on_the_unchanged_gate(tmp_path: Path) -> None:
+    """All fixtures are found beside the copies."""
+    gate = mutation.copy_tests(tmp_path)
+    assert {path.name for path in gate.glob("test_*.py")} >= set(mutation.TESTS)
+    tests = [str(gate / name) for name in ("test_gate_ages.py", "test_gate_arming.py")]
+    assert mutation.judge(mutation.PACKAGE, None, tests, 120.0) == "survived"

@@ -164,6 +164,7 @@ def trial(overlay: str, tests: Sequence[str]) -> None:
         sys.exit(99)
     os.chdir(ROOT)
     options = ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "--hypothesis-seed=1"]
+    options += ["--confcutdir=/"]  # the fixtures lie in folders above
     sys.exit(pytest.main([*options, *tests]))
 
 
@@ -190,6 +191,16 @@ def _copy(source: Path, target: Path) -> None:
     shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
 
 
+def copy_tests(folder: Path) -> Path:
+    """Copy the gate's tests and the fixtures that they use; returns the folder of the tests."""
+    gate = Path("tests", "reachd", "gate")
+    _copy(ROOT / gate, folder / gate)
+    for above in list(gate.parents)[:-1]:
+        for conftest in (ROOT / above).glob("conftest.py"):
+            shutil.copy(conftest, folder / above)
+    return folder / gate
+
+
 def run(options: argparse.Namespace) -> int:
     """Judge every mutant, several at a time, and report the survivors."""
     folder = ROOT / "tests" / "reachd"
@@ -201,11 +212,10 @@ def run(options: argparse.Namespace) -> int:
         return 3
     with tempfile.TemporaryDirectory(prefix="mutation-") as frozen:
         # Copies, so that work on the checkout does not disturb a run of many minutes.
-        package, tests = Path(frozen) / "reachd", Path(frozen) / "tests"
+        package = Path(frozen) / "reachd"
         _copy(PACKAGE, package)
-        _copy(folder / "gate", tests / "gate")
-        shutil.copy(folder / "conftest.py", tests)
-        return _judge_all(package, [str(tests / "gate" / name) for name in TESTS], options)
+        gate = copy_tests(Path(frozen))
+        return _judge_all(package, [str(gate / name) for name in TESTS], options)
 
 
 def _judge_all(package: Path, tests: Sequence[str], options: argparse.Namespace) -> int:
