@@ -39,6 +39,7 @@ TESTS = (
     "test_gate_arming.py",
     "test_gate_motion.py",
     "test_gate_loads.py",
+    "test_gate_counts.py",
     "test_gate_echo.py",
     "test_gate_random.py",
 )
