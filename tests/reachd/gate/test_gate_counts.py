@@ -105,14 +105,14 @@ def test_rising_force_is_foreseen_over_at_most_200_ms(rig: Callable) -> None:
     )  # fmt: skip
 
     def speed(before: float, gap: int) -> float:
-        """m/s towards a contact of 8 N that was ``before`` N ``gap`` ns earlier."""
+        """m/s towards a contact of 9 N that was ``before`` N ``gap`` ns earlier."""
         r = rig(*off)
         place = {"peak_side": Side.TIP, "peak_x": 0.15, "normal_force_bound": 0.0}
         r.step(touch=replace(r.fresh_touch(-r.period), total_force=before, **place))
-        touch = replace(r.fresh_touch(-gap), total_force=8.0, **place)
+        touch = replace(r.fresh_touch(-gap), total_force=9.0, **place)
         decision = r.step(Twist(0.06, 0.0, 0.0), touch=touch, passed=gap)
         return float(decision.twist.vx)
 
-    steady = speed(8.0, 10 * MS)
+    steady = speed(9.0, 10 * MS)
     assert 0.0 < speed(0.0, 200 * MS) < steady
     assert speed(0.0, 200 * MS + 1) == steady
