@@ -712,7 +712,8 @@ def _fill_crash(parser: Parser) -> None:
 def _fill_mutation(parser: Parser) -> None:
     parser.description = (
         "Changes the safety gate in small ways and runs its tests on each: what no test fails on "
-        "is listed. Needs the tests, so it works only in a checkout."
+        "is listed. Needs the tests, so it works only in a checkout. A run that was cut off goes "
+        "on from its --out, as long as gate and tests are the same."
     )
     parser.former(limit="patience")
     parser.add_argument(

@@ -77,3 +77,18 @@ def test_copied_tests_pass_on_the_unchanged_gate(tmp_path: Path) -> None:
     assert {path.name for path in gate.glob("test_*.py")} >= set(mutation.TESTS)
     tests = [str(gate / name) for name in ("test_gate_ages.py", "test_gate_arming.py")]
     assert mutation.judge(mutation.PACKAGE, None, tests, 120.0) == "survived"
+
+
+def test_verdicts_are_kept_for_the_same_code_alone(tmp_path: Path) -> None:
+    out, package, tests = tmp_path / "out.json", tmp_path / "package", tmp_path / "tests"
+    for folder in (package, tests):
+        folder.mkdir()
+        (folder / "x.py").write_text(SOURCE, encoding="utf-8")
+    code = mutation.digest(package, tests, ["x.py"])
+    every = mutation.mutants("x.py", SOURCE)
+    mutation._write(out, every, {0: "killed", 2: "survived"}, code)
+    assert mutation.read_fates(out, code) == {0: "killed", 2: "survived"}
+    (tests / "x.py").write_text(SOURCE + "# more", encoding="utf-8")
+    assert mutation.read_fates(out, mutation.digest(package, tests, ["x.py"])) == {}
+    out.write_text('{"mutants": 359, "survivors": []}', encoding="utf-8")
+    assert mutation.read_fates(out, code) == {}

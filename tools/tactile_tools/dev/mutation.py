@@ -1,7 +1,9 @@
 """``tactile mutation``: make small changes to the safety gate and see whether its tests notice.
 
 A mutant that no test fails on is a survivor: either a test is missing, or the change makes no
-difference that matters. It needs the tests, so it works only in a checkout.
+difference that matters. It needs the tests, so it works only in a checkout. The result is written
+after each mutant, and a run that was cut off goes on where it ended, as long as gate and tests are
+the same.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import hashlib
 import json
 import multiprocessing
 import os
@@ -16,6 +19,7 @@ import random
 import shutil
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
@@ -76,14 +80,6 @@ class Mutant:
     before: str
     after: str
     source: str
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """Fate of a mutant: "killed", "survived" or "timeout"."""
-
-    mutant: Mutant
-    fate: str
 
 
 def variants(node: ast.AST) -> Iterator[ast.AST]:
@@ -220,27 +216,62 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _judge_all(package: Path, tests: Sequence[str], options: argparse.Namespace) -> int:
-    made = [m for f in options.file for m in mutants(f, (package / f).read_text(encoding="utf-8"))]
-    total = len(made)
-    if options.sample is not None and options.sample < total:
-        made = random.Random(options.seed).sample(made, options.sample)
+    every = [m for f in options.file for m in mutants(f, (package / f).read_text(encoding="utf-8"))]
+    chosen: Sequence[int] = range(len(every))
+    if options.sample is not None and options.sample < len(every):
+        chosen = random.Random(options.seed).sample(chosen, options.sample)
+    code = digest(package, Path(tests[0]).parent, options.file)
+    fates = read_fates(options.out, code)
+    todo = [k for k in chosen if k not in fates]
     multiprocessing.get_context("forkserver").set_forkserver_preload(
         ["pytest", "numpy", "hypothesis", "scipy.integrate"]
     )
     if judge(package, None, tests, options.patience) != "survived":
         print("the tests fail on the unchanged package: fix that first", file=sys.stderr)
         return 3
-    verdicts = []
     console = Console()
     with Progress(console=console, transient=True) as bar, ThreadPoolExecutor(options.jobs) as pool:
-        task = bar.add_task(f"{len(made)} of {total} mutants", total=len(made))
-        jobs = {pool.submit(judge, package, m, tests, options.patience): m for m in made}
-        for job in as_completed(jobs):
-            verdicts.append(Verdict(jobs[job], job.result()))
-            bar.advance(task)
-            if verdicts[-1].fate == "survived":
-                console.print(_line(jobs[job]), markup=False, soft_wrap=True)
-    return _report(verdicts, total, console, options)
+        task = bar.add_task(
+            f"{len(chosen)} of {len(every)} mutants",
+            total=len(chosen),
+            completed=len(chosen) - len(todo),
+        )
+        jobs = {pool.submit(judge, package, every[k], tests, options.patience): k for k in todo}
+        try:
+            for job in as_completed(jobs):
+                k = jobs[job]
+                fates[k] = job.result()
+                if options.out:
+                    _write(options.out, every, fates, code)
+                bar.advance(task)
+                if fates[k] == "survived":
+                    console.print(_line(every[k]), markup=False, soft_wrap=True)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    if options.out:
+        _write(options.out, every, fates, code)
+    return _report({k: fates[k] for k in chosen}, len(every), console, options)
+
+
+def digest(package: Path, tests: Path, files: Sequence[str]) -> str:
+    """What tells a run apart whose verdicts may be kept: the mutated files and the tests."""
+    found = hashlib.sha256()
+    for path in (*(package / file for file in files), *sorted(tests.glob("*.py"))):
+        found.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return found.hexdigest()[:16]
+
+
+def read_fates(path: Path | None, code: str) -> dict[int, str]:
+    """Verdicts of an earlier run on the same code, which goes on; none if it was another's."""
+    if path is None or not path.exists():
+        return {}
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        fates = {int(k): str(fate) for k, fate in found["fates"].items()}
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return {}
+    return fates if found.get("code") == code else {}
 
 
 def _line(mutant: Mutant) -> str:
@@ -248,32 +279,37 @@ def _line(mutant: Mutant) -> str:
 
 
 def _report(
-    verdicts: list[Verdict], total: int, console: Console, options: argparse.Namespace
+    fates: dict[int, str], total: int, console: Console, options: argparse.Namespace
 ) -> int:
-    """Print totals and write the survivors. Returns 1 if there are more than allowed."""
-    survivors = sorted(
-        (v.mutant for v in verdicts if v.fate == "survived"), key=lambda m: (m.file, m.line)
-    )
-    slow = sum(v.fate == "timeout" for v in verdicts)
+    """Print totals. Returns 1 if more survive than allowed."""
+    counts = Counter(fates.values())
     console.print(
-        f"{len(verdicts)} mutants of {total}: {len(verdicts) - len(survivors)} killed "
-        f"({slow} by the time limit), {len(survivors)} survived"
+        f"{len(fates)} mutants of {total}: {len(fates) - counts['survived']} killed "
+        f"({counts['timeout']} by the time limit), {counts['survived']} survived"
     )
-    if options.out:
-        _write(options.out, len(verdicts), survivors, slow)
     allowed = options.max_survivors
-    return 1 if allowed is not None and len(survivors) > allowed else 0
+    return 1 if allowed is not None and counts["survived"] > allowed else 0
 
 
-def _write(path: Path, judged: int, survivors: list[Mutant], slow: int) -> None:
-    def plain(mutant: Mutant) -> dict[str, Any]:
-        return {k: v for k, v in asdict(mutant).items() if k != "source"}
-
+def _write(path: Path, every: Sequence[Mutant], fates: dict[int, str], code: str) -> None:
+    """Replace the result at once, so that one that was cut off is whole."""
+    counts = Counter(fates.values())
+    survivors = sorted(
+        (every[k] for k, fate in fates.items() if fate == "survived"),
+        key=lambda m: (m.file, m.line),
+    )
     found = {
-        "mutants": judged,
-        "killed": judged - len(survivors),
-        "timeouts": slow,
-        "survivors": [plain(m) for m in survivors],
+        "mutants": len(every),
+        "judged": len(fates),
+        "killed": len(fates) - counts["survived"],
+        "timeouts": counts["timeout"],
+        "survivors": [
+            {k: v for k, v in asdict(mutant).items() if k != "source"} for mutant in survivors
+        ],
+        "code": code,
+        "fates": {str(k): fates[k] for k in sorted(fates)},
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    beside = path.with_name(f".{path.name}.part")
+    beside.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    beside.replace(path)
