@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import random
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
@@ -33,14 +32,12 @@ def own_runtime_folder() -> Iterator[None]:
 
     In the system's folder of temporary files, because the path of a socket must be short.
     """
-    with tempfile.TemporaryDirectory(prefix="tactile-test-") as folder:
-        before = os.environ.get(RUNTIME_VARIABLE)
-        os.environ[RUNTIME_VARIABLE] = folder
+    with (
+        tempfile.TemporaryDirectory(prefix="tactile-test-") as folder,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setenv(RUNTIME_VARIABLE, folder)
         yield
-        if before is None:
-            del os.environ[RUNTIME_VARIABLE]
-        else:
-            os.environ[RUNTIME_VARIABLE] = before
 
 
 @pytest.fixture

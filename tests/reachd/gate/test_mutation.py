@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tactile_tools.cli import main
 from tactile_tools.dev import mutation
 
 SOURCE = """
@@ -92,3 +93,12 @@ def test_verdicts_are_kept_for_the_same_code_alone(tmp_path: Path) -> None:
     assert mutation.read_fates(out, mutation.digest(package, tests, ["x.py"])) == {}
     out.write_text('{"mutants": 359, "survivors": []}', encoding="utf-8")
     assert mutation.read_fates(out, code) == {}
+
+
+def test_a_result_that_cannot_be_written_is_said_before_the_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for place in (tmp_path, tmp_path / "file" / "out.json"):
+        (tmp_path / "file").touch()
+        assert main(["mutation", "--file", "gate/limits.py", "--out", str(place)]) == 3
+        assert "name another file" in capsys.readouterr().err

@@ -29,6 +29,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
+from tactile_core.cli import REFUSED, CommandError
+
 ROOT = Path(__file__).parents[3]
 PACKAGE = ROOT / "host" / "reachd"
 FILES = ("gate/gate.py", "gate/limits.py", "gate/motion.py")
@@ -220,8 +222,15 @@ def _judge_all(package: Path, tests: Sequence[str], options: argparse.Namespace)
     chosen: Sequence[int] = range(len(every))
     if options.sample is not None and options.sample < len(every):
         chosen = random.Random(options.seed).sample(chosen, options.sample)
-    code = digest(package, Path(tests[0]).parent, options.file)
-    fates = read_fates(options.out, code)
+    code = digest(package, Path(tests[0]).parents[2], options.file)
+    try:
+        fates = read_fates(options.out, code)
+        if options.out:
+            _write(options.out, every, fates, code)
+    except OSError as error:
+        raise CommandError(
+            f"cannot write {options.out}: {error.strerror}; name another file", REFUSED
+        ) from error
     todo = [k for k in chosen if k not in fates]
     multiprocessing.get_context("forkserver").set_forkserver_preload(
         ["pytest", "numpy", "hypothesis", "scipy.integrate"]
@@ -249,15 +258,13 @@ def _judge_all(package: Path, tests: Sequence[str], options: argparse.Namespace)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    if options.out:
-        _write(options.out, every, fates, code)
     return _report({k: fates[k] for k in chosen}, len(every), console, options)
 
 
 def digest(package: Path, tests: Path, files: Sequence[str]) -> str:
-    """What tells a run apart whose verdicts may be kept: the mutated files and the tests."""
+    """What tells a run apart whose verdicts may be kept: mutated files, tests and fixtures."""
     found = hashlib.sha256()
-    for path in (*(package / file for file in files), *sorted(tests.glob("*.py"))):
+    for path in (*(package / file for file in files), *sorted(tests.rglob("*.py"))):
         found.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     return found.hexdigest()[:16]
 
