@@ -92,13 +92,13 @@ def busy_loops(count: int) -> Iterator[None]:
             process.wait()
 
 
-def run_suite(words: Sequence[str]) -> Row:
-    """Run pytest with ``words`` beside the busy loops and return the row of that run.
+def run_suite(words: Sequence[str], loops: int = BUSY_LOOPS) -> Row:
+    """Run pytest with ``words`` beside ``loops`` busy loops and return the row of that run.
 
     A run that gives no report, as one that could not collect its tests, counts as failed.
     """
     started, before = time.monotonic(), datetime.now(UTC).isoformat(timespec="seconds")
-    with tempfile.TemporaryDirectory() as folder, busy_loops(BUSY_LOOPS):
+    with tempfile.TemporaryDirectory() as folder, busy_loops(loops):
         report = Path(folder) / "report.xml"
         cpu = cpu_seconds()
         done = subprocess.run(
@@ -112,6 +112,7 @@ def run_suite(words: Sequence[str]) -> Row:
             "started": before,
             "seconds": round(time.monotonic() - started, 1),
             "cpu_s": round(cpu_seconds() - cpu, 1),
+            "loops": loops,
             "load": [round(load, 1) for load in os.getloadavg()],
             "exit": done.returncode,
         }
@@ -136,6 +137,9 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--runs", type=int, default=1, help="runs asked for in all")
     parser.add_argument("--since", metavar="COMMIT", help="count runs of later commits, too")
     parser.add_argument("--json", type=Path, default=RESULT, help="where rows are kept")
+    parser.add_argument(
+        "--loops", type=int, default=BUSY_LOOPS, help="busy loops; 0 where other work loads enough"
+    )
     parser.add_argument("pytest", nargs="*", help="words for pytest, after --")
     given = parser.parse_args(words)
     if given.runs < 1:
@@ -153,7 +157,8 @@ def main(words: Sequence[str] | None = None) -> int:
 
     for number in range(len(mine()) + 1, given.runs + 1):
         print(f"run {number} of {given.runs}", flush=True)
-        rows.append(run_suite(given.pytest or ["-n", "2", "--dist", "worksteal"]))
+        words_of_pytest = given.pytest or ["-n", "2", "--dist", "worksteal"]
+        rows.append(run_suite(words_of_pytest, given.loops))
         write_rows(given.json, rows)
     passed = sum(map(green, mine()))
     print(f"{passed} of {given.runs} runs asked for are green ({len(mine())} done) in {given.json}")

@@ -270,6 +270,8 @@ class Worlds:
         (n, t, 7) x, y m; outward normal x, y; force x, y N, all in ``ee``; body, an index into
         the scene's objects or `WALL`. (n,) how many rows of each world are in use.
         """
+        if self._device is not None:
+            self._device.fetch_felt()
         counts = self._host.readout[:, 9].astype(np.int64)
         rows = self._host.felt[:, : max(1, int(counts.max(initial=0))), 1:]
         return np.array(rows), counts
@@ -332,7 +334,7 @@ def _sides(x: FloatArray, y: FloatArray) -> NDArray[np.int64]:
 
 
 class _Gpu:
-    """The arrays of ``host`` on a CUDA device; a step brings readout and contacts back."""
+    """The arrays of ``host`` on a CUDA device; a step brings the readout back."""
 
     BUILT: Final = ("worlds", "bodies", "outlines", "hulls", "readout")
     """What a scene is built into."""
@@ -349,12 +351,21 @@ class _Gpu:
         self._host = host
         self._kernel, self._threads = planar_cuda.advance_all, planar_cuda.THREADS
         self._arrays = {name: cuda.to_device(getattr(host, name)) for name in host.names}
+        self._felt_stale = False
 
     def step(self, steps: int) -> None:
         self.send("wanted")
         blocks = math.ceil(len(self._host.worlds) / self._threads)
         self._kernel[blocks, self._threads](steps, *self._arrays.values())
-        self.fetch("readout", "felt")
+        self.fetch("readout")
+        self._felt_stale = True
+
+    def fetch_felt(self) -> None:
+        """Bring the contacts back: of all that a step changes by far the most, and not always
+        asked for."""
+        if self._felt_stale:
+            self.fetch("felt")
+            self._felt_stale = False
 
     def send(self, *names: str) -> None:
         for name in names:

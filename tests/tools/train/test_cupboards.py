@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 
 pytest.importorskip("numba", reason="no numba: pip install 'tactile-reach[train]'")
+pytest.importorskip("torch", reason="no torch: pip install 'tactile-reach[learn]'")
+
+import torch
 
 from reachd.interfaces import Goal
 from reachd.strategies.learned import NEAR_GOAL_M, NEAR_GOAL_N, with_residual
@@ -18,7 +21,8 @@ from sim_device.world.scene_generation import generate
 from sim_device.world.scenes import Scene
 from tactile_core.geometry import TIP_X, Side
 from tactile_core.types import Instant, after
-from tactile_tools.train.cupboards import CYCLE_S, Bank, Cupboards, decide_some
+from tactile_tools.train.cupboards import Bank, Cupboards
+from tactile_tools.train.kernels import CYCLE_S
 from tactile_tools.train.settings import NO_VARIETY, Reward, Variety
 
 T0 = Instant(5_000_000_000)
@@ -43,7 +47,7 @@ def test_motion_is_that_of_the_strategy(
     p = parameters(name)
     residual = np.array([-0.1, 0.05, 0.1])
     worlds = Cupboards(Bank([scene]), 1, np.random.default_rng(0), variety=NO_VARIETY, rows=[0])
-    agents = worlds._agents
+    agents = worlds._agents.kernel
     agents["ahead"], agents["aside"], agents["turn"] = residual
     agents["felt_any"] = 1
     strategy = QuickSweep(p, np.random.default_rng(0))
@@ -55,7 +59,7 @@ def test_motion_is_that_of_the_strategy(
             agent = agents[0]
             if agent["done"]:
                 break
-            x, y, heading = worlds._host.readout[0, :3]
+            x, y, heading = worlds.pose[0].tolist()
             touch = make_touch(
                 now,
                 total_force=agent["total"],
@@ -71,9 +75,8 @@ def test_motion_is_that_of_the_strategy(
             distance = np.hypot(goal.x - tip[0], goal.y - tip[1])
             if distance >= NEAR_GOAL_M or touch.total_force >= NEAR_GOAL_N:
                 twist = with_residual(twist, residual, heading, p)
-            arrays = (agents, worlds._rings, worlds._skin, *worlds._host.all)
-            decide_some(0, 1, 1, *arrays)
-            wanted = worlds._host.wanted[0]
+            worlds.run(1)
+            wanted = worlds._world["wanted"].kernel[0]
             assert wanted == pytest.approx([twist.vx, twist.vy, twist.omega], abs=1e-12)
             sweeps += strategy.activity.startswith("sweep")
             now = after(now, CYCLE_S)
@@ -82,7 +85,7 @@ def test_motion_is_that_of_the_strategy(
 
 def run(worlds: Cupboards, actions: np.ndarray, decisions: int) -> list[Any]:
     with worlds:
-        return [worlds.step(actions) for _ in range(decisions)]
+        return [worlds.step(torch.from_numpy(actions)) for _ in range(decisions)]
 
 
 def test_same_seed_gives_the_same_bits_in_any_number_of_threads(bank: Bank) -> None:
@@ -96,7 +99,7 @@ def test_same_seed_gives_the_same_bits_in_any_number_of_threads(bank: Bank) -> N
     ]
     for one, other in zip(*turns, strict=True):
         for name in ("observations", "privileged", "rewards", "ended", "force_n"):
-            assert np.array_equal(getattr(one, name), getattr(other, name)), name
+            assert torch.equal(getattr(one, name), getattr(other, name)), name
 
 
 def test_mirrored_scene_mirrors_the_reach(bank: Bank) -> None:
@@ -108,19 +111,19 @@ def test_mirrored_scene_mirrors_the_reach(bank: Bank) -> None:
     action = np.array([[0.2, 0.4, -0.3]] * n + [[0.2, -0.4, 0.3]] * n)
     with worlds:
         for _ in range(8):
-            worlds.step(action)
-        pose = worlds._host.readout[:, :3]
+            worlds.step(torch.from_numpy(action))
+        pose = worlds.pose.numpy()
         assert pose[n:] == pytest.approx(pose[:n] * [1, -1, -1], abs=1e-6)
 
 
 def test_every_reach_ends_by_its_limit_and_begins_anew(bank: Bank) -> None:
     back = np.tile((-2.0, 0.0, 0.0), (4, 1))  # out of the cupboard, never to arrive
     turns = run(Cupboards(bank, 4, np.random.default_rng(1), variety=NO_VARIETY), back, 201)
-    assert not np.any([turn.ended for turn in turns[:199]])
+    assert not any(turn.ended.any() for turn in turns[:199])
     assert turns[199].ended.all()
     assert not turns[199].arrived.any()
-    assert turns[199].seconds == pytest.approx(20.0)
-    assert turns[200].seconds == pytest.approx(0.1)
+    assert turns[199].seconds.tolist() == pytest.approx([20.0] * 4)
+    assert turns[200].seconds.tolist() == pytest.approx([0.1] * 4)
 
 
 def test_arrival_is_worth_more_the_sooner_it_comes(bank: Bank) -> None:
@@ -128,7 +131,9 @@ def test_arrival_is_worth_more_the_sooner_it_comes(bank: Bank) -> None:
     worlds = Cupboards(bank, 8, np.random.default_rng(1), variety=NO_VARIETY, reward=reward)
     turns = run(worlds, np.zeros((8, 3)), 200)
     arrived = [
-        (turn.seconds[w], turn.rewards[w]) for turn in turns for w in np.flatnonzero(turn.arrived)
+        (float(turn.seconds[w]), float(turn.rewards[w]))
+        for turn in turns
+        for w in np.flatnonzero(turn.arrived)
     ]
     assert len(arrived) >= 3
     for seconds, worth in arrived:
@@ -145,10 +150,8 @@ def test_touch_through_taxels_is_late_and_seldom(bank: Bank) -> None:
         worlds = Cupboards(bank, 1, np.random.default_rng(1), variety=variety, rows=[0])
         totals = []
         with worlds:
-            worlds._agents["ahead"] = 0.0
-            arrays = (worlds._agents, worlds._rings, worlds._skin, *worlds._host.all)
             for _ in range(300):
-                decide_some(0, 1, 1, *arrays)
+                worlds.run(1)
                 totals.append(float(worlds._agents["total"][0]))
         return totals
 

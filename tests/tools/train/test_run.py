@@ -11,7 +11,10 @@ import pytest
 pytest.importorskip("torch", reason="no torch: pip install 'tactile-reach[learn]'")
 pytest.importorskip("numba", reason="no numba: pip install 'tactile-reach[train]'")
 
+import torch
+
 from reachd.strategies.learned import load_policy
+from reachd.strategies.memory import WIDTH
 from tactile_tools.cli import main
 from tactile_tools.train.cupboards import PRIVILEGED
 from tactile_tools.train.ppo import ACTIONS, Batch, Learner, Noise, advantages_of
@@ -28,13 +31,13 @@ SMALL = Settings(
 
 def test_advantages_follow_their_definition() -> None:
     """δ_k + γλ δ_{k+1} + …, cut where a reach ends (Schulman et al. 2016, equation 16)."""
-    rng = np.random.default_rng(0)
+    generator = torch.Generator().manual_seed(0)
     t, n, discount, trace = 5, 3, 0.9, 0.8
-    rewards = rng.normal(size=(t, n)).astype(np.float32)
-    values = rng.normal(size=(t + 1, n)).astype(np.float32)
-    ended = np.zeros((t, n), bool)
+    rewards = torch.randn((t, n), generator=generator)
+    values = torch.randn((t + 1, n), generator=generator)
+    ended = torch.zeros((t, n), dtype=torch.bool)
     ended[2, 1] = True
-    empty = np.zeros((t, n, 1), np.float32)
+    empty = torch.zeros((t, n, 1))
     batch = Batch(empty, empty, empty, rewards, rewards, ended, values)
     found, returns = advantages_of(batch, discount, trace)
     for w in range(n):
@@ -46,35 +49,39 @@ def test_advantages_follow_their_definition() -> None:
                 if ended[j, w]:
                     break
                 weight *= discount * trace
-            assert found[k, w] == pytest.approx(total, abs=1e-5)
-    assert returns == pytest.approx(found + values[:-1])
+            assert float(found[k, w]) == pytest.approx(float(total), abs=1e-5)
+    assert torch.equal(returns, found + values[:-1])
 
 
 def test_learner_moves_towards_what_was_rewarded() -> None:
     learner = Learner(Learning(hidden=(16,), epochs=4, rate=3e-3), "cpu", 0)
-    rng = np.random.default_rng(0)
+    generator = torch.Generator().manual_seed(0)
     t, n = 8, 64
     for _ in range(15):
-        seen = rng.normal(size=(t, n, 270)).astype(np.float32)[:, :, : learner.actor[0].in_features]
-        hidden = np.zeros((t, n, PRIVILEGED), np.float32)
-        draws = rng.standard_normal((t, n, ACTIONS)).astype(np.float32)
+        seen = torch.randn((t, n, WIDTH), generator=generator)
+        hidden = torch.zeros((t, n, PRIVILEGED))
+        draws = torch.randn((t, n, ACTIONS), generator=generator)
         drawn = [learner.act(seen[k], hidden[k], draws[k]) for k in range(t)]
-        actions = np.stack([d[0] for d in drawn])
+        actions = torch.stack([d[0] for d in drawn])
         rewards = -((actions[:, :, 0] - 0.6) ** 2)
-        values = np.stack([*(d[2] for d in drawn), drawn[-1][2]])
-        ended = np.ones((t, n), bool)
-        chances = np.stack([d[1] for d in drawn])
-        learner.learn(Batch(seen, hidden, actions, chances, rewards, ended, values), rng)
-    mean = learner.policy({})(rng.normal(size=(200, seen.shape[2])).astype(np.float32)).mean(0)
+        values = torch.stack([*(d[2] for d in drawn), drawn[-1][2]])
+        ended = torch.ones((t, n), dtype=torch.bool)
+        chances = torch.stack([d[1] for d in drawn])
+        batch = Batch(seen, hidden, actions, chances, rewards, ended, values)
+        learner.learn(batch, generator)
+    seen = torch.randn((200, WIDTH), generator=generator)
+    mean = learner.policy({})(seen.numpy()).mean(0)
     assert mean[0] > 0.25
     assert abs(mean[1]) < 0.2
+    # What runs on the arm is what was trained.
+    assert learner.mean(seen).numpy() == pytest.approx(learner.policy({})(seen.numpy()), abs=1e-5)
 
 
 @pytest.mark.parametrize("lasting", [0.0, 0.5, 1.0])
 def test_noise_is_standard_normal_and_the_lasting_share_decays(lasting: float) -> None:
     """Correlation over k decisions: share · exp(-k · 0.1 s / time constant)."""
-    noise = Noise(4000, lasting, 0.5, np.random.default_rng(0))
-    draws = np.stack([noise.draw() for _ in range(12)])
+    noise = Noise(4000, lasting, 0.5, torch.Generator().manual_seed(0))
+    draws = torch.stack([noise.draw() for _ in range(12)]).numpy()
     assert draws.dtype == np.float32
     assert draws.mean() == pytest.approx(0.0, abs=0.01)
     assert draws.std() == pytest.approx(1.0, abs=0.01)

@@ -34,6 +34,11 @@ def fill(parser: Parser) -> None:
     parser.add_argument(
         "--config", type=Path, metavar="FILE", help="settings (docs/configuration.md, Training)"
     )
+    add_path(
+        parser,
+        "--start-from",
+        "folder of another run, whose networks a new one begins with; layers may be wider here",
+    )
     parser.add_argument(
         "--minutes",
         type=positive("minutes"),
@@ -45,11 +50,15 @@ def fill(parser: Parser) -> None:
         "--device",
         choices=DEVICES,
         default="cpu",
-        help="what computes the network (default %(default)s); cupboards run on --jobs threads",
+        help="where cupboards move and the network learns (default %(default)s)",
     )
     cores = os.cpu_count() or 1
     parser.add_argument(
-        "--jobs", type=count, default=cores, metavar="N", help=f"threads (default {cores})"
+        "--jobs",
+        type=count,
+        default=cores,
+        metavar="N",
+        help=f"threads of the processor (default {cores})",
     )
     parser.set_defaults(
         func=later("tactile_tools.train.cli:train", "torch", "numba", "mujoco", extra="learn")
@@ -65,7 +74,7 @@ def train(options: argparse.Namespace) -> int:
     out: Path = options.out or Path("runs/train")
     try:
         settings = Settings() if options.config is None else load_toml(options.config, Settings)
-        run = Run(out, settings, options.device, options.jobs, _say)
+        run = Run(out, settings, options.device, options.jobs, _say, options.start_from)
         run.go(options.minutes * 60.0)
     except (ConfigError, RunError) as error:
         raise CommandError(str(error), USAGE) from error

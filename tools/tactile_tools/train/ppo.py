@@ -7,11 +7,10 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
 from reachd.strategies.learned import RESIDUAL_BOUND, Policy
-from reachd.strategies.memory import DECISION_S, WIDTH, Rows
+from reachd.strategies.memory import DECISION_S, WIDTH
 from tactile_tools.train.cupboards import PRIVILEGED, Turn
 from tactile_tools.train.settings import Learning
 
@@ -35,38 +34,38 @@ class Noise:
 
     Noise that is drawn anew ten times a second cancels before a finger has moved. Noise of which
     a part lasts explores better (Hollenstein et al. 2024, "Colored Noise in PPO"); each draw alone
-    is standard normal, and counts as such.
+    is standard normal, and counts as such. ``generator``: lies on the device that draws.
     """
 
-    def __init__(self, n: int, lasting: float, lasts_s: float, rng: np.random.Generator) -> None:
-        self._rng, self._lasting = rng, lasting
+    def __init__(self, n: int, lasting: float, lasts_s: float, generator: torch.Generator) -> None:
+        self._generator, self._lasting = generator, lasting
         self._keeps = float(np.exp(-DECISION_S / lasts_s))
         self._slow = self._fresh(n)
 
-    def _fresh(self, n: int) -> Rows:
-        return self._rng.standard_normal((n, ACTIONS)).astype(np.float32)
+    def _fresh(self, n: int) -> torch.Tensor:
+        generator = self._generator
+        return torch.randn((n, ACTIONS), generator=generator, device=generator.device)
 
-    def draw(self) -> Rows:
+    def draw(self) -> torch.Tensor:
         """The draws of the next decision."""
         n, keeps = len(self._slow), self._keeps
-        self._slow = np.float32(keeps) * self._slow + np.float32(
-            np.sqrt(1.0 - keeps * keeps)
-        ) * self._fresh(n)
-        slow, fast = np.sqrt(self._lasting), np.sqrt(1.0 - self._lasting)
-        return np.float32(slow) * self._slow + np.float32(fast) * self._fresh(n)
+        self._slow = keeps * self._slow + (1.0 - keeps * keeps) ** 0.5 * self._fresh(n)
+        slow, fast = self._lasting**0.5, (1.0 - self._lasting) ** 0.5
+        mixed: torch.Tensor = slow * self._slow + fast * self._fresh(n)
+        return mixed
 
 
 @dataclass(slots=True)
 class Batch:
-    """What was seen and done in ``t`` decisions of ``n`` reaches: arrays (t, n, …)."""
+    """What was seen and done in ``t`` decisions of ``n`` reaches: tensors (t, n, …)."""
 
-    observations: Rows
-    privileged: Rows
-    actions: Rows
-    chances: Rows  # logarithm of the density with which each action was drawn
-    rewards: Rows
-    ended: NDArray[np.bool_]
-    values: Rows  # (t + 1, n)
+    observations: torch.Tensor
+    privileged: torch.Tensor
+    actions: torch.Tensor
+    chances: torch.Tensor  # logarithm of the density with which each action was drawn
+    rewards: torch.Tensor
+    ended: torch.Tensor
+    values: torch.Tensor  # (t + 1, n)
 
 
 class Learner:
@@ -85,50 +84,49 @@ class Learner:
         self._optimiser = torch.optim.Adam(self._parameters, lr=settings.rate, eps=1e-5)
         self.rate = settings.rate
 
-    def act(self, observations: Rows, privileged: Rows, draws: Rows) -> tuple[Rows, Rows, Rows]:
+    @torch.no_grad()
+    def act(
+        self, seen: torch.Tensor, privileged: torch.Tensor, draws: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Actions for (n, ·) observations with the `Noise` ``draws``, the logarithms of their
         densities, and values."""
-        with torch.no_grad():
-            seen = torch.from_numpy(observations).to(self.device)
-            mean = self.actor(seen).cpu().numpy()
-            spread = self.spread.exp().cpu().numpy()
-        values = self.values(observations, privileged)
-        chances = (-0.5 * draws**2 - np.log(spread) - 0.9189385).sum(axis=1)
-        return mean + spread * draws, chances.astype(np.float32), values
+        chances = (-0.5 * draws**2 - self.spread - 0.9189385).sum(dim=1)
+        actions = self.actor(seen) + self.spread.exp() * draws
+        return actions, chances, self._value(seen, privileged)
 
-    def values(self, observations: Rows, privileged: Rows) -> Rows:
+    @torch.no_grad()
+    def mean(self, seen: torch.Tensor) -> torch.Tensor:
+        """What the policy does without noise: residuals for (n, ·) observations."""
+        mean: torch.Tensor = self.actor(seen).clamp(-RESIDUAL_BOUND, RESIDUAL_BOUND)
+        return mean
+
+    @torch.no_grad()
+    def values(self, seen: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
         """What the critic expects from (n, ·) observations on."""
-        with torch.no_grad():
-            seen, hidden = (
-                torch.from_numpy(rows).to(self.device) for rows in (observations, privileged)
-            )
-            values: Rows = self._value(seen, hidden).cpu().numpy()
-        return values
+        return self._value(seen, privileged)
 
     def _value(self, seen: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
         value: torch.Tensor = self.critic(torch.cat([seen, privileged], dim=1))[:, 0]
         return value
 
-    def learn(self, batch: Batch, rng: np.random.Generator) -> dict[str, float]:
+    def learn(self, batch: Batch, generator: torch.Generator) -> dict[str, float]:
         """Improve actor and critic by ``batch``; returns what there is to say of it."""
         s = self.settings
         advantages, returns = advantages_of(batch, s.discount, s.trace)
-        count = advantages.size
-        flat: dict[str, torch.Tensor] = {}
-        for name, values in (
-            ("seen", batch.observations),
-            ("privileged", batch.privileged),
-            ("actions", batch.actions),
-            ("chances", batch.chances),
-            ("values", batch.values[:-1]),
-            ("advantages", (advantages - advantages.mean()) / (advantages.std() + 1e-8)),
-            ("returns", returns),
-        ):
-            array = np.ascontiguousarray(values, np.float32)
-            flat[name] = torch.from_numpy(array.reshape(count, *array.shape[2:])).to(self.device)
+        flat = {
+            "seen": batch.observations,
+            "privileged": batch.privileged,
+            "actions": batch.actions,
+            "chances": batch.chances,
+            "values": batch.values[:-1],
+            "advantages": (advantages - advantages.mean()) / (advantages.std() + 1e-8),
+            "returns": returns,
+        }
+        flat = {name: values.flatten(0, 1) for name, values in flat.items()}
+        count = len(flat["returns"])
         drift, losses = 0.0, []
         for _ in range(s.epochs):
-            order = torch.from_numpy(rng.permutation(count)).to(self.device)
+            order = torch.randperm(count, generator=generator, device=self.device)
             drift = 0.0
             for part in order.chunk(s.minibatches):
                 loss, away = self._loss({name: values[part] for name, values in flat.items()})
@@ -199,6 +197,32 @@ class Learner:
             "rate": self.rate,
         }
 
+    def adopt(self, state: dict[str, Any]) -> None:
+        """Begin with the networks of another checkpoint's `state`, whatever their width.
+
+        A layer that is wider here has the other's units, and more that are as yet without effect:
+        the function is the same. ValueError where it does not fit.
+        """
+        with torch.no_grad():
+            for network, theirs in ((self.actor, state["actor"]), (self.critic, state["critic"])):
+                own = network.state_dict()
+                if own.keys() != theirs.keys():
+                    raise ValueError("it has another number of layers")
+                layers = sorted({name.split(".")[0] for name in own}, key=int)
+                known = own[f"{layers[0]}.weight"].shape[1]
+                if theirs[f"{layers[0]}.weight"].shape[1] != known:
+                    raise ValueError("it sees other observations")
+                for layer in layers:
+                    weight, offsets = own[f"{layer}.weight"], own[f"{layer}.bias"]
+                    other = theirs[f"{layer}.weight"]
+                    if other.shape[0] > weight.shape[0]:
+                        raise ValueError(f"a layer of {other.shape[0]} is wider than here")
+                    weight[: other.shape[0], known:] = 0.0  # of units that are new
+                    weight[: other.shape[0], :known] = other
+                    offsets[: other.shape[0]] = theirs[f"{layer}.bias"]
+                    known = other.shape[0]
+                network.load_state_dict(own)
+
     def load(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint's `state`."""
         self.actor.load_state_dict(state["actor"])
@@ -209,27 +233,30 @@ class Learner:
         self.rate = float(state["rate"])
 
 
-def advantages_of(batch: Batch, discount: float, trace: float) -> tuple[Rows, Rows]:
+def advantages_of(batch: Batch, discount: float, trace: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Generalised advantages (Schulman et al. 2016, equation 16) and returns, (t, n) each."""
-    t = len(batch.rewards)
-    advantages = np.zeros_like(batch.rewards)
-    following = np.zeros(batch.rewards.shape[1], np.float32)
-    for k in range(t - 1, -1, -1):
-        goes_on = ~batch.ended[k]
+    advantages = torch.zeros_like(batch.rewards)
+    following = torch.zeros_like(batch.rewards[0])
+    for k in range(len(batch.rewards) - 1, -1, -1):
+        goes_on = (~batch.ended[k]).float()
         error = batch.rewards[k] + discount * goes_on * batch.values[k + 1] - batch.values[k]
         following = error + discount * trace * goes_on * following
         advantages[k] = following
     return advantages, advantages + batch.values[:-1]
 
 
-def gather(turns: list[tuple[Rows, Rows, Rows, Rows, Rows, Turn]], last_values: Rows) -> Batch:
-    """A batch of (observations, privileged, actions, chances, values, turn), in order."""
+Seen = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, Turn]
+"""Observations, privileged, actions, chances, values of a decision, and what it led to."""
+
+
+def gather(turns: list[Seen], last_values: torch.Tensor) -> Batch:
+    """A batch of decisions, in order."""
     return Batch(
-        np.stack([t[0] for t in turns]),
-        np.stack([t[1] for t in turns]),
-        np.stack([t[2] for t in turns]),
-        np.stack([t[3] for t in turns]),
-        np.stack([t[5].rewards for t in turns]),
-        np.stack([t[5].ended for t in turns]),
-        np.stack([*(t[4] for t in turns), last_values]),
+        torch.stack([t[0] for t in turns]),
+        torch.stack([t[1] for t in turns]),
+        torch.stack([t[2] for t in turns]),
+        torch.stack([t[3] for t in turns]),
+        torch.stack([t[5].rewards for t in turns]),
+        torch.stack([t[5].ended for t in turns]),
+        torch.stack([*(t[4] for t in turns), last_values]),
     )

@@ -17,12 +17,12 @@ import msgspec
 import numpy as np
 import torch
 
-from reachd.strategies.learned import Policy, save_policy
+from reachd.strategies.learned import RESIDUAL_BOUND, Policy, save_policy
 from sim_device.world.scene_generation import generate
 from sim_device.world.scenes import Scene
 from tactile_tools.train.cupboards import Bank, Cupboards
 from tactile_tools.train.curve import draw
-from tactile_tools.train.ppo import Learner, Noise, gather
+from tactile_tools.train.ppo import Learner, Noise, Seen, gather
 from tactile_tools.train.settings import NO_VARIETY, Settings
 
 CHECKPOINT = "checkpoint.pt"
@@ -62,29 +62,33 @@ def _scene(job: tuple[str, int]) -> Scene:
     return generate(*job)
 
 
-def judge(policy: Policy, bank: Bank, threads: int) -> Judged:
-    """One reach in each scene of ``bank``, not mirrored, felt exactly, with the policy's mean."""
+def judge(act: Callable[[torch.Tensor], torch.Tensor], bank: Bank, threads: int) -> Judged:
+    """One reach in each scene of ``bank``, not mirrored, felt exactly.
+
+    ``act``: observations (n, ·) → residuals (n, 3).
+    """
     n = bank.originals
     rng = np.random.default_rng(0)
     with Cupboards(
         bank, n, rng, variety=NO_VARIETY, threads=threads, rows=list(range(n))
     ) as worlds:
         seen, _ = worlds.observe()
-        over, arrived = np.zeros(n, bool), np.zeros(n, bool)
-        seconds, force = np.zeros(n), np.zeros(n)
+        over, arrived = (torch.zeros(n, dtype=torch.bool, device=bank.device) for _ in range(2))
+        seconds, force = (torch.zeros(n, dtype=torch.float64, device=bank.device) for _ in range(2))
         while not over.all():
-            turn = worlds.step(policy(seen))
+            turn = worlds.step(act(seen))
             seen = turn.observations
-            force = np.where(over, force, np.maximum(force, turn.force_n))
+            force = torch.where(over, force, torch.maximum(force, turn.force_n))
             now = turn.ended & ~over
             arrived |= now & turn.arrived
             seconds[now] = turn.seconds[now]
             over |= turn.ended
+    forces = force.cpu().numpy()
     return Judged(
-        float(arrived.mean()),
+        float(arrived.double().mean()),
         float(seconds.mean()),
-        float(np.median(force)),
-        float(np.percentile(force, 90)),
+        float(np.median(forces)),
+        float(np.percentile(forces, 90)),
         n,
     )
 
@@ -99,6 +103,7 @@ class Run:
         device: str,
         threads: int,
         say: Callable[[str], None],
+        start_from: Path | None = None,
     ) -> None:
         self.folder, self.settings, self._say = folder, settings, say
         self._threads = threads
@@ -111,8 +116,12 @@ class Run:
         self._keep_settings()
         self.learner = Learner(settings.learning, device, settings.seed)
         self.batches, self.decisions, self.cpu_s, self.best = 0, 0, 0.0, -1.0
+        self.started_from: str | None = None
+        if start_from is not None and not (folder / CHECKPOINT).exists():
+            self._adopt(start_from / CHECKPOINT)
         self._load()
         torch.set_num_threads(threads)
+        torch.set_float32_matmul_precision("high")  # where a GPU has matrix units for it
 
     def _keep_settings(self) -> None:
         path, mine = self.folder / SETTINGS, json.loads(msgspec.json.encode(self.settings))
@@ -138,6 +147,18 @@ class Run:
             ) from error
         self.batches, self.decisions = int(state["batches"]), int(state["decisions"])
         self.cpu_s, self.best = float(state["cpu_s"]), float(state["best"])
+        self.started_from = state.get("started_from")
+
+    def _adopt(self, path: Path) -> None:
+        """Begin with the networks of another run."""
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+            self.learner.adopt(state["learner"])
+        except FileNotFoundError as error:
+            raise RunError(f"there is no {path}; name the folder of a run") from error
+        except Exception as error:  # of any kind: PyTorch says what is wrong by many
+            raise RunError(f"cannot start from {path}: {error}") from error
+        self.started_from = f"{state['decisions'] / 1e6:.1f} M decisions of another run"
 
     def save(self) -> None:
         """Write the checkpoint in one step, so that a kill loses a minute at most."""
@@ -149,6 +170,7 @@ class Run:
                 "decisions": self.decisions,
                 "cpu_s": self.cpu_s,
                 "best": self.best,
+                "started_from": self.started_from,
             },
             new,
         )
@@ -160,6 +182,8 @@ class Run:
         bank, judged = self._banks()
         # A run that goes on draws other scenes than the one that was cut off.
         rng = np.random.default_rng([s.seed, self.batches])
+        generator = torch.Generator(self.learner.device)
+        generator.manual_seed(int(rng.integers(2**62)))
         if self.batches == 0:
             self._judge(judged)
         saved, cpu = time.monotonic(), time.process_time()
@@ -167,28 +191,31 @@ class Run:
             bank, s.worlds, rng, variety=s.variety, reward=s.reward, threads=self._threads
         ) as worlds:
             seen, privileged = worlds.observe()
-            noise = Noise(s.worlds, s.learning.lasting, s.learning.lasts, rng)
+            noise = Noise(s.worlds, s.learning.lasting, s.learning.lasts, generator)
             started, over = time.monotonic(), 0
             while time.monotonic() - started < seconds:
-                turns: list[Any] = []
-                ended = arrived = 0
+                turns: list[Seen] = []
+                began = time.monotonic()
                 for _ in range(s.learning.decisions):
                     actions, chances, values = self.learner.act(seen, privileged, noise.draw())
-                    turn = worlds.step(np.clip(actions, -2.0, 2.0))
+                    turn = worlds.step(actions.clamp(-RESIDUAL_BOUND, RESIDUAL_BOUND))
                     turns.append((seen, privileged, actions, chances, values, turn))
                     seen, privileged = turn.observations, turn.privileged
-                    ended += int(turn.ended.sum())
-                    arrived += int(turn.arrived.sum())
-                last = self.learner.values(seen, privileged)
-                told = self.learner.learn(gather(turns, last), rng)
+                batch = gather(turns, self.learner.values(seen, privileged))
+                moved = time.monotonic()
+                told = self.learner.learn(batch, generator)
+                told["moving_s"] = round(moved - began, 3)
+                told["learning_s"] = round(time.monotonic() - moved, 3)
                 self.batches += 1
                 self.decisions += s.worlds * s.learning.decisions
                 self.cpu_s += time.process_time() - cpu
                 cpu = time.process_time()
+                ended = int(batch.ended.sum())
+                arrived = sum(int(t[5].arrived.sum()) for t in turns)
                 told |= {"reaches": ended, "arrived": arrived / max(1, ended)}
                 told["early"] = over < s.worlds  # all began at once: who arrives, ends first
                 over += ended
-                told["reward"] = float(np.mean([t[5].rewards.mean() for t in turns]))
+                told["reward"] = float(batch.rewards.mean())
                 self._progress(told)
                 if self.batches % s.judge_every == 0:
                     self._judge(judged)
@@ -218,11 +245,12 @@ class Run:
             with gzip.open(new, "wt", encoding="utf-8") as file:
                 file.writelines(scene.to_json() + "\n" for scene in scenes)
             new.replace(path)
-        return Bank(scenes[: s.count]), Bank(scenes[s.count :])
+        device = self.learner.device.type
+        return Bank(scenes[: s.count], device), Bank(scenes[s.count :], device)
 
     def _judge(self, bank: Bank) -> None:
         policy = self.learner.policy(self.about())
-        found = judge(policy, bank, self._threads)
+        found = judge(self.learner.mean, bank, self._threads)
         self._progress({"judged": asdict(found)})
         save_policy(self.folder / f"last-{WEIGHTS}", policy)
         # Arriving counts; a tenth of a second, or two newtons, for a thousandth of it.
@@ -248,6 +276,7 @@ class Run:
             "torch": torch.__version__,
             "date": datetime.now(UTC).strftime("%Y-%m-%d"),
             "device": str(self.learner.device),
+            "started_from": self.started_from,
         }
 
     def _progress(self, told: dict[str, Any]) -> None:
