@@ -143,7 +143,7 @@ with Worlds([authors_sim(1), authors_sim(6)], device=device) as worlds:
 
 def run_on(device: str, **variables: str) -> np.ndarray[Any, Any]:
     done = subprocess.run(
-        [sys.executable, "-c", ON_CUDA, device, "6"],
+        [sys.executable, "-c", ON_CUDA, device, "2"],
         capture_output=True,
         text=True,
         env=os.environ | variables,
