@@ -353,7 +353,7 @@ class MotionWatch:
             aside = pushed >= s.free_air_force
             went, moves = moved[0] * ux + moved[1] * uy, mx * ux + my * uy
             reports = [a.twist.vx * ux + a.twist.vy * uy for a in states]
-            words = f"{length * 1e3:.1f} mm", f"{went * 1e3:.1f}"
+            words, noise = (f"{length * 1e3:.1f} mm", f"{went * 1e3:.1f}"), POSE_NOISE
         else:
             sign = math.copysign(1.0, length)
             pushed = math.copysign(1.0, moved[2] - length) * sum([a.mz for a in states]) / n
@@ -361,11 +361,13 @@ class MotionWatch:
             went, moves, length = moved[2] * sign, mh * sign, abs(length)
             reports = [sign * a.twist.omega for a in states]
             words = f"{math.degrees(length):.2f}°", f"{math.degrees(went):.2f}"
+            noise = POSE_NOISE / s.tip_length
         pace = length / seconds
         dead = abs(moves) < DEAD * pace * TRACK_NS / NS_PER_S
-        if 0.0 <= went < (1.0 - DISAGREES) * length:
+        if -noise <= went < (1.0 - DISAGREES) * length:
             # Held back by anything that presses on the finger, which may be wedged in any
-            # direction; or held back for a part of the window and now free.
+            # direction; or held back for a part of the window and now free. One that stays seems
+            # to go back as often as not, by as much as its pose errs.
             explained = any(
                 sum([math.hypot(a.fx, a.fy) for a in some]) >= s.free_air_force * len(some)
                 or sum([abs(a.mz) for a in some]) >= s.free_air_torque * len(some)
