@@ -61,9 +61,26 @@ def test_long_echo_delay_stops_at_once_and_latches(delay: float, delayed: Delaye
     stopped = [k for k, d in enumerate(seen) if d.twist == ZERO]
     latched = [k for k, d in enumerate(seen) if d.held is not None]
     assert stopped[0] <= 5
-    assert latched[0] - stopped[0] <= 6
+    assert latched[0] - stopped[0] == 5, "when it has lasted for 50 ms"
     assert seen[latched[0]].held is Check.ECHO_LOST
     assert "come into force" in seen[latched[0]].interventions[0].text
+
+
+def test_how_late_commands_come_into_force_is_named(delayed: DelayedCommands) -> None:
+    delayed.delay = 700.0
+    for _ in range(80):
+        decision = delayed.step()
+    texts = {i.text for i in decision.interventions if i.code is Check.ECHO_LATE}
+    assert texts == {
+        "commands come into force at the arm 700 ms late, or not at all: 50 ms are allowed"
+    }
+
+
+def test_no_command_is_due_before_the_first_was_sent(rig: Callable) -> None:
+    r = rig(armed=False)
+    for cycle in range(4):
+        decision = r.step(ZERO, arm=r.fresh_arm(-r.period, echo=Echo("r-1", 0, Instant(0))))
+        assert Check.ECHO_LATE not in {i.code for i in decision.interventions}, cycle
 
 
 def test_slowly_growing_echo_delay_is_detected_at_50_ms(delayed: DelayedCommands) -> None:

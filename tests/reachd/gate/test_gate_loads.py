@@ -67,6 +67,7 @@ def test_repeated_overloads_latch(rig: Callable) -> None:
     assert when == 80
     assert r.gate.held.code is Check.OVERLOAD_REPEATED
     assert "5 times within 5 s" in r.gate.held.text
+    assert passing(rig(*OFF, overload_passes=5.0), 10, 125) == 500, "in just five seconds"
     assert passing(rig(*OFF, overload_passes=5.0), 10, 126) is None, "over more than five seconds"
     assert passing(rig(*OFF, Check.OVERLOAD_REPEATED, overload_passes=5.0), 10, 20) is None
     assert passing(rig(*OFF), 29, 16) is None, "the set allows so many"
