@@ -179,10 +179,13 @@ def test_a_force_below_the_light_touch_changes_nothing(
         ([Constraint(0.0, 1.0, 0.0, 0.02)], (0.08 / 3, 0.02, 0.2 / 3)),
         ([Constraint(0.0, -1.0, 0.0, 0.0)], (0.04, 0.03, 0.1)),
         ([Constraint(0.6, -0.8, 0.2, 0.005)], (0.01, 0.0075, 0.025)),
-        ([Constraint(1.0, 0.0, 0.0, 0.02), Constraint(0.0, 0.0, 1.0, 0.025)], (0.01, 0.0075, 0.025)),
+        (
+            [Constraint(1.0, 0.0, 0.0, 0.02), Constraint(0.0, 0.0, 1.0, 0.025)],
+            (0.01, 0.0075, 0.025),
+        ),
         ([Constraint(0.8, 0.6, 0.0, 0.0)], (0.0, 0.0, 0.0)),
     ],
-)  # fmt: skip
+)
 def test_braking_keeps_the_path_and_no_more_speed_than_allowed(
     rules: list[Constraint], expected: tuple[float, float, float]
 ) -> None:
