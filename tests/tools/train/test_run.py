@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -131,7 +132,34 @@ def test_missing_gpu_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with pytest.raises(RunError, match="no GPU"):
         Run(tmp_path / "run", SMALL, "cuda", 1, lambda _: None)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    with pytest.raises(RunError, match="numba-cuda"):
+        Run(tmp_path / "run", SMALL, "cuda", 1, lambda _: None)
     assert not (tmp_path / "run").exists()
+
+
+def test_run_begins_with_the_networks_of_another(tmp_path: Path) -> None:
+    """In wider layers, too, and as yet it does the same."""
+    first = Run(tmp_path / "narrow", SMALL, "cpu", 1, lambda _: None)
+    for parameter in first.learner.actor.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    first.save()
+    wide = msgspec.structs.replace(SMALL, learning=Learning(hidden=(24,), decisions=4))
+    again = Run(tmp_path / "wide", wide, "cpu", 1, lambda _: None, tmp_path / "narrow")
+    seen = torch.randn((20, WIDTH), generator=torch.Generator().manual_seed(0))
+    assert again.learner.mean(seen).numpy() == pytest.approx(
+        first.learner.mean(seen).numpy(), abs=1e-5
+    )
+    assert first.learner.mean(seen).std() > 0.1
+    assert again.about()["started_from"] == "0.0 M decisions of another run"
+    other = msgspec.structs.replace(SMALL, learning=Learning(hidden=(8, 8), decisions=4))
+    with pytest.raises(RunError, match="number of layers"):
+        Run(tmp_path / "other", other, "cpu", 1, lambda _: None, tmp_path / "narrow")
+    small = msgspec.structs.replace(SMALL, learning=Learning(hidden=(8,), decisions=4))
+    with pytest.raises(RunError, match="wider than here"):
+        Run(tmp_path / "small", small, "cpu", 1, lambda _: None, tmp_path / "narrow")
+    with pytest.raises(RunError, match="name the folder of a run"):
+        Run(tmp_path / "none", SMALL, "cpu", 1, lambda _: None, tmp_path / "nothing")
 
 
 @pytest.mark.parametrize("name", ["checkpoint.pt", "scenes.jsonl.gz"])

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from reachd.strategies.learned import RESIDUAL_BOUND, Policy, save_policy
+from sim_device.world import planar_cuda
 from sim_device.world.scene_generation import generate
 from sim_device.world.scenes import Scene
 from tactile_tools.train.cupboards import Bank, Cupboards
@@ -111,6 +112,11 @@ class Run:
             raise RunError(
                 "no GPU that PyTorch can use was found: leave out --device cuda, or install its "
                 "driver and a build of PyTorch for it"
+            )
+        if device == "cuda" and not planar_cuda.available():
+            raise RunError(
+                "PyTorch finds the GPU, but Numba does not: pip install 'numba-cuda[cu13]' (or "
+                "cu12, as the driver says), or leave out --device cuda"
             )
         folder.mkdir(parents=True, exist_ok=True)
         self._keep_settings()
