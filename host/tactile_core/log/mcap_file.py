@@ -11,12 +11,13 @@ import errno
 import fcntl
 import os
 import struct
+import tempfile
 import zlib
 from array import array
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import IO, Protocol
 
 import zstandard
 
@@ -33,6 +34,9 @@ CHUNK_HEAD = struct.Struct("<QQQI")
 
 ZSTD_LEVEL = 1
 """Takes little more than half the time of level 3 and compresses taxel data as well."""
+
+INDEX_BYTES = 1 << 20
+"""Bytes of the chunk index that are held in memory; two thousand chunks of forty channels."""
 
 
 class Storage(Protocol):
@@ -192,6 +196,62 @@ class SealedChunk:
     uncompressed_size: int
 
 
+class ChunkIndex:
+    """Chunk index records of a file, past INDEX_BYTES in an unnamed file in ``folder``.
+
+    The index takes ten bytes per chunk and channel, so in memory it would grow with the log.
+    """
+
+    __slots__ = ("_file", "_folder", "_held", "_limit", "_stored", "size")
+
+    def __init__(self, folder: Path) -> None:
+        self.size = 0
+        self._folder = folder
+        self._held = bytearray()
+        self._limit = INDEX_BYTES
+        self._file: IO[bytes] | None = None
+        self._stored = 0
+
+    def add(self, record: bytes) -> None:
+        """Append a record. Never fails: what the disk does not take stays in memory."""
+        self._held += record
+        self.size += len(record)
+        if len(self._held) >= self._limit:
+            self._store()
+
+    def pieces(self) -> Iterator[bytes]:
+        """Yield all records in order. Raises OSError where the disk cannot be read."""
+        if self._file is not None:
+            for at in range(0, self._stored, INDEX_BYTES):
+                self._file.seek(at)
+                size = min(INDEX_BYTES, self._stored - at)
+                piece = self._file.read(size)
+                if len(piece) < size:
+                    raise OSError(errno.EIO, "the index of the chunks cannot be read again")
+                yield piece
+        yield bytes(self._held)
+
+    def close(self) -> None:
+        """Remove the file, if there is one."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _store(self) -> None:
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
+            self._file.seek(self._stored)
+            left = memoryview(self._held)
+            while left:
+                left = left[self._file.write(left) :]
+        except OSError:
+            self._limit = 2 * len(self._held)  # not with every chunk
+            return
+        self._stored += len(self._held)
+        self._held = bytearray()
+
+
 class McapFile:
     """Writer of one file: ``add_*`` stage records; `commit` writes all of them or none."""
 
@@ -204,7 +264,7 @@ class McapFile:
         self._staged: list[tuple[bytes, Callable[[int], None]]] = []
         self._schemas: list[bytes] = []
         self._channels: list[bytes] = []
-        self._chunk_index = bytearray()
+        self._chunk_index = ChunkIndex(path.parent)
         self._attachment_index: list[bytes] = []
         self._metadata_index: list[bytes] = []
         self._counts: dict[int, int] = {}
@@ -320,10 +380,10 @@ class McapFile:
         """
         try:
             self.commit()
-            self._put(self._summary())
+            self._put_summary()
             self.sync()
         finally:
-            self._storage.close(self._fd)
+            self.abandon()
 
     def forget(self) -> None:
         """Discard everything staged but not committed."""
@@ -331,6 +391,7 @@ class McapFile:
 
     def abandon(self) -> None:
         """Close without a summary: every record so far stays readable."""
+        self._chunk_index.close()
         self._storage.close(self._fd)
 
     def _stage(self, record: bytes, note: Callable[[int], None]) -> None:
@@ -355,7 +416,7 @@ class McapFile:
         body += struct.pack("<Q", len(chunk.data) - chunk.chunk_length)
         body += _string(chunk.compression)
         body += struct.pack("<QQ", chunk.compressed_size, chunk.uncompressed_size)
-        self._chunk_index += _record(CHUNK_INDEX, body)
+        self._chunk_index.add(_record(CHUNK_INDEX, body))
 
     def _put(self, data: bytes) -> None:
         """Append all of ``data``, or truncate the file back and raise OSError."""
@@ -375,10 +436,23 @@ class McapFile:
             raise
         self.size += len(data)
 
-    def _summary(self) -> bytes:
+    def _put_summary(self) -> None:
+        """Append the summary piece by piece, or truncate the file back and raise OSError."""
+        start = self.size
+        try:
+            for piece in self._summary():
+                self._put(piece)
+        except OSError:
+            if self.size > start:
+                self._storage.truncate(self._fd, start)
+                self.size = start
+            raise
+
+    def _summary(self) -> Iterator[bytes]:
         """Everything after the data: end mark, summary, its offsets, footer, magic."""
         end = _record(DATA_END, struct.pack("<I", 0))
-        start = self.size + len(end)
+        start = at = self.size + len(end)
+        yield end
         counts = b"".join(struct.pack("<HQ", c, n) for c, n in sorted(self._counts.items()))
         statistics = struct.pack(
             "<QHIIIIQQI",
@@ -392,21 +466,23 @@ class McapFile:
             self._end_ns,
             len(counts),
         )
-        groups = (
-            (SCHEMA, b"".join(self._schemas)),
-            (CHANNEL, b"".join(self._channels)),
-            (STATISTICS, _record(STATISTICS, statistics + counts)),
-            (CHUNK_INDEX, bytes(self._chunk_index)),
-            (ATTACHMENT_INDEX, b"".join(self._attachment_index)),
-            (METADATA_INDEX, b"".join(self._metadata_index)),
+        groups: tuple[tuple[int, Iterable[bytes]], ...] = (
+            (SCHEMA, self._schemas),
+            (CHANNEL, self._channels),
+            (STATISTICS, [_record(STATISTICS, statistics + counts)]),
+            (CHUNK_INDEX, self._chunk_index.pieces()),
+            (ATTACHMENT_INDEX, self._attachment_index),
+            (METADATA_INDEX, self._metadata_index),
         )
-        summary, offsets = bytearray(), bytearray()
-        for opcode, group in groups:
-            if group:
-                place = struct.pack("<BQQ", opcode, start + len(summary), len(group))
-                offsets += _record(SUMMARY_OFFSET, place)
-            summary += group
-        footer = struct.pack("<QQ", start, start + len(summary))
-        summary += offsets
-        checked = bytes(summary) + RECORD.pack(FOOTER, len(footer) + 4) + footer
-        return end + checked + struct.pack("<I", zlib.crc32(checked)) + MAGIC
+        offsets, crc = bytearray(), 0
+        for opcode, pieces in groups:
+            size = 0
+            for piece in pieces:
+                crc, size = zlib.crc32(piece, crc), size + len(piece)
+                yield piece
+            if size:
+                offsets += _record(SUMMARY_OFFSET, struct.pack("<BQQ", opcode, at, size))
+                at += size
+        footer = struct.pack("<QQ", start, at)
+        rest = bytes(offsets) + RECORD.pack(FOOTER, len(footer) + 4) + footer
+        yield rest + struct.pack("<I", zlib.crc32(rest, crc)) + MAGIC
