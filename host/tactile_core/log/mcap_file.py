@@ -38,6 +38,9 @@ ZSTD_LEVEL = 1
 INDEX_BYTES = 1 << 20
 """Bytes of the chunk index that are held in memory; two thousand chunks of forty channels."""
 
+PIECE = 1 << 16
+"""Bytes of the index that are read back at once."""
+
 
 class Storage(Protocol):
     """File-system calls of a log; tests replace them to simulate a full disk."""
@@ -149,9 +152,27 @@ class ChunkBuffer:
 
     def seal(self, compressor: zstandard.ZstdCompressor) -> SealedChunk:
         """Compress (other threads can run meanwhile) and add the message indexes."""
-        compressed = compressor.compress(self.data)
+        return self._sealed(compressor.compress(self.data), len(self.data), zlib.crc32(self.data))
+
+    @classmethod
+    def copy(
+        cls, compressed: bytes, size: int, crc: int, index: dict[int, array[int]]
+    ) -> SealedChunk:
+        """Make a chunk of messages that are compressed already, as one zstd frame.
+
+        ``size``, ``crc``: of the messages. ``index``: by channel, alternately the log time of a
+        message and its place; not empty.
+        """
+        chunk = cls()
+        chunk.index = index
+        chunk.messages = sum(len(times) for times in index.values()) // 2
+        chunk.start_ns = min(min(times[::2]) for times in index.values())
+        chunk.end_ns = max(max(times[::2]) for times in index.values())
+        return chunk._sealed(compressed, size, crc)
+
+    def _sealed(self, compressed: bytes, size: int, crc: int) -> SealedChunk:
         body = (
-            CHUNK_HEAD.pack(self.start_ns, self.end_ns, len(self.data), zlib.crc32(self.data))
+            CHUNK_HEAD.pack(self.start_ns, self.end_ns, size, crc)
             + _string("zstd")
             + struct.pack("<Q", len(compressed))
         )
@@ -176,7 +197,7 @@ class ChunkBuffer:
             end_ns=self.end_ns,
             compression="zstd",
             compressed_size=len(compressed),
-            uncompressed_size=len(self.data),
+            uncompressed_size=size,
         )
 
 
@@ -222,14 +243,15 @@ class ChunkIndex:
     def pieces(self) -> Iterator[bytes]:
         """Yield all records in order. Raises OSError where the disk cannot be read."""
         if self._file is not None:
-            for at in range(0, self._stored, INDEX_BYTES):
+            for at in range(0, self._stored, PIECE):
                 self._file.seek(at)
-                size = min(INDEX_BYTES, self._stored - at)
+                size = min(PIECE, self._stored - at)
                 piece = self._file.read(size)
                 if len(piece) < size:
                     raise OSError(errno.EIO, "the index of the chunks cannot be read again")
                 yield piece
-        yield bytes(self._held)
+        for at in range(0, len(self._held), PIECE):
+            yield bytes(self._held[at : at + PIECE])
 
     def close(self) -> None:
         """Remove the file, if there is one."""

@@ -420,6 +420,36 @@ class LogReader:
         if at < end and not block.partial:
             self.note_damage(Damage(block.offset, 0, "a chunk whose records do not fit into it"))
 
+    def index(self, block: Block, channels: Container[int]) -> dict[int, array[int]] | None:
+        """Times and places of the messages of a block, for a copy of its bytes.
+
+        Returns alternately log time and place within the block, by channel. None if the block
+        holds anything but whole messages of ``channels``: `messages` reads it then.
+        """
+        data, at, end = block.data, 0, len(block.data)
+        head, message, fixed = op.MESSAGE_HEAD.unpack_from, op.MESSAGE, op.MESSAGE_FIXED
+        last = end - op.MESSAGE_HEAD.size
+        found: dict[int, array[int]] = {}
+        count = 0
+        while at <= last:
+            opcode, length, channel, _, log_ns, _ = head(data, at)
+            if opcode != message or length < fixed:
+                return None
+            times = found.get(channel)
+            if times is None:
+                if channel not in channels:
+                    return None
+                times = found[channel] = array("Q")
+            times.append(log_ns)
+            times.append(at)
+            at += 9 + length
+            count += 1
+        if at != end or not count:
+            return None
+        self._read += 1
+        self._messages += count
+        return found
+
     def check_structure(self) -> None:
         """Raise `LogError` unless the sequence of records is valid; does not decompress chunks."""
         position = self._start()
@@ -723,8 +753,8 @@ class LogReader:
                     f"a chunk compressed with {head.compression!r}, which is not read here"
                 )
             if head.size <= SMALL and head.data_length <= SMALL:
-                data = unpack(self.read_at, packed)
-                return after, Block(position, data, head.crc != 0)
+                data, frame = unpack(self.read_at, packed)
+                return after, Block(position, data, head.crc != 0, frame=frame, crc=head.crc)
             if head.crc:
                 verify(self.read_at, packed)
             return after, Block(position, b"", head.crc != 0, packed)

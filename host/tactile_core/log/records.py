@@ -104,7 +104,9 @@ class Block:
     """A run of message, schema and channel records: ``data``, or ``packed`` if large.
 
     ``verified``: its checksum was right. ``partial``: its end is missing, which was reported.
-    ``suspect``: its checksum is wrong, but it is read nevertheless.
+    ``suspect``: its checksum is wrong, but it is read nevertheless. ``frame``: ``data``
+    as it is in the file, if that is one zstd frame and nothing else, so that it can be copied as it
+    is; else empty. ``crc``: checksum of ``data``, 0 if none.
     """
 
     offset: int
@@ -113,6 +115,8 @@ class Block:
     packed: Packed | None = None
     partial: bool = False
     suspect: bool = False
+    frame: bytes = b""
+    crc: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -465,22 +469,32 @@ def verify(read_at: ReadAt, packed: Packed) -> None:
     _check(size, crc, packed.head)
 
 
-def unpack(read_at: ReadAt, packed: Packed) -> bytes:
-    """Decompress and check a whole chunk of at most `SMALL` bytes. Raises `BadRecordError`."""
+def unpack(read_at: ReadAt, packed: Packed) -> tuple[bytes, bytes]:
+    """Decompress and check a whole chunk of at most `SMALL` bytes. Raises `BadRecordError`.
+
+    Returns also the compressed bytes if they are one zstd frame and nothing else, else none.
+    """
     head = packed.head
     raw = read_at(packed.place, packed.length)
     data: bytes | None = None
+    frame = b""
     if head.compression == "":
         data = raw
     elif head.compression == "zstd" and _stated_size(raw) == head.size > 0:
-        try:  # one frame that states its size, as from nearly every writer: decompress at once
-            data = zstandard.ZstdDecompressor().decompress(raw, max_output_size=head.size)
+        # One frame that states its size, as from nearly every writer: decompress at once.
+        unpacker = zstandard.ZstdDecompressor()
+        try:
+            data = unpacker.decompress(raw, max_output_size=head.size, allow_extra_data=False)
+            frame = raw
         except (zstandard.ZstdError, MemoryError):
-            raise BadRecordError("a chunk that does not decompress") from None
+            try:  # perhaps with something after it
+                data = unpacker.decompress(raw, max_output_size=head.size)
+            except (zstandard.ZstdError, MemoryError):
+                raise BadRecordError("a chunk that does not decompress") from None
     if data is None:
         data = b"".join(pieces(read_at, packed))
     _check(len(data), zlib.crc32(data) if head.crc else 0, head)
-    return data
+    return data, frame
 
 
 def unpack_what_can_be(read_at: ReadAt, packed: Packed) -> bytes:

@@ -10,7 +10,13 @@ from pathlib import Path
 
 import zstandard
 
-from tactile_core.log.mcap_file import ZSTD_LEVEL, ChunkBuffer, DiskStorage, McapFile
+from tactile_core.log.mcap_file import (
+    ZSTD_LEVEL,
+    ChunkBuffer,
+    DiskStorage,
+    McapFile,
+    SealedChunk,
+)
 from tactile_core.log.reader import LogReader
 from tactile_core.log.records import (
     AttachmentRecord,
@@ -23,7 +29,10 @@ from tactile_core.log.records import (
 )
 
 CHUNK_BYTES = 1 << 18
-"""Size in bytes of chunks made from small blocks and from messages outside chunks."""
+"""Size in bytes of chunks made from small blocks and from messages outside chunks.
+
+Larger blocks with a right checksum are copied as they are.
+"""
 
 SUSPECT = "suspect"
 """Metadata table of a recovered log that marks a kept block with a wrong checksum."""
@@ -182,6 +191,8 @@ class _Copy:
         reader, report, channels = self._reader, self._report, self._channels
         if event.suspect:
             self._flush(file)
+        if self._copy_block(file, event):
+            return
         for message in reader.messages(event):
             if message.channel not in channels:
                 channel = reader.channels.get(message.channel)
@@ -201,6 +212,21 @@ class _Copy:
         if event.suspect:
             self._flush(file, suspect=True)
 
+    def _copy_block(self, file: McapFile, event: Block) -> bool:
+        """Copy the compressed bytes of a block; False if its messages must be copied one by one.
+
+        The bytes are those whose checksum was right, and the index is made anew from them. A block
+        that defines channels, or holds messages of unknown ones, would not be the same afterwards.
+        """
+        if not event.frame or not event.verified or len(event.data) < CHUNK_BYTES:
+            return False
+        index = self._reader.index(event, self._channels)
+        if index is None:
+            return False
+        self._flush(file)
+        self._add(file, ChunkBuffer.copy(event.frame, len(event.data), event.crc, index))
+        return True
+
     def _flush(self, file: McapFile, suspect: bool = False) -> None:
         """Write the collected messages as one chunk."""
         chunk, report = self._chunk, self._report
@@ -211,7 +237,11 @@ class _Copy:
             span = {"first_ns": str(chunk.start_ns), "last_ns": str(chunk.end_ns)}
             file.add_metadata(SUSPECT, span | {"messages": str(chunk.messages)})
             report.metadata += 1
-        file.add_chunk(chunk.seal(self._compressor))
+        self._add(file, chunk.seal(self._compressor))
+
+    def _add(self, file: McapFile, chunk: SealedChunk) -> None:
+        report = self._report
+        file.add_chunk(chunk)
         report.messages += chunk.messages
         if report.start_ns is None or report.end_ns is None:
             report.start_ns, report.end_ns = chunk.start_ns, chunk.end_ns
