@@ -17,6 +17,7 @@ from tactile_core.bus.messages import DecodeError
 from tactile_core.bus.topics import RAW, find_topic
 from tactile_core.cli import progress, require
 from tactile_tools.log.arguments import Selection, select
+from tactile_tools.log.batches import REFUSED
 from tactile_tools.log.sources import find_series
 from tactile_tools.log.stream import Reading, Record, Stream, read_merged
 from tactile_tools.log.terminal import (
@@ -29,9 +30,9 @@ from tactile_tools.log.terminal import (
 )
 
 if TYPE_CHECKING:
+    from tactile_tools.log.batches import Table
     from tactile_tools.log.columns import Column
     from tactile_tools.log.decode import Decoder
-    from tactile_tools.log.tables import Table
 
 FORMATS = ("csv", "parquet", "npz", "lerobot")
 
@@ -131,8 +132,8 @@ class _Export:
         self.decoder = decoder
         self.reading = Reading()
         self.widths: dict[Stream, dict[str, int]] = {}
+        from tactile_tools.log.batches import Budget
         from tactile_tools.log.columns import FileNames
-        from tactile_tools.log.tables import Budget
 
         self._kind = kind
         self._start_ns = start_ns
@@ -147,19 +148,24 @@ class _Export:
     def take(self, record: Record) -> None:
         """Write one message."""
         stream = record.stream
-        try:
-            message = self.decoder.decode(stream, record.data)
-        except DecodeError as error:
-            self.refused.setdefault(stream.topic, str(error))
-            self.undecoded[stream.topic] = self.undecoded.get(stream.topic, 0) + 1
-            return
         table = self.tables.get(stream)
         if table is None:
+            if self.decode(stream, record.data) is REFUSED:
+                return  # only a stream that can be read gets a table
             table = self.tables[stream] = self._make(stream)
-        table.add(record, message)
+        table.add(record)
         if self._budget.spent:
             for each in self.tables.values():
                 each.relieve()
+
+    def decode(self, stream: Stream, data: bytes) -> Any:
+        """Decode a message; `REFUSED`, and counted, where that is not possible."""
+        try:
+            return self.decoder.decode(stream, data)
+        except DecodeError as error:
+            self.refused.setdefault(stream.topic, str(error))
+            self.undecoded[stream.topic] = self.undecoded.get(stream.topic, 0) + 1
+            return REFUSED
 
     def columns(self, stream: Stream) -> list[Column]:
         """Columns of the table of a stream."""
@@ -185,16 +191,17 @@ class _Export:
         (self.folder / CONTENTS).write_text(text + "\n", encoding="utf-8")
 
     def _make(self, stream: Stream) -> Table:
+        decode = partial(self.decode, stream)
         path, columns = self.folder / self._files.add(stream), self.columns(stream)
         if self._kind == "npz":
             from tactile_tools.log.npz import NpzTable
 
             scratch = path.with_suffix(".parts")
-            return NpzTable(path, columns, self._start_ns, scratch, self._budget)
+            return NpzTable(path, columns, self._start_ns, scratch, decode, self._budget)
         from tactile_tools.log.tables import ArrowTable
 
         widths = self.widths.get(stream, {}) if self._kind == "csv" else None
-        return ArrowTable(path, stream, columns, self._start_ns, widths, self._budget)
+        return ArrowTable(path, stream, columns, self._start_ns, widths, decode, self._budget)
 
 
 def _export(chosen: Selection, kind: str, folder: Path) -> _Export:

@@ -1,7 +1,7 @@
 """NumPy archives of messages.
 
-Columns grow in files of their own and are packed at the end, so that memory does not depend on the
-length of a log.
+Columns grow in files of their own, batch by batch, and are packed at the end, so that memory does
+not depend on the length of a log.
 """
 
 from __future__ import annotations
@@ -9,99 +9,86 @@ from __future__ import annotations
 import io
 import json
 import shutil
+import sys
 import zipfile
-from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tactile_tools.log.batches import NOTES, OWN, Budget, Table
 from tactile_tools.log.columns import Column
 from tactile_tools.log.decode import finite
 from tactile_tools.log.stream import Record
-from tactile_tools.log.tables import NOTES, OWN, Budget
 
 MAX_TEXT_BYTES = 256 << 20
 """Largest column of texts in NumPy's own form, in which all are as long as the longest, bytes.
 Larger ones are kept as UTF-8 with offsets."""
 
-PIECE = 1 << 20
-
-HELD = 1 << 16
-"""Bytes of a column that are held in memory."""
+PIECE = 1 << 18
+"""Bytes packed at once."""
 
 
 class _Growing:
     """Raw bytes of one array, in a file that is open only while it is written to."""
 
-    def __init__(self, path: Path, dtype: np.dtype[Any], budget: Budget) -> None:
+    def __init__(self, path: Path, dtype: np.dtype[Any]) -> None:
         self.path = path
         self.dtype = dtype
         self.count = 0
-        self._budget = budget
-        self._held = bytearray()
 
-    def add(self, values: Any) -> None:
+    def add(self, values: np.ndarray[Any, Any]) -> None:
         """Append numbers."""
-        data = np.ascontiguousarray(values, self.dtype)
-        self.count += data.size
-        self.add_bytes(data.tobytes())
+        self.add_bytes(values.astype(self.dtype, copy=False).tobytes(), values.size)
 
-    def add_bytes(self, data: bytes) -> None:
-        """Append bytes; `add` of another array keeps their lengths."""
-        self._held += data
-        self._budget.held += len(data)
-        if len(self._held) >= HELD:
-            self.flush()
-
-    def flush(self) -> None:
-        """Write all held bytes to the file."""
+    def add_bytes(self, data: bytes, count: int) -> None:
+        """Append the bytes of ``count`` numbers."""
+        self.count += count
         with self.path.open("ab") as file:
-            file.write(self._held)
-        self._budget.held -= len(self._held)
-        self._held.clear()
+            file.write(data)
 
 
-class NpzTable:
+class NpzTable(Table):
     """One archive.
 
     Lists of equal length make a matrix; others are stored flat beside their offsets.
     """
 
     def __init__(
-        self, path: Path, columns: list[Column], start_ns: int, scratch: Path, budget: Budget
+        self,
+        path: Path,
+        columns: list[Column],
+        start_ns: int,
+        scratch: Path,
+        decode: Callable[[bytes], Any],
+        budget: Budget,
     ) -> None:
-        self.rows = 0
+        super().__init__(decode, budget)
         self._path = path
         self._columns = columns
         self._start_ns = start_ns
         self._scratch = scratch
-        self._budget = budget
         scratch.mkdir()
         self._growing: dict[str, _Growing] = {}
+        self._ends: dict[str, int] = {}  # last offset by name
         self._lengths: dict[str, tuple[int, bool]] = {}  # of the first list; whether all agree
         self._longest: dict[str, int] = {}
         self._notes: dict[str, str] = dict(NOTES)
 
-    def add(self, record: Record, message: Any) -> None:
-        """Add a row."""
-        self.rows += 1
-        self._numbers(OWN[0], np.float64, (record.log_ns - self._start_ns) / 1e9)
-        for name, value in zip(OWN[1:3], (record.log_ns, record.publish_ns), strict=True):
-            self._numbers(name, np.uint64, value)
-        self._numbers(OWN[3], np.uint32, record.sequence)
+    def write(self, records: list[Record], messages: list[Any]) -> None:
+        """Append rows to the files of the columns."""
+        start = self._start_ns  # may be later than a message: no unsigned numbers here
+        self._numbers(OWN[0], np.float64, [(each.log_ns - start) / 1e9 for each in records])
+        self._numbers(OWN[1], np.uint64, [each.log_ns for each in records])
+        self._numbers(OWN[2], np.uint64, [each.publish_ns for each in records])
+        self._numbers(OWN[3], np.uint32, [each.sequence for each in records])
         for column in self._columns:
-            self._add(column, column.name, message)
-
-    def relieve(self) -> None:
-        """Write all held rows to the files."""
-        for growing in self._growing.values():
-            growing.flush()
+            self._add(column, column.name, messages)
 
     def close(self) -> list[dict[str, str]]:
         """Pack the archive. Returns a description of its arrays."""
-        self.relieve()
+        self.flush()
         told = []
         with zipfile.ZipFile(
             self._path, "w", zipfile.ZIP_DEFLATED, allowZip64=True, compresslevel=1
@@ -120,60 +107,54 @@ class NpzTable:
         growing = self._growing.get(name)
         if growing is None:
             path = self._scratch / str(len(self._growing))
-            growing = self._growing[name] = _Growing(path, np.dtype(dtype), self._budget)
+            growing = self._growing[name] = _Growing(path, np.dtype(dtype))
         return growing
 
-    def _numbers(self, name: str, dtype: Any, values: Any) -> None:
-        self._grow(name, dtype).add(values)
+    def _numbers(self, name: str, dtype: Any, values: list[Any]) -> None:
+        self._grow(name, dtype).add(np.array(values, dtype))
 
-    def _add(self, column: Column, name: str, message: Any) -> None:
-        value = column.get(message)
+    def _add(self, column: Column, name: str, messages: list[Any]) -> None:
+        """Append a column of several messages, or of several rows of a nested table."""
+        values = list(map(column.get, messages))
         self._notes.setdefault(name, column.note)
         if column.kind == "number":
-            self._numbers(name, column.dtype, value)
+            self._numbers(name, column.dtype, values)
         elif column.kind == "text":
-            self._text(name, value)
+            self._texts(name, values)
         elif column.kind == "numbers":
-            self._numbers(name, column.dtype, value)
-            self._length(name, len(value))
+            growing = self._grow(name, column.dtype)
+            growing.add(np.concatenate(values, dtype=growing.dtype, casting="unsafe"))
+            self._list_lengths(name, list(map(len, values)))
         elif column.kind == "texts":
-            self._text(name, json.dumps(list(value), ensure_ascii=False))
+            self._texts(name, [json.dumps(list(each), ensure_ascii=False) for each in values])
         else:
-            for row in value:
+            if rows := [row for each in values for row in each]:
                 for inner in column.fields:
                     if inner.kind in ("number", "text"):
-                        self._add(inner, f"{name}.{inner.name}", row)
+                        self._add(inner, f"{name}.{inner.name}", rows)
                     else:
-                        told = inner.get(row)
-                        if inner.kind == "numbers":
-                            told = np.asarray(told).tolist()
-                        elif inner.kind == "rows":
-                            told = [inner.to_plain(each) for each in told]
-                        text = json.dumps(finite(list(told)), ensure_ascii=False)
-                        self._text(f"{name}.{inner.name}", text)
-            self._offset(name, len(value))
+                        self._texts(f"{name}.{inner.name}", _as_json(inner, rows))
+            self._offsets(name, list(map(len, values)))
 
-    def _text(self, name: str, text: str) -> None:
-        data = text.encode("utf-8", "replace")
-        growing = self._grow(f"{name}.utf8", np.uint8)
-        growing.add_bytes(data)
-        growing.count += len(data)
-        self._longest[name] = max(self._longest.get(name, 0), len(text))
-        self._offset(f"{name}.utf8", len(data))
+    def _texts(self, name: str, texts: list[str]) -> None:
+        parts = [text.encode("utf-8", "replace") for text in texts]
+        data = b"".join(parts)
+        self._grow(f"{name}.utf8", np.uint8).add_bytes(data, len(data))
+        self._longest[name] = max(self._longest.get(name, 0), max(map(len, texts)))
+        self._offsets(f"{name}.utf8", list(map(len, parts)))
 
-    def _offset(self, name: str, length: int) -> None:
+    def _offsets(self, name: str, lengths: list[int]) -> None:
         growing = self._grow(f"{name}.offsets", np.int64)
         if not growing.count:
-            growing.add(0)
-            self._lengths[f"{name}.offsets"] = (0, True)
-        total = self._lengths[f"{name}.offsets"][0] + length
-        self._lengths[f"{name}.offsets"] = (total, True)
-        growing.add(total)
+            growing.add(np.zeros(1, np.int64))
+        ends = np.cumsum(lengths, dtype=np.int64) + self._ends.get(name, 0)
+        self._ends[name] = int(ends[-1])
+        growing.add(ends)
 
-    def _length(self, name: str, length: int) -> None:
-        first, same = self._lengths.get(name, (length, True))
-        self._lengths[name] = (first, same and first == length)
-        self._offset(name, length)
+    def _list_lengths(self, name: str, lengths: list[int]) -> None:
+        first, same = self._lengths.get(name, (lengths[0], True))
+        self._lengths[name] = (first, same and lengths.count(first) == len(lengths))
+        self._offsets(name, lengths)
 
     def _pack(self, archive: zipfile.ZipFile, name: str) -> dict[str, str]:
         growing = self._growing[name]
@@ -195,7 +176,7 @@ class NpzTable:
         note = self._notes.get(name, "")
         if count * width * 4 <= MAX_TEXT_BYTES:
             dtype = np.dtype(f"<U{width}")
-            _write(archive, name, dtype, (count,), _texts(raw, offsets, dtype))
+            _write(archive, name, dtype, (count,), _square(raw, offsets, dtype))
             return [{"name": name, "type": f"{dtype} ({count},)", "note": note}]
         _write(archive, f"{name}.utf8", raw.dtype, (raw.count,), _pieces(raw))
         _write(archive, f"{name}.utf8.offsets", offsets.dtype, (offsets.count,), _pieces(offsets))
@@ -226,13 +207,29 @@ def _pieces(growing: _Growing) -> Iterator[bytes]:
             yield piece
 
 
-def _texts(raw: _Growing, offsets: _Growing, dtype: np.dtype[Any]) -> Iterator[bytes]:
+def _as_json(column: Column, rows: list[Any]) -> list[str]:
+    """Lists within the rows of a nested table as JSON."""
+    texts = []
+    for value in map(column.get, rows):
+        told = value
+        if column.kind == "numbers":
+            told = np.asarray(value).tolist()
+        elif column.kind == "rows":
+            told = [column.to_plain(each) for each in value]
+        texts.append(json.dumps(finite(list(told)), ensure_ascii=False))
+    return texts
+
+
+def _square(raw: _Growing, offsets: _Growing, dtype: np.dtype[Any]) -> Iterator[bytes]:
+    """Texts of equal width, some at a time: all as long as the longest."""
+    rows_at_once = max(1, PIECE // dtype.itemsize)
     with raw.path.open("rb") as texts, offsets.path.open("rb") as places:
-        before = array("q", places.read(8))[0]
-        while piece := places.read(8 * 4096):
-            ends = array("q", piece)
+        before = int.from_bytes(places.read(8), sys.byteorder)
+        while piece := places.read(8 * rows_at_once):
+            ends = np.frombuffer(piece, np.int64).tolist()
+            data, start = texts.read(ends[-1] - before), before
             rows = []
             for end in ends:
-                rows.append(texts.read(end - before).decode("utf-8", "replace"))
+                rows.append(data[before - start : end - start].decode("utf-8", "replace"))
                 before = end
             yield np.array(rows, dtype).tobytes()

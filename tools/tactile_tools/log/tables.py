@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -17,66 +18,17 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
+from tactile_tools.log.batches import NOTES, OWN, Budget, Table
 from tactile_tools.log.columns import Column
 from tactile_tools.log.decode import finite
 from tactile_tools.log.stream import Record, Stream
 
-BATCH = 1024
-"""Rows per batch: some MB of the widest topic (80 taxels). A Parquet row group has ten batches."""
-
-BATCH_BYTES = 2 << 20
-"""Encoded bytes after which a batch is written in any case: as objects they take ten times that."""
-
-HELD_BYTES = 48 << 20
-"""Encoded bytes of the messages held by all tables together."""
-
-MESSAGE_BYTES = 500
-"""Bytes counted for a message besides its own."""
-
 GROUP = 10
 GROUP_BYTES = 1 << 20
-"""Encoded bytes after which a row group of a Parquet file is written in any case."""
-
-OWN = ("time_s", "log_time_ns", "publish_time_ns", "log_sequence")
-"""Columns in front: seconds since the start of the log, then what the log says of the message."""
-
-NOTES = {
-    "time_s": "s since the first message of the log",
-    "log_time_ns": "ns since the Unix epoch, when it was logged",
-    "publish_time_ns": "ns since the Unix epoch, when it was sent",
-    "log_sequence": "number of the message within its stream",
-}
+"""Bytes in Arrow's form after which a row group of a Parquet file is written in any case."""
 
 
-class Budget:
-    """Memory of all tables of an export; when it is spent, all tables write."""
-
-    def __init__(self, limit: int = HELD_BYTES) -> None:
-        self.held = 0
-        self._limit = limit
-
-    @property
-    def spent(self) -> bool:
-        """Whether the tables hold more than the limit."""
-        return self.held > self._limit
-
-
-class Table(Protocol):
-    """A table being written. ``rows``: number of rows so far."""
-
-    rows: int
-
-    def add(self, record: Record, message: Any) -> None:
-        """Add a row."""
-
-    def relieve(self) -> None:
-        """Write all held rows."""
-
-    def close(self) -> list[dict[str, str]]:
-        """Write the held rows and finish. Returns a description of the columns."""
-
-
-class ArrowTable:
+class ArrowTable(Table):
     """A CSV or Parquet file. ``widths``: of lists, each of which becomes several columns in CSV."""
 
     def __init__(
@@ -86,10 +38,10 @@ class ArrowTable:
         columns: list[Column],
         start_ns: int,
         widths: dict[str, int] | None,
+        decode: Callable[[bytes], Any],
         budget: Budget,
     ) -> None:
-        self.rows = 0
-        self._budget = budget
+        super().__init__(decode, budget)
         self._path = path
         self._stream = stream
         self._start_ns = start_ns
@@ -97,35 +49,19 @@ class ArrowTable:
         taken = {column.name for column in columns}
         self._own = tuple(name + "_" * (name in taken) for name in OWN)
         self._columns = columns
-        self._records: list[tuple[int, int, int]] = []
-        self._messages: list[Any] = []
-        self._bytes = 0
         self._batches: list[pa.RecordBatch] = []
         self._group_bytes = 0
         self._writer: Any = None
         self._schema: pa.Schema | None = None
 
-    def add(self, record: Record, message: Any) -> None:
-        """Add a row."""
-        self._records.append((record.log_ns, record.publish_ns, record.sequence))
-        self._messages.append(message)
-        size = len(record.data) + MESSAGE_BYTES
-        self._bytes += size
-        self._budget.held += size
-        self.rows += 1
-        if len(self._messages) >= BATCH or self._bytes >= BATCH_BYTES:
-            self._flush()
-
     def relieve(self) -> None:
         """Write all held rows."""
-        if self._messages:
-            self._flush()
+        self.flush()
         self._write_group()
 
     def close(self) -> list[dict[str, str]]:
         """Write the held rows and finish. Returns a description of the columns."""
-        if self._messages or self._schema is None:
-            self._flush()
+        self.flush()
         self._write_group()
         if self._writer is not None:
             self._writer.close()
@@ -137,19 +73,18 @@ class ArrowTable:
             for f in self._schema
         ]
 
-    def _flush(self) -> None:
-        names, arrays = self._own_arrays()
+    def write(self, records: list[Record], messages: list[Any]) -> None:
+        """Make a batch of rows; a group of batches is written together."""
+        names, arrays = self._own_arrays(records)
         for column in self._columns:
-            for name, values in self._arrays(column):
+            for name, values in self._arrays(column, messages):
                 names.append(name)
                 arrays.append(values)
         batch = pa.RecordBatch.from_arrays(arrays, names=names)
         if self._schema is None:
             self._schema = self._with_notes(batch.schema)
         self._batches.append(batch.replace_schema_metadata(None))
-        self._group_bytes += self._bytes
-        self._budget.held -= self._bytes
-        self._records, self._messages, self._bytes = [], [], 0
+        self._group_bytes += batch.nbytes
         full = len(self._batches) >= GROUP or self._group_bytes >= GROUP_BYTES
         if self._widths is not None or full:
             self._write_group()
@@ -171,16 +106,16 @@ class ArrowTable:
             self._writer.write_table(table)
         self._batches, self._group_bytes = [], 0
 
-    def _own_arrays(self) -> tuple[list[str], list[pa.Array]]:
-        log = np.array([each[0] for each in self._records], np.uint64)
-        sent = np.array([each[1] for each in self._records], np.uint64)
-        sequence = np.array([each[2] for each in self._records], np.uint32)
+    def _own_arrays(self, records: list[Record]) -> tuple[list[str], list[pa.Array]]:
+        log = np.array([each.log_ns for each in records], np.uint64)
+        sent = np.array([each.publish_ns for each in records], np.uint64)
+        sequence = np.array([each.sequence for each in records], np.uint32)
         start = self._start_ns  # may be later than a message: no unsigned numbers here
-        seconds = np.array([(each[0] - start) / 1e9 for each in self._records])
+        seconds = np.array([(each.log_ns - start) / 1e9 for each in records])
         return list(self._own), [pa.array(each) for each in (seconds, log, sent, sequence)]
 
-    def _arrays(self, column: Column) -> list[tuple[str, pa.Array]]:
-        values = [column.get(message) for message in self._messages]
+    def _arrays(self, column: Column, messages: list[Any]) -> list[tuple[str, pa.Array]]:
+        values = list(map(column.get, messages))
         if column.kind == "number":
             return [(column.name, pa.array(np.array(values, column.dtype)))]
         if column.kind == "text":
