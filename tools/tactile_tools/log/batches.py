@@ -90,10 +90,6 @@ class Table:
         """Write rows; ``messages`` are decoded."""
         raise NotImplementedError
 
-    def relieve(self) -> None:
-        """Write everything held."""
-        self.flush()
-
     def close(self) -> list[dict[str, str]]:
         """Write the held rows and finish. Returns a description of the columns."""
         raise NotImplementedError

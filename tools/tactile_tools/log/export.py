@@ -131,7 +131,6 @@ class _Export:
         self.undecoded: dict[str, int] = {}
         self.decoder = decoder
         self.reading = Reading()
-        self.widths: dict[Stream, dict[str, int]] = {}
         from tactile_tools.log.batches import Budget
         from tactile_tools.log.columns import FileNames
 
@@ -156,7 +155,7 @@ class _Export:
         table.add(record)
         if self._budget.spent:
             for each in self.tables.values():
-                each.relieve()
+                each.flush()
 
     def decode(self, stream: Stream, data: bytes) -> Any:
         """Decode a message; `REFUSED`, and counted, where that is not possible."""
@@ -175,6 +174,8 @@ class _Export:
 
     def close(self) -> None:
         """Finish all tables, and write the description of their columns."""
+        for table in self.tables.values():
+            table.flush()  # before the first of them is closed, which takes memory too
         contents = []
         for stream, table in self.tables.items():
             columns = table.close()
@@ -200,17 +201,13 @@ class _Export:
             return NpzTable(path, columns, self._start_ns, scratch, decode, self._budget)
         from tactile_tools.log.tables import ArrowTable
 
-        widths = self.widths.get(stream, {}) if self._kind == "csv" else None
-        return ArrowTable(path, stream, columns, self._start_ns, widths, decode, self._budget)
+        return ArrowTable(path, stream, columns, self._start_ns, self._kind, decode, self._budget)
 
 
 def _export(chosen: Selection, kind: str, folder: Path) -> _Export:
     from tactile_tools.log.decode import Decoder
 
     result = _Export(folder, kind, chosen.start_ns, Decoder())
-    if kind == "csv":
-        with progress("measuring lists") as report:
-            _measure(chosen, result, report)
     with progress("exporting") as report:
         for _, item in read_merged(
             chosen.logs, result.reading, report, chosen.wanted, chosen.window
@@ -219,33 +216,6 @@ def _export(chosen: Selection, kind: str, folder: Path) -> _Export:
                 result.take(item)
     result.close()
     return result
-
-
-def _measure(chosen: Selection, result: _Export, report: Any) -> None:
-    """Find the longest list of each column: CSV needs its columns before the first row."""
-    lists: dict[Stream, list[Column]] = {}
-    for _, item in read_merged(chosen.logs, Reading(), report, chosen.wanted, chosen.window):
-        if not isinstance(item, Record):
-            continue
-        stream = item.stream
-        try:
-            if stream not in lists:
-                lists[stream] = [
-                    column
-                    for column in result.columns(stream)
-                    if column.kind in ("numbers", "texts")
-                ]
-                result.widths[stream] = dict.fromkeys((c.name for c in lists[stream]), 0)
-            if not lists[stream]:
-                continue
-            message = result.decoder.decode(stream, item.data)
-        except DecodeError:
-            continue
-        widths = result.widths[stream]
-        for column in lists[stream]:
-            length = len(column.get(message))
-            if length > widths[column.name]:
-                widths[column.name] = length
 
 
 def _report(result: _Export, out: Path, left_out: set[str]) -> int:
