@@ -22,7 +22,7 @@ from tactile_core.bus.messages import DecodeError
 from tactile_tools.log.cdr import ARRAY, BASE, NAME, SEQUENCE, CdrError, WideDecoder
 from tactile_tools.log.stream import Stream
 
-__all__ = ["ARRAY", "BASE", "NAME", "SEQUENCE", "Decoder", "Reader", "finite", "plain"]
+__all__ = ["ARRAY", "BASE", "NAME", "SEQUENCE", "Decoder", "Reader", "finite", "list_text", "plain"]
 
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
@@ -371,6 +371,17 @@ def _plain_field(value: Any, fields: dict[str, Any], kind: int, arguments: Any) 
     if inner == NAME:
         return [plain(each, fields, inner_arguments) for each in value]
     return value.tolist() if isinstance(value, np.ndarray) else list(value)
+
+
+_encode = json.JSONEncoder(ensure_ascii=False, allow_nan=False).encode
+
+
+def list_text(values: list[Any]) -> str:
+    """A list as JSON, with null for NaN and infinities."""
+    try:
+        return _encode(values)
+    except ValueError:  # seldom: looking at every number first takes longer than encoding them
+        return _encode(finite(values))
 
 
 def finite(value: Any) -> Any:

@@ -7,7 +7,6 @@ not depend on the length of a log.
 from __future__ import annotations
 
 import io
-import json
 import shutil
 import sys
 import zipfile
@@ -19,7 +18,7 @@ import numpy as np
 
 from tactile_tools.log.batches import NOTES, OWN, Budget, Table
 from tactile_tools.log.columns import Column
-from tactile_tools.log.decode import finite
+from tactile_tools.log.decode import list_text
 from tactile_tools.log.stream import Record
 
 MAX_TEXT_BYTES = 256 << 20
@@ -126,7 +125,7 @@ class NpzTable(Table):
             growing.add(np.concatenate(values, dtype=growing.dtype, casting="unsafe"))
             self._list_lengths(name, list(map(len, values)))
         elif column.kind == "texts":
-            self._texts(name, [json.dumps(list(each), ensure_ascii=False) for each in values])
+            self._texts(name, [list_text(list(each)) for each in values])
         else:
             if rows := [row for each in values for row in each]:
                 for inner in column.fields:
@@ -216,7 +215,7 @@ def _as_json(column: Column, rows: list[Any]) -> list[str]:
             told = np.asarray(value).tolist()
         elif column.kind == "rows":
             told = [column.to_plain(each) for each in value]
-        texts.append(json.dumps(finite(list(told)), ensure_ascii=False))
+        texts.append(list_text(list(told)))
     return texts
 
 

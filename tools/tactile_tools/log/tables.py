@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +17,7 @@ import pyarrow as pa
 
 from tactile_tools.log.batches import NOTES, OWN, Budget, Table
 from tactile_tools.log.columns import Column
-from tactile_tools.log.decode import finite
+from tactile_tools.log.decode import list_text
 from tactile_tools.log.stream import Record, Stream
 
 GROUP_ROWS = 10_240
@@ -223,4 +222,4 @@ def _nested(column: Column, rows: list[Any]) -> pa.Array:
 
 
 def _json(column: Column, rows: Any) -> str:
-    return json.dumps(finite([column.to_plain(row) for row in rows]), ensure_ascii=False)
+    return list_text([column.to_plain(row) for row in rows])
