@@ -44,9 +44,11 @@ def test_memory_of_an_export_does_not_grow_with_the_log(
     assert most[1] < HELD_BYTES
 
 
-def arrays_log(path: Path, payloads: list[bytes]) -> None:
+def arrays_log(
+    path: Path, payloads: list[bytes], fields: bytes = b"float32[] values\nstring[] names\n"
+) -> None:
     file = McapFile(path, DiskStorage(), "t")
-    file.add_schema(1, "a/msg/List", "ros2msg", b"float32[] values\nstring[] names\n")
+    file.add_schema(1, "a/msg/List", "ros2msg", fields)
     file.add_channel(1, 1, "/list", "cdr", {})
     chunk = ChunkBuffer()
     for number, data in enumerate(payloads):
@@ -116,6 +118,27 @@ def test_messages_that_cannot_be_decoded_are_counted_within_a_batch(
         with np.load(tmp_path / "a_npz" / "list.npz") as arrays:
             assert arrays["log_sequence"].tolist() == [*range(1, 50), *range(51, 99)]
             assert arrays["values"][:, 0].tolist() == [*range(1, 50), *range(51, 99)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fields_called_like_the_columns_in_front_keep_their_values(
+    log_tool: Any, tmp_path: Path, kind: str
+) -> None:
+    payloads = [b"\0\1\0\0" + k.to_bytes(4, "little") for k in (7, 8, 9)]
+    arrays_log(tmp_path / "a.mcap", payloads, b"uint32 log_sequence\n")
+    assert log_tool("export", tmp_path / "a.mcap", "--format", kind).code == 0
+    path = tmp_path / f"a_{kind}" / f"list.{kind}"
+    if kind == "csv":
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        found = {name: [int(row[name]) for row in rows] for name in rows[0] if "seq" in name}
+    elif kind == "parquet":
+        table = pyarrow.parquet.read_table(path)
+        found = {name: table[name].to_pylist() for name in table.column_names if "seq" in name}
+    else:
+        with np.load(path) as arrays:
+            found = {name: arrays[name].tolist() for name in arrays.files if "seq" in name}
+    assert found == {"log_sequence_": [0, 1, 2], "log_sequence": [7, 8, 9]}
 
 
 class Kept(Table):

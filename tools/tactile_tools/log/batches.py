@@ -7,9 +7,12 @@ are decoded at a time.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tactile_tools.log.stream import Record
+
+if TYPE_CHECKING:
+    from tactile_tools.log.columns import Column
 
 BATCH = 1024
 """Most rows per batch."""
@@ -32,6 +35,13 @@ NOTES = {
     "publish_time_ns": "ns since the Unix epoch, when it was sent",
     "log_sequence": "number of the message within its stream",
 }
+
+
+def own_names(columns: list[Column]) -> tuple[str, ...]:
+    """Names of the columns in front, other than those of the messages' fields."""
+    taken = {column.name for column in columns}
+    return tuple(name + "_" * (name in taken) for name in OWN)
+
 
 REFUSED = object()
 """Instead of a message that could not be decoded; the decoder has counted it."""

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from tactile_tools.log.batches import NOTES, OWN, Budget, Table
+from tactile_tools.log.batches import NOTES, OWN, Budget, Table, own_names
 from tactile_tools.log.columns import Column
 from tactile_tools.log.decode import list_text
 from tactile_tools.log.stream import Record
@@ -73,15 +73,17 @@ class NpzTable(Table):
         self._ends: dict[str, int] = {}  # last offset by name
         self._lengths: dict[str, tuple[int, bool]] = {}  # of the first list; whether all agree
         self._longest: dict[str, int] = {}
-        self._notes: dict[str, str] = dict(NOTES)
+        self._own = own_names(columns)
+        self._notes = {name: NOTES[plain] for name, plain in zip(self._own, OWN, strict=True)}
 
     def write(self, records: list[Record], messages: list[Any]) -> None:
         """Append rows to the files of the columns."""
+        own = self._own
         start = self._start_ns  # may be later than a message: no unsigned numbers here
-        self._numbers(OWN[0], np.float64, [(each.log_ns - start) / 1e9 for each in records])
-        self._numbers(OWN[1], np.uint64, [each.log_ns for each in records])
-        self._numbers(OWN[2], np.uint64, [each.publish_ns for each in records])
-        self._numbers(OWN[3], np.uint32, [each.sequence for each in records])
+        self._numbers(own[0], np.float64, [(each.log_ns - start) / 1e9 for each in records])
+        self._numbers(own[1], np.uint64, [each.log_ns for each in records])
+        self._numbers(own[2], np.uint64, [each.publish_ns for each in records])
+        self._numbers(own[3], np.uint32, [each.sequence for each in records])
         for column in self._columns:
             self._add(column, column.name, messages)
 

@@ -15,7 +15,7 @@ os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
 
 import pyarrow as pa
 
-from tactile_tools.log.batches import NOTES, OWN, Budget, Table
+from tactile_tools.log.batches import NOTES, OWN, Budget, Table, own_names
 from tactile_tools.log.columns import Column
 from tactile_tools.log.decode import list_text
 from tactile_tools.log.stream import Record, Stream
@@ -57,8 +57,7 @@ class ArrowTable(Table):
         self._start_ns = start_ns
         self._csv = kind == "csv"
         self._widths: dict[str, int] = {}  # longest list by column, for CSV
-        taken = {column.name for column in columns}
-        self._own = tuple(name + "_" * (name in taken) for name in OWN)
+        self._own = own_names(columns)
         self._columns = columns
         self._file: Any = None
         self._writer: Any = None
