@@ -160,10 +160,10 @@ def test_one_batch_is_decoded_at_a_time() -> None:
         table.add(Record(stream, k, 0, 0, b"bad" if k % 2 else b"good"))
     assert table.sizes == [BATCH // 2]
     for _ in range(3):
-        large.add(Record(stream, 0, 0, 0, bytes(400_000)))
+        large.add(Record(stream, 0, 0, 0, bytes(150_000)))
     assert large.sizes == [2]
     assert not budget.spent
-    large.add(Record(stream, 0, 0, 0, bytes(100_000)))
+    large.add(Record(stream, 0, 0, 0, bytes(50_000)))
     table.flush()
     large.flush()
     assert (table.rows, large.rows, budget.held) == (BATCH // 2 + 5, 4, 0)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 BATCH = 1024
 """Most rows per batch."""
 
-BATCH_BYTES = 512 << 10
+BATCH_BYTES = 256 << 10
 """Encoded bytes after which a batch is written in any case: as objects they take ten times that."""
 
 HELD_BYTES = 24 << 20
