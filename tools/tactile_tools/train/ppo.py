@@ -84,26 +84,26 @@ class Learner:
         self._optimiser = torch.optim.Adam(self._parameters, lr=settings.rate, eps=1e-5)
         self.rate = settings.rate
 
-    @torch.no_grad()
     def act(
         self, seen: torch.Tensor, privileged: torch.Tensor, draws: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Actions for (n, ·) observations with the `Noise` ``draws``, the logarithms of their
         densities, and values."""
-        chances = (-0.5 * draws**2 - self.spread - 0.9189385).sum(dim=1)
-        actions = self.actor(seen) + self.spread.exp() * draws
-        return actions, chances, self._value(seen, privileged)
+        with torch.no_grad():
+            chances = (-0.5 * draws**2 - self.spread - 0.9189385).sum(dim=1)
+            actions = self.actor(seen) + self.spread.exp() * draws
+            return actions, chances, self._value(seen, privileged)
 
-    @torch.no_grad()
     def mean(self, seen: torch.Tensor) -> torch.Tensor:
         """What the policy does without noise: residuals for (n, ·) observations."""
-        mean: torch.Tensor = self.actor(seen).clamp(-RESIDUAL_BOUND, RESIDUAL_BOUND)
+        with torch.no_grad():
+            mean: torch.Tensor = self.actor(seen).clamp(-RESIDUAL_BOUND, RESIDUAL_BOUND)
         return mean
 
-    @torch.no_grad()
     def values(self, seen: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
         """What the critic expects from (n, ·) observations on."""
-        return self._value(seen, privileged)
+        with torch.no_grad():
+            return self._value(seen, privileged)
 
     def _value(self, seen: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
         value: torch.Tensor = self.critic(torch.cat([seen, privileged], dim=1))[:, 0]
