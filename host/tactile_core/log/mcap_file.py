@@ -262,7 +262,9 @@ class ChunkIndex:
     def _store(self) -> None:
         try:
             if self._file is None:
-                self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
+                self._file = tempfile.TemporaryFile(  # noqa: SIM115 - closed by close()
+                    dir=self._folder, buffering=0
+                )
             self._file.seek(self._stored)
             left = memoryview(self._held)
             while left:
