@@ -92,8 +92,10 @@ def busy_loops(count: int) -> Iterator[None]:
             process.wait()
 
 
-def run_suite(words: Sequence[str], loops: int = BUSY_LOOPS) -> Row:
+def run_suite(words: Sequence[str], loops: int = BUSY_LOOPS, beside: str = "") -> Row:
     """Run pytest with ``words`` beside ``loops`` busy loops and return the row of that run.
+
+    ``beside``: what else is running, in words.
 
     A run that gives no report, as one that could not collect its tests, counts as failed.
     """
@@ -113,6 +115,7 @@ def run_suite(words: Sequence[str], loops: int = BUSY_LOOPS) -> Row:
             "seconds": round(time.monotonic() - started, 1),
             "cpu_s": round(cpu_seconds() - cpu, 1),
             "loops": loops,
+            "beside": beside,
             "load": [round(load, 1) for load in os.getloadavg()],
             "exit": done.returncode,
         }
@@ -140,6 +143,9 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--loops", type=int, default=BUSY_LOOPS, help="busy loops; 0 where other work loads enough"
     )
+    parser.add_argument(
+        "--beside", metavar="TEXT", default="", help="what else loads the machine, for the rows"
+    )
     parser.add_argument("pytest", nargs="*", help="words for pytest, after --")
     given = parser.parse_args(words)
     if given.runs < 1:
@@ -158,7 +164,7 @@ def main(words: Sequence[str] | None = None) -> int:
     for number in range(len(mine()) + 1, given.runs + 1):
         print(f"run {number} of {given.runs}", flush=True)
         words_of_pytest = given.pytest or ["-n", "2", "--dist", "worksteal"]
-        rows.append(run_suite(words_of_pytest, given.loops))
+        rows.append(run_suite(words_of_pytest, given.loops, given.beside))
         write_rows(given.json, rows)
     passed = sum(map(green, mine()))
     print(f"{passed} of {given.runs} runs asked for are green ({len(mine())} done) in {given.json}")

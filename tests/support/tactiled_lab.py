@@ -17,6 +17,9 @@ from tests.support.network import free_endpoint
 from tests.support.processes import Program, command
 from tests.support.waiting import wait_until
 
+CALM_HZ = "40"
+"""Rate of boards whose rate is not the subject: machines that are slow or busy keep up with it."""
+
 
 class TactiledLab:
     """Starts simulated boards and daemons, and listens to them."""
@@ -28,7 +31,9 @@ class TactiledLab:
         self._sessions: list[zenoh.Session] = []
 
     def boards(self, *words: str, link: str) -> Program:
-        program = self._start("simdevice", "boards", *words)
+        """Simulated boards; at `CALM_HZ` where ``words`` give no rate."""
+        calm = () if "--rate" in words else ("--rate", CALM_HZ)
+        program = self._start("simdevice", "boards", *words, *calm)
         program.wait_for_file(self.folder / link)
         return program
 

@@ -37,6 +37,9 @@ log = logging.getLogger(__name__)
 
 USB_PREFIX = "usb:"
 PTY_MAJORS = range(136, 144)  # Linux devices.txt: UNIX98 pseudo-terminal slaves
+CHANGED_MODE_NS = 1_000_000_000
+"""Time in which whoever made a pseudo-terminal sets its owner and mode, which changes it anew."""
+
 LOST_SLAVE = select.POLLHUP | select.POLLERR | select.POLLNVAL
 """Poll events of a terminal whose other end is gone."""
 
@@ -44,7 +47,10 @@ LOST_SLAVE = select.POLLHUP | select.POLLERR | select.POLLNVAL
 class SerialTransport:
     """A serial port by its path, or by the serial number of its USB device (``usb:SERIAL``).
 
-    Once opened, it is found again by its USB serial number, even when plugged in elsewhere.
+    Once opened, it is found again by its USB serial number, even when plugged in elsewhere. The
+    system gives the number of a pseudo-terminal that ended to the next one, which may be anybody's:
+    one that is younger than the link that leads to it, or than the one opened before by the same
+    number, is refused as missing.
     ``baud``: bit/s; USB devices ignore it. POSIX only.
     """
 
@@ -59,6 +65,7 @@ class SerialTransport:
         if port.startswith(USB_PREFIX):
             self.usb_serial = port.removeprefix(USB_PREFIX)
         self._serial: serial.Serial | None = None
+        self._made_ns: int | None = None  # when the pseudo-terminal opened by its number was made
         self._losses = Losses()
         self._reading = threading.Lock()
         self._writing = threading.Lock()
@@ -94,7 +101,9 @@ class SerialTransport:
         """Open the port exclusively; `TransportError` names the remedy."""
         self.close()
         device = self._locate()
+        made_ns = self._made_ns_of(device)
         port = _open_exclusively(device, self.baud)
+        self._made_ns = made_ns
         try:
             port.set_low_latency_mode(True)
         except ValueError:
@@ -208,6 +217,36 @@ class SerialTransport:
                     f"plug it in; {listing.known_ports()}",
                 )
         return self._name
+
+    def _made_ns_of(self, device: str) -> int | None:
+        """When the pseudo-terminal ``device`` was made; None for other devices and behind links.
+
+        `PortMissing` if it took the number of the one that was meant. Asked before it is opened,
+        for opening changes the settings of a terminal, and this one may be somebody's.
+        """
+        try:
+            found = os.stat(device)
+        except OSError:
+            return None  # opening it says why
+        if os.major(found.st_rdev) not in PTY_MAJORS:
+            return None
+        link_ns = _made_last_ns(device)
+        meant_ns = self._made_ns if link_ns is None else link_ns
+        if meant_ns is not None and found.st_ctime_ns > meant_ns + CHANGED_MODE_NS:
+            raise PortMissing(
+                f"the pseudo-terminal of {device} has ended; another one has its number now",
+                "start its simulator again, and give the link that it makes",
+            )
+        return found.st_ctime_ns if link_ns is None else None
+
+
+def _made_last_ns(path: str) -> int | None:
+    """When the symbolic link was made that ``path`` leads through last; None if it is no link."""
+    made = None
+    while os.path.islink(path):
+        made = os.lstat(path).st_ctime_ns
+        path = os.path.join(os.path.dirname(path), os.readlink(path))
+    return made
 
 
 def _open_exclusively(device: str, baud: int) -> serial.Serial:

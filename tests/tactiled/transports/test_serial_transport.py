@@ -134,6 +134,50 @@ def test_replugged_port_is_reopened_by_its_path(
     assert read_bytes(transport, 4) == b"back"
 
 
+def other_with_number_of(pty: PtyPort, name: str) -> tuple[int, int]:
+    """End ``pty`` as a kill does, leaving its link, and open another that gets its number."""
+    link = os.readlink(pty.link)
+    assert link == name
+    pty.close()
+    pty.link.symlink_to(link)
+    made = os.lstat(pty.link).st_ctime_ns
+    while True:
+        held = os.openpty()
+        taken = os.ttyname(held[1]) != name
+        if not taken and os.stat(name).st_ctime_ns > made + serial_port.CHANGED_MODE_NS:
+            return held
+        for end in held:
+            os.close(end)
+        if taken:
+            pytest.skip("another program took the number of the pseudo-terminal")
+        time.sleep(0.1)  # of the age of the link, which is the subject
+
+
+@pytest.mark.parametrize("by_link", [True, False])
+def test_stranger_that_got_the_number_of_a_pseudo_terminal_is_left_alone(
+    pty: PtyPort, by_link: bool
+) -> None:
+    name = os.readlink(pty.link)
+    transport = SerialTransport(str(pty.link) if by_link else name)
+    transport.open()
+    transport.close()
+    transport.open()  # the same one again
+    transport.close()
+    held = other_with_number_of(pty, name)
+    try:
+        with pytest.raises(PortMissing, match="another one has its number now"):
+            transport.open()
+        assert transport.device is None
+        pty.link.unlink()
+        pty.link.symlink_to(name)  # whoever makes a link to it means it
+        transport = SerialTransport(str(pty.link))
+        transport.open()
+        transport.close()
+    finally:
+        for end in held:
+            os.close(end)
+
+
 def test_closing_from_another_thread_wakes_a_waiting_reader(
     transport: SerialTransport, run_in_background: Any
 ) -> None:

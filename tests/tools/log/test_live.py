@@ -31,6 +31,7 @@ from tactile_tools.processes import running, wait_for
 from tests.support.network import free_port
 from tests.support.paths import ROOT
 from tests.support.processes import command
+from tests.support.tactiled_lab import CALM_HZ
 from tests.support.waiting import PATIENCE_S, wait_until
 
 PRESS = """[[press]]
@@ -60,7 +61,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
         check=True, stdout=subprocess.DEVNULL,
     )  # fmt: skip
     b, s, endpoint = folder / "b", folder / "s", f"tcp/127.0.0.1:{free_port()}"
-    boards = [simdevice, "boards", "--seed", "1"]
+    boards = [simdevice, "boards", "--seed", "1", "--rate", CALM_HZ]
     press = ["--press", str(folder / "press.toml"), "--rotate", "90deg/10s"]
     with (
         running([*boards, "--pty", str(b), *press], folder / "b.txt") as first,
