@@ -31,6 +31,7 @@ SHOWN: Mapping[Case, str] = {
     ("high_friction", "mujoco", "contacts", 20.0): "high friction, 20 s",
     ("narrow", "mujoco", "contacts", 20.0): "narrow, 20 s",
     ("recorded", "mujoco", "contacts", 20.0): "recorded, 20 s",
+    ("recorded", "pybullet", "contacts", 20.0): "recorded in Bullet, 20 s",
     ("hardware", "mujoco", "contacts", 40.0): "hardware, 40 s",
     ("squeezed", "pymunk", "contacts", 20.0): "pymunk, 20 s",
     ("squeezed", "mujoco", "taxels", 20.0): "taxels, 20 s",

@@ -48,7 +48,7 @@ PARTS = (
     Variant("sweep of 1.2 s instead of 0.6", parameters={"sweep_time": 1.2}),
     Variant("jam answered after 1 s instead of 0.3", parameters={"jam_time": 1.0}),
     Variant("no turn during a sweep", parameters={"sweep_omega": 0.0}),
-    Variant("sweep at 90° instead of 55°", parameters={"sweep_angle": round(math.pi / 2, 6)}),
+    Variant("sweep at 55° instead of 90°", parameters={"sweep_angle": round(math.radians(55), 6)}),
 )
 
 
