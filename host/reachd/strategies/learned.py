@@ -11,7 +11,7 @@ import json
 import math
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, Final
@@ -39,6 +39,12 @@ RESIDUAL_BOUND: Final = 2.0
 STRONG: Final = 0.5
 """Residual in v_max or ω_max from which it is told apart in activity and events."""
 
+BASE: Final = (
+    "jam_time", "jam_progress", "jam_force", "sweep_time", "sweep_angle", "sweep_omega",
+    "sweep_obedience",
+)  # fmt: skip
+"""Parameters of the quick sweep that a residual is learned on."""
+
 WEIGHTS: Final = "learned.npz"
 """Weights that come with the package."""
 
@@ -58,6 +64,13 @@ class Policy:
     layers: tuple[tuple[Rows, Rows], ...]
     about: dict[str, Any]
 
+    def base(self, parameters: Parameters) -> Parameters:
+        """``parameters`` with the quick sweep that this was trained on, where it tells of this set.
+
+        Another sweep beneath a residual makes it worse: it was learned on that one.
+        """
+        return replace(parameters, **self.about.get("base", {}).get(parameters.name, {}))
+
     def __call__(self, observations: Rows) -> Rows:
         """(n, `WIDTH`) → (n, 3): residuals ahead, aside and in turning, within `RESIDUAL_BOUND`."""
         values = observations
@@ -66,6 +79,11 @@ class Policy:
             if index + 1 < len(self.layers):
                 values = np.where(values > 0, values, np.expm1(np.minimum(values, 0.0)))
         return np.clip(values, -RESIDUAL_BOUND, RESIDUAL_BOUND)
+
+
+def base_of(parameters: Parameters) -> dict[str, float]:
+    """What weights that are trained with ``parameters`` tell of the sweep beneath them."""
+    return {name: getattr(parameters, name) for name in BASE}
 
 
 def save_policy(path: Path, policy: Policy) -> None:
@@ -117,7 +135,18 @@ def _read(path: Path) -> Policy:
             inputs = matrix.shape[1]
         if not layers or inputs != 3:
             raise ValueError("no network with three outputs")
+        _check_base(about.get("base", {}))
     return Policy(tuple(layers), about)
+
+
+def _check_base(base: Any) -> None:
+    """ValueError unless ``base`` holds figures of `BASE` by name of the parameter set."""
+    sets = list(base.values()) if isinstance(base, dict) else [None]
+    for told in sets:
+        figures = told if isinstance(told, dict) else {"": None}
+        for name, value in figures.items():
+            if name not in BASE or not isinstance(value, int | float) or not math.isfinite(value):
+                raise ValueError("it tells of no quick sweep of this version")
 
 
 def with_residual(
@@ -158,7 +187,7 @@ class Learned(ReachingStrategy):
         weights = parameters.learned_weights
         policy = load_policy(Path(weights) if weights else None)
         self._policy: Callable[[Rows], Rows] = policy
-        self._sweeps = QuickSweep(parameters, rng)
+        self._sweeps = QuickSweep(policy.base(parameters), rng)
         self._memory = Memory(1)
         super().__init__(parameters, rng)
 

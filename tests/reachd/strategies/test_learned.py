@@ -88,6 +88,30 @@ def test_without_a_residual_it_is_quick_sweep(
     assert any(activity.startswith("sweep") for activity in mine[1])
 
 
+def test_residual_stays_on_the_sweep_it_was_learned_on(
+    tmp_path: Path, make_touch: Callable[..., Any], make_arm: Callable[..., Any]
+) -> None:
+    base = {"authors_sim": {"sweep_angle": 0.4, "sweep_time": 0.2}}
+    policy = Policy(constant(0.0, 0.0, 0.0).layers, {"base": base})
+    save_policy(tmp_path / "w.npz", policy)
+
+    def twists(name: str) -> tuple[Any, Any]:
+        mine = reach("learned", tmp_path / "w.npz", make_touch, make_arm, name)
+        theirs = reach("quick_sweep", None, make_touch, make_arm, name)
+        return mine[:2], theirs[:2]
+
+    mine, theirs = twists("authors_sim")
+    assert mine[0] != theirs[0]
+    assert mine[1].count("sweep_cw") < theirs[1].count("sweep_cw")
+    mine, theirs = twists("hardware")  # of which the weights tell nothing
+    assert mine[1] == theirs[1]
+
+
+def test_packaged_weights_tell_of_their_sweep() -> None:
+    base = load_policy().about["base"]
+    assert base["authors_sim"]["sweep_angle"] == pytest.approx(math.radians(55))
+
+
 def test_strong_residual_shows_in_activity_and_events(
     tmp_path: Path, make_touch: Callable[..., Any], make_arm: Callable[..., Any]
 ) -> None:
@@ -193,15 +217,18 @@ def test_weights_come_back_as_they_were_kept(tmp_path: Path) -> None:
     assert back.about["seed"] == 4
 
 
-def wrong_version(arrays: dict[str, Any]) -> None:
-    about = json.loads(bytes(arrays["about"]).decode()) | {"observation": 99}
+def told(arrays: dict[str, Any], **more: Any) -> None:
+    about = json.loads(bytes(arrays["about"]).decode()) | more
     arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (wrong_version, "observation 99"),
+        (lambda a: told(a, observation=99), "observation 99"),
+        (lambda a: told(a, base={"authors_sim": {"v_max": 1.0}}), "no quick sweep"),
+        (lambda a: told(a, base={"authors_sim": {"sweep_time": "long"}}), "no quick sweep"),
+        (lambda a: told(a, base=[0.6]), "no quick sweep"),
         (lambda a: a.update(matrix_0=np.zeros((4, 3), np.float32)), "wrong shape"),
         (lambda a: a["offsets_0"].fill(np.nan), "not finite"),
         (lambda a: a.pop("about"), "about"),

@@ -16,6 +16,7 @@ import torch
 
 from reachd.strategies.learned import load_policy
 from reachd.strategies.memory import WIDTH
+from reachd.strategies.parameters import SETS
 from tactile_tools.cli import main
 from tactile_tools.train.cupboards import PRIVILEGED
 from tactile_tools.train.ppo import ACTIONS, Batch, Learner, Noise, advantages_of
@@ -107,6 +108,7 @@ def test_run_goes_on_where_it_was_cut_off(tmp_path: Path) -> None:
     assert [r["batch"] for r in rows if "loss" in r] == list(range(1, again.batches + 1))
     about = load_policy(tmp_path / "run" / "learned.npz").about
     assert about["settings"]["worlds"] == 8
+    assert about["base"]["authors_sim"]["sweep_angle"] == SETS["authors_sim"].sweep_angle
     assert about["judged"]["reaches"] == 1
     assert (tmp_path / "run" / "curve.png").stat().st_size > 5000
     with pytest.raises(RunError, match="other settings"):

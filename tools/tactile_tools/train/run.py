@@ -17,7 +17,8 @@ import msgspec
 import numpy as np
 import torch
 
-from reachd.strategies.learned import RESIDUAL_BOUND, Policy, save_policy
+from reachd.strategies.learned import RESIDUAL_BOUND, Policy, base_of, save_policy
+from reachd.strategies.parameters import SETS
 from sim_device.world import planar_cuda
 from sim_device.world.scene_generation import generate
 from sim_device.world.scenes import Scene
@@ -276,6 +277,7 @@ class Run:
         """How these weights came about; stored with them."""
         return {
             "settings": msgspec.to_builtins(self.settings),
+            "base": {name: base_of(SETS[name]) for name in self.settings.scenes.generators},
             "batches": self.batches,
             "decisions": self.decisions,
             "cpu_minutes": round(self.cpu_s / 60, 1),
