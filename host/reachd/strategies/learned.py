@@ -24,8 +24,10 @@ from reachd.interfaces import ArmState, Goal, Touch, Twist
 from reachd.strategies.builtin import Moment, ReachingStrategy, StrategyEvent
 from reachd.strategies.memory import DECISION_S, FELT, VERSION, WIDTH, Memory, Rows
 from reachd.strategies.parameter_fields import Parameters
+from reachd.strategies.parameters import ParameterTable
 from reachd.strategies.primitives import pivot_velocity
 from reachd.strategies.quick_sweep import QuickSweep
+from tactile_core.config import convert
 from tactile_core.geometry import Side
 from tactile_core.types import Instant, seconds_between
 
@@ -140,13 +142,13 @@ def _read(path: Path) -> Policy:
 
 
 def _check_base(base: Any) -> None:
-    """ValueError unless ``base`` holds figures of `BASE` by name of the parameter set."""
-    sets = list(base.values()) if isinstance(base, dict) else [None]
-    for told in sets:
-        figures = told if isinstance(told, dict) else {"": None}
-        for name, value in figures.items():
-            if name not in BASE or not isinstance(value, int | float) or not math.isfinite(value):
-                raise ValueError("it tells of no quick sweep of this version")
+    """ValueError unless ``base`` holds figures of `BASE`, in range, by name of the parameter set."""
+    if not isinstance(base, dict):
+        raise ValueError("base is not a table of parameter sets")
+    convert(base, dict[str, ParameterTable])
+    unknown = {name for told in base.values() for name in told} - set(BASE)
+    if unknown:
+        raise ValueError(f"base: {', '.join(sorted(unknown))} is not of a quick sweep")
 
 
 def with_residual(

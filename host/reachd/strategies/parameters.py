@@ -111,11 +111,11 @@ HARDWARE = Parameters(
     direction_from="side",
     direction_obedience=1.0,
     # quick_sweep is not of the paper. This set's gate takes away motion towards a loaded contact,
-    # and with it much of a sweep at 55°: 7 of 16 scenes were reached so, 8 at
-    # 90°, 9 at 110°. A sweep that goes back leaves the contact: 48 of 56 at 140° (hybrid_event 50),
-    # and 46 at 150°; 31 to 34 of 40 at 120 to 140° and 0.75 to 0.9 s (planar engine, seeds from
-    # 730000). Longer sweeps after a failed one, or to the other side, gave less. No motion of this
-    # set turns faster than ω_max.
+    # and with it much of a sweep at 55°: 7 of 16 scenes were reached so, 8 at 90°, 9 at 110°. A
+    # sweep that goes back leaves the contact: 48 of 56 at 140° (hybrid_event 50), and 46 at 150°;
+    # 31 to 34 of 40 at 120 to 140° and 0.75 to 0.9 s (planar engine, seeds from 730000). Longer
+    # sweeps after a failed one, or to the other side, gave less. No motion of this set turns faster
+    # than ω_max.
     jam_time=0.3,
     jam_progress=0.0018,
     jam_force=4.5,

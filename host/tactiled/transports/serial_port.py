@@ -37,9 +37,6 @@ log = logging.getLogger(__name__)
 
 USB_PREFIX = "usb:"
 PTY_MAJORS = range(136, 144)  # Linux devices.txt: UNIX98 pseudo-terminal slaves
-CHANGED_MODE_NS = 1_000_000_000
-"""Time in which whoever made a pseudo-terminal sets its owner and mode, which changes it anew."""
-
 LOST_SLAVE = select.POLLHUP | select.POLLERR | select.POLLNVAL
 """Poll events of a terminal whose other end is gone."""
 
@@ -232,7 +229,10 @@ class SerialTransport:
             return None
         link_ns = _made_last_ns(device)
         meant_ns = self._made_ns if link_ns is None else link_ns
-        if meant_ns is not None and found.st_ctime_ns > meant_ns + CHANGED_MODE_NS:
+        # One of the three is as old as the terminal: setting its mode changes the first alone, what
+        # is written and read the others.
+        made_ns = min(found.st_ctime_ns, found.st_mtime_ns, found.st_atime_ns)
+        if meant_ns is not None and made_ns > meant_ns:
             raise PortMissing(
                 f"the pseudo-terminal of {device} has ended; another one has its number now",
                 "start its simulator again, and give the link that it makes",

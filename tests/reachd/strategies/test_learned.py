@@ -226,9 +226,10 @@ def told(arrays: dict[str, Any], **more: Any) -> None:
     ("change", "says"),
     [
         (lambda a: told(a, observation=99), "observation 99"),
-        (lambda a: told(a, base={"authors_sim": {"v_max": 1.0}}), "no quick sweep"),
-        (lambda a: told(a, base={"authors_sim": {"sweep_time": "long"}}), "no quick sweep"),
-        (lambda a: told(a, base=[0.6]), "no quick sweep"),
+        (lambda a: told(a, base={"authors_sim": {"v_max": 1.0}}), "v_max is not of a quick"),
+        (lambda a: told(a, base={"authors_sim": {"sweep_time": "long"}}), "authors_sim.sweep_time"),
+        (lambda a: told(a, base={"authors_sim": {"sweep_time": math.nan}}), "a finite number"),
+        (lambda a: told(a, base=[0.6]), "not a table"),
         (lambda a: a.update(matrix_0=np.zeros((4, 3), np.float32)), "wrong shape"),
         (lambda a: a["offsets_0"].fill(np.nan), "not finite"),
         (lambda a: a.pop("about"), "about"),

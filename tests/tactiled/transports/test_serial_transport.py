@@ -144,13 +144,13 @@ def other_with_number_of(pty: PtyPort, name: str) -> tuple[int, int]:
     while True:
         held = os.openpty()
         taken = os.ttyname(held[1]) != name
-        if not taken and os.stat(name).st_ctime_ns > made + serial_port.CHANGED_MODE_NS:
+        if not taken and os.stat(name).st_ctime_ns > made:
             return held
         for end in held:
             os.close(end)
         if taken:
             pytest.skip("another program took the number of the pseudo-terminal")
-        time.sleep(0.1)  # of the age of the link, which is the subject
+        time.sleep(0.01)  # until the clock of the file system has gone on
 
 
 @pytest.mark.parametrize("by_link", [True, False])
@@ -161,6 +161,7 @@ def test_stranger_that_got_the_number_of_a_pseudo_terminal_is_left_alone(
     transport = SerialTransport(str(pty.link) if by_link else name)
     transport.open()
     transport.close()
+    os.chmod(name, 0o660)  # for another user, later
     transport.open()  # the same one again
     transport.close()
     held = other_with_number_of(pty, name)
