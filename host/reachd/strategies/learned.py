@@ -142,7 +142,7 @@ def _read(path: Path) -> Policy:
 
 
 def _check_base(base: Any) -> None:
-    """ValueError unless ``base`` holds figures of `BASE`, in range, by name of the parameter set."""
+    """ValueError unless ``base`` holds figures of `BASE`, in range, by parameter set."""
     if not isinstance(base, dict):
         raise ValueError("base is not a table of parameter sets")
     convert(base, dict[str, ParameterTable])
