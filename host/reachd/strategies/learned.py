@@ -117,8 +117,14 @@ def load_policy(path: Path | None = None) -> Policy:
 
 
 def _read(path: Path) -> Policy:
+    with path.open("rb") as raw:
+        # Of what is no archive numpy says how to unpickle it, which nobody should.
+        if not zipfile.is_zipfile(raw):
+            raise ValueError("it is not a file of weights")
     with np.load(path, allow_pickle=False) as file:
         about = json.loads(bytes(file["about"]).decode())
+        if not isinstance(about, dict):
+            raise ValueError("it does not tell how it was trained")
         version, width = about.get("observation"), about.get("width")
         if (version, width) != (VERSION, WIDTH):
             raise ValueError(

@@ -233,6 +233,7 @@ def told(arrays: dict[str, Any], **more: Any) -> None:
         (lambda a: a.update(matrix_0=np.zeros((4, 3), np.float32)), "wrong shape"),
         (lambda a: a["offsets_0"].fill(np.nan), "not finite"),
         (lambda a: a.pop("about"), "about"),
+        (lambda a: a.update(about=np.frombuffer(b"[]", np.uint8)), "how it was trained"),
         (lambda a: a.update(matrix_0=np.array([{}], object)), "pickle"),
     ],
 )
@@ -249,11 +250,15 @@ def test_weights_that_do_not_fit_are_refused(
     assert "tactile train" in str(error.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"not weights", b"PK\x03\x04 cut off"])
+@pytest.mark.parametrize(
+    "content", [b"", b"not weights", b"PK\x03\x04 cut off", b"\x93NUMPY\x01\x00", b"{}"]
+)
 def test_a_file_that_is_not_weights_is_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "w.npz").write_bytes(content)
     given = parameters("authors_sim", {"learned_weights": str(tmp_path / "w.npz")})
-    with pytest.raises(StrategyError, match="tactile train"):
+    with pytest.raises(
+        StrategyError, match=r"w\.npz: it is not a file of weights; .*tactile train"
+    ):
         load_strategy("learned", given, np.random.default_rng(0))
 
 

@@ -36,19 +36,19 @@ def draw(progress: Path, out: Path) -> None:
         label="scenes it is judged by",
     )
     share.set_ylabel("arrived, %")
-    share.legend(loc="lower right")
     seconds.plot(at, [row["judged"]["seconds"] for row in judged], "o-", markersize=3)
     seconds.set_ylabel("mean time, s")
     force.plot(
         at, [row["judged"]["force_p50"] for row in judged], "o-", markersize=3, label="median"
     )
     force.plot(at, [row["judged"]["force_p90"] for row in judged], "o-", markersize=3, label="90 %")
-    force.set_ylabel("peak of summed force, N")
+    force.set_ylabel("peak force, N")
     force.set_ylim(bottom=0)
-    force.legend(loc="lower right")
     force.set_xlabel("decisions, millions")
     for axes in (share, seconds, force):
         axes.grid(alpha=0.3)
+    for axes in (share, force):  # above the axes, off the data
+        axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False, borderpad=0.1)
     new = out.with_name(f".{out.name}")
     figure.savefig(new, dpi=120, format="png")
     new.replace(out)
