@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -83,8 +84,13 @@ class FeatureListener:
             fresh[:] = [m for at, m in list(self.heard) if at > after and m.valid]
             return len(fresh) >= count
 
-        wait_until(enough)
+        wait_until(enough, explain=lambda: self._why_not(count, after))
         return fresh[-1]
+
+    def _why_not(self, count: int, after: float) -> str:
+        since = [message for at, message in list(self.heard) if at > after]
+        reasons = Counter(tuple(message.reason_codes) for message in since if not message.valid)
+        return f"{count} valid features wanted, {len(since)} came; invalid for: {dict(reasons)}"
 
 
 @contextmanager

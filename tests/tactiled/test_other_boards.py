@@ -14,20 +14,19 @@ from tests.support.tactiled_lab import FeatureListener
 from tests.support.waiting import wait_until
 
 
-def test_text_board_declared_board_and_silent_adapter_stream_and_replay(lab: Any) -> None:
+def test_text_board_and_declared_board_stream_and_replay(lab: Any) -> None:
     lab.boards(
         "--pty", "text", "--board", "anyskin", "--arrays", "5+5", "--format", "anyskin-text",
-        "--banner", "--rate", "50", link="text",
+        "--banner", link="text",
     )  # fmt: skip
     lab.boards(
-        "--pty", "bare", "--board", "anyskin", "--rate", "50",
+        "--pty", "bare", "--board", "anyskin",
         "--format", "floats:5xyz,start=aa55,skip=1,check=xor,end=none", link="bare",
     )  # fmt: skip
-    lab.boards("--slcan", "can0", "--adapter", "canable", "--rate", "20", link="can0")
     daemon = lab.tactiled(
         "--port", "text", "--name", "jaws", "--board", "auto", "--arrays", "5+5",
         "--port", "bare", "--name", "pad", "--board", "floats:5xyz", "--arrays", "5",
-        "--can", "slcan:can0@1000000", "--name", "hand", "--log", "run.mcap",
+        "--log", "run.mcap",
     )  # fmt: skip
     session = lab.listen()
     shapes: list[Any] = []
@@ -35,11 +34,10 @@ def test_text_board_declared_board_and_silent_adapter_stream_and_replay(lab: Any
         GEOMETRY.key("jaws"),
         lambda sample: shapes.append(codec().decode(GEOMETRY, sample.payload.to_bytes())),
     )
-    listeners = {name: FeatureListener(session, name) for name in ("jaws", "pad", "hand")}
+    listeners = {name: FeatureListener(session, name) for name in ("jaws", "pad")}
     for listener in listeners.values():
         listener.wait(20)
     wait_until(lambda: "read as text:10txyz" in daemon.said)
-    assert "answers no command" in daemon.said
     daemon.process.send_signal(signal.SIGINT)
     assert daemon.wait() == 0, daemon.said
     subscriber.undeclare()
@@ -53,6 +51,14 @@ def test_text_board_declared_board_and_silent_adapter_stream_and_replay(lab: Any
     assert replay.wait() == 0, replay.said
     again = {c.topic: c.messages for c in info(lab.folder / "a.mcap").channels}
     assert again["/tactile/pad/features"] > 20
+
+
+def test_adapter_that_answers_no_command_streams(lab: Any) -> None:
+    # Eighty frames a cycle: more often than this, a starved machine cannot take them all.
+    lab.boards("--slcan", "can0", "--adapter", "canable", "--rate", "5", link="can0")
+    daemon = lab.tactiled("--can", "slcan:can0@1000000", "--name", "hand", "--no-log")
+    FeatureListener(lab.listen(), "hand").wait(10)
+    assert "answers no command" in daemon.said
 
 
 @pytest.mark.parametrize(
