@@ -78,7 +78,7 @@ def tiny_log() -> Callable[..., bytes]:
     return write
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def recorded() -> Callable[..., Path]:
     """``recorded(path, seconds=1.0)``: features, commands and events as our daemons log them."""
 

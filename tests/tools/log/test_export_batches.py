@@ -21,28 +21,37 @@ BASE_NS = 1_700_000_000_000_000_000
 KINDS = ("csv", "parquet", "npz")
 
 
+@pytest.fixture(scope="module")
+def short_and_long(recorded: Any, tmp_path_factory: Any) -> tuple[Path, Path]:
+    """Logs of one and a half and of three batches a topic."""
+    folder = tmp_path_factory.mktemp("lengths")
+    # Small chunks, for a writer that is starved makes larger ones, which take memory.
+    small = {"queue_bytes": 1 << 30, "chunk_bytes": 1 << 16}
+    short, long = (
+        recorded(folder / f"{batches}.mcap", batches * BATCH / 100, **small) for batches in (1.5, 3)
+    )
+    return short, long
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_memory_of_an_export_does_not_grow_with_the_log(
-    log_tool: Any, recorded: Any, tmp_path: Path, kind: str
+    log_tool: Any, short_and_long: tuple[Path, Path], tmp_path: Path, kind: str
 ) -> None:
-    short, long = (
-        # Small chunks, for a writer that is starved makes larger ones, which take memory.
-        recorded(
-            tmp_path / f"{seconds}.mcap", float(seconds), queue_bytes=1 << 30, chunk_bytes=1 << 16
-        )
-        for seconds in (20, 80)
-    )
-    assert log_tool("export", short, "--format", kind).code == 0  # loads what it needs
+    short, long = short_and_long
+    out = tmp_path / "out"
+    assert log_tool("export", short, "--format", kind, "--out", out).code == 0  # loads all it needs
     most = []
     for path in (short, long):
         tracemalloc.start()
         try:
-            outcome = log_tool("export", path, "--format", kind, "--out", tmp_path / f"{path}.d")
+            outcome = log_tool(
+                "export", path, "--format", kind, "--out", tmp_path / f"{path.stem}.d"
+            )
             most.append(tracemalloc.get_traced_memory()[1])
         finally:
             tracemalloc.stop()
         assert outcome.code == 0, outcome.err
-    assert "8000 messages" in outcome.out
+    assert f"{3 * BATCH} messages" in outcome.out
     assert most[1] < most[0] + (1 << 20)
     assert most[1] < HELD_BYTES
 
