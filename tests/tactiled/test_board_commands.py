@@ -38,8 +38,10 @@ def test_tare_under_a_press_is_refused_and_can_be_forced(
     lab: Any, tmp_path: Path, capsys: Any
 ) -> None:
     (tmp_path / "press.toml").write_text(PRESS)
+    daemon = lab.tactiled("--port", "skin0", "--no-log", "--wait")
+    # It is ready before the board is there: that is tared long before the press begins.
+    daemon.wait_for_text("waiting for it")
     lab.boards("--board", "anyskin", "--pty", "skin0", "--press", "press.toml", link="skin0")
-    daemon = lab.tactiled("--port", "skin0", "--no-log")
     listener = FeatureListener(lab.listen())
     wait_until(lambda: any(m.normal_force > 2.0 for _, m in list(listener.heard)))
     words = ["--connect", lab.endpoint]
