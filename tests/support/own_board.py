@@ -13,6 +13,7 @@ from sim_device.board.catalogue import build_skin
 from sim_device.ports_plan import BoardsRequest, plan_boards
 from sim_device.runner import Runner
 from sim_device.skin.elastomer import Contact
+from tests.support.tactiled_lab import CALM_HZ
 
 RAMP_S = 0.1
 """A press comes and goes in so long, as a hand's does."""
@@ -28,7 +29,10 @@ class OwnBoard:
         self._place = skin.position.mean(axis=0)
         self._inward = -skin.rotation[0, :, 2]
         self._wanted_n, self._former_n, self._since = 0.0, 0.0, 0.0
-        request = BoardsRequest(ptys=(link,), board="anyskin", touched=self._touched)
+        # Slowly: this thread shares a test's process, and a starved machine must keep up with it.
+        request = BoardsRequest(
+            ptys=(link,), board="anyskin", touched=self._touched, rate=float(CALM_HZ)
+        )
         self._runner = Runner([plan.server for plan in plan_boards(request)])
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._runner.run, args=(self._stop.is_set,))
