@@ -9,10 +9,8 @@ already in the file is not run again, so a run that was stopped goes on.
 from __future__ import annotations
 
 import argparse
-import gzip
 import json
 import time
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -27,7 +25,7 @@ from sim_device.world.scenes import Scene
 from tactile_tools.train.cupboards import Bank, Cupboards
 from tactile_tools.train.kernels import AGENT
 from tactile_tools.train.ppo import Learner, Noise, Seen, gather
-from tactile_tools.train.run import judge, scenes_of
+from tactile_tools.train.run import judge, read_scenes, scenes_of, write_scenes
 from tactile_tools.train.settings import Learning, Reward, Variety
 
 FIRST_SEED: Final = 1_000_000
@@ -165,17 +163,13 @@ def row_of(
     }
 
 
-def cached_scenes(path: Path, make: Callable[[], list[Scene]]) -> list[Scene]:
-    """The scenes in ``path``, made by ``make`` if it is not there."""
+def scenes_from(folder: Path, first: int, count: int, workers: int) -> list[Scene]:
+    """``count`` scenes from seed ``first`` on, made once and then kept in ``folder``."""
+    path = folder / f"{first}.jsonl.gz"
     if not path.exists():
-        scenes = make()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        new = path.with_name(f".{path.name}.new")
-        with gzip.open(new, "wt", encoding="utf-8") as file:
-            file.writelines(scene.to_json() + "\n" for scene in scenes)
-        new.replace(path)
-    with gzip.open(path, "rt", encoding="utf-8") as file:
-        return [Scene.from_json(line) for line in file]
+        folder.mkdir(parents=True, exist_ok=True)
+        write_scenes(path, scenes_of((SET,), first, count, workers))
+    return read_scenes(path)
 
 
 def main() -> None:
@@ -192,13 +186,8 @@ def main() -> None:
     if unknown:
         parser.error(f"no variant {min(unknown)!r}; there are: {', '.join(VARIANTS)}")
     torch.set_num_threads(given.threads)
-    scenes, judged = (
-        cached_scenes(
-            given.folder / f"{first}.jsonl.gz",
-            lambda first=first, count=count: scenes_of((SET,), first, count, given.threads),  # type: ignore[misc]
-        )
-        for first, count in ((FIRST_SEED, TRAINED_ON), (JUDGED_SEED, JUDGED))
-    )
+    scenes = scenes_from(given.folder, FIRST_SEED, TRAINED_ON, given.threads)
+    judged = scenes_from(given.folder, JUDGED_SEED, JUDGED, given.threads)
     rows: dict[str, Any] = json.loads(given.json.read_text()) if given.json.exists() else {}
     for seed in range(1, given.seeds + 1):
         for name in given.variants or VARIANTS:

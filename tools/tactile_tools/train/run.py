@@ -6,7 +6,7 @@ import gzip
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -62,6 +62,20 @@ def scenes_of(names: tuple[str, ...], first: int, count: int, workers: int) -> l
 
 def _scene(job: tuple[str, int]) -> Scene:
     return generate(*job)
+
+
+def read_scenes(path: Path) -> list[Scene]:
+    """Scenes of a file by `write_scenes`; OSError, EOFError or ValueError if it is damaged."""
+    with gzip.open(path, "rt", encoding="utf-8") as file:
+        return [Scene.from_json(line) for line in file]
+
+
+def write_scenes(path: Path, scenes: Iterable[Scene]) -> None:
+    """Write ``scenes`` to ``path``, whole or not at all."""
+    new = path.with_name(f".{path.name}.new")
+    with gzip.open(new, "wt", encoding="utf-8") as file:
+        file.writelines(scene.to_json() + "\n" for scene in scenes)
+    new.replace(path)
 
 
 def judge(act: Callable[[torch.Tensor], torch.Tensor], bank: Bank, threads: int) -> Judged:
@@ -238,8 +252,7 @@ class Run:
         s, path = self.settings.scenes, self.folder / SCENES
         if path.exists():
             try:
-                with gzip.open(path, "rt", encoding="utf-8") as file:
-                    scenes = [Scene.from_json(line) for line in file]
+                scenes = read_scenes(path)
             except (OSError, EOFError, ValueError) as error:
                 raise RunError(f"{path} cannot be read ({error}); delete it") from error
         else:
@@ -248,10 +261,7 @@ class Run:
                 *scenes_of(s.generators, s.first_seed, s.count, self._threads),
                 *scenes_of(s.generators, s.judged_seed, s.judged, self._threads),
             ]
-            new = path.with_name(f".{SCENES}.new")
-            with gzip.open(new, "wt", encoding="utf-8") as file:
-                file.writelines(scene.to_json() + "\n" for scene in scenes)
-            new.replace(path)
+            write_scenes(path, scenes)
         device = self.learner.device.type
         return Bank(scenes[: s.count], device), Bank(scenes[s.count :], device)
 
