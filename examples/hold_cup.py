@@ -62,18 +62,20 @@ class Cup:
     def __init__(self, place: np.ndarray, axes: np.ndarray) -> None:
         self.place, self.axes = place, axes
         self.grip = 3.0
+        self.taken = False  # set once the fingers may close on it
+        self.since: float | None = None
         self.slipped = False
         self.mass = 0.05
         self.held = 0.0
 
     def contacts(self, seconds: float) -> list[Contact]:
         """Contacts on the skin at ``seconds``: the grip into it, half of the weight along it."""
-        since = seconds - 4.0  # the skin must be untouched during the tare
-        if since < 0.0:
+        if not self.taken:
             return []
-        self.mass = 0.05 + 0.25 * min(max((since - 2.0) / 6.0, 0.0), 1.0)
+        self.since = seconds if self.since is None else self.since
+        self.held = seconds - self.since
+        self.mass = 0.05 + 0.25 * min(max((self.held - 2.0) / 6.0, 0.0), 1.0)
         weight = self.mass * G / 2
-        self.held = since
         self.slipped |= weight > FRICTION * self.grip
         force = -self.grip * self.axes[:, 2] - weight * self.axes[:, 1]
         return [Contact(self.place, force, 0.008)]
@@ -115,20 +117,24 @@ def main(seconds: float = 12.0) -> int:
         try:
             with tr.connect(endpoint, find_s=60.0) as bus:
                 features = bus.board("gripper").features(timeout_s=30.0)
-                control, last, told = GripControl(), time.monotonic(), 0
+                control, begin, told = GripControl(), time.monotonic(), 0
+                last = begin
                 for f in features:
                     now = time.monotonic()
-                    if not f.valid or f.normal_force < 0.2:
-                        last = now
-                        continue
-                    bound = min(f.normal_force_bound, 0.3)
-                    cup.grip = control.step(f.normal_force, f.shear_force, bound, now - last)
+                    # Forces are valid once the untouched skin is tared; only then is the cup taken.
+                    cup.taken |= f.valid
+                    if not cup.taken and now - begin > 60.0:
+                        raise SystemExit("no valid force for a minute: " + "; ".join(f.reasons))
+                    if f.valid and f.normal_force > 0.2:
+                        bound = min(f.normal_force_bound, 0.3)
+                        cup.grip = control.step(f.normal_force, f.shear_force, bound, now - last)
                     last = now
                     if int(cup.held) > told:
                         told = int(cup.held)
+                        felt = f"{f.normal_force:4.1f} N" if f.valid else "unknown"
                         print(
                             f"{1e3 * cup.mass:3.0f} g: grip {cup.grip:4.1f} N, felt "
-                            f"{f.normal_force:4.1f} N, shear {f.shear_force:.2f} N"
+                            f"{felt}, shear {f.shear_force:.2f} N"
                         )
                     if cup.held > seconds:
                         break
