@@ -130,10 +130,11 @@ from sim_device.world.planar_worlds import Worlds
 from sim_device.world.scene_generation import authors_sim
 
 device, cycles = sys.argv[1], int(sys.argv[2])
-with Worlds([authors_sim(1), authors_sim(6)], device=device) as worlds:
-    start = worlds.finger
+with Worlds([authors_sim(seed, (8, 10)) for seed in (1, 6)], device=device) as worlds:
+    start = worlds.poses().copy()
     for cycle in range(cycles):
         worlds.step(0.01, np.tile((0.05, 0.03, 0.3), (2, 1)))
+    assert not np.allclose(worlds.poses(), start, atol=1e-5, equal_nan=True), "nothing was pushed"
     worlds.reset(1)
     worlds.limit_wrench(3.0, 1.0)
     worlds.step(0.01, np.tile((0.05, 0.0, 0.0), (2, 1)))
@@ -143,7 +144,7 @@ with Worlds([authors_sim(1), authors_sim(6)], device=device) as worlds:
 
 def run_on(device: str, **variables: str) -> np.ndarray[Any, Any]:
     done = subprocess.run(
-        [sys.executable, "-c", ON_CUDA, device, "2"],
+        [sys.executable, "-c", ON_CUDA, device, "1"],
         capture_output=True,
         text=True,
         env=os.environ | variables,
