@@ -22,6 +22,7 @@ from tactile_core.bus.topics import REACH_STATE, service_key
 from tactile_tools.ros2.follow import WANTED, FollowTwist, planar_twist
 from tactile_tools.ros2.names import dds_type
 from tests.support.reachd_lab import patient_config
+from tests.support.tactiled_lab import CALM_HZ
 
 
 def start(folder: Path, name: str, *words: str) -> subprocess.Popen[bytes]:
@@ -37,7 +38,8 @@ def start(folder: Path, name: str, *words: str) -> subprocess.Popen[bytes]:
 def rig(tmp_path: Path, router: Any) -> Iterator[Path]:
     scene = Scene("test", "authors_sim", 1, 0.375, 0.55, Pose(-0.2, 0.0, 0.0), (0.05, 0.0), ())
     (tmp_path / "empty.json").write_text(scene.to_json())
-    running = [start(tmp_path, "simdevice", "cupboard", "--scene", "empty.json", "--pty", "board0")]
+    board = ("--pty", "board0", "--rate", CALM_HZ, "--engine", "planar")
+    running = [start(tmp_path, "simdevice", "cupboard", "--scene", "empty.json", *board)]
     done = start(tmp_path, "simdevice", "calibration", "--out", "board0.cal.toml")
     assert done.wait(120) == 0
     words = ("--port", "board0", "--name", "board0", "--calibration", "board0.cal.toml")
@@ -45,17 +47,8 @@ def rig(tmp_path: Path, router: Any) -> Iterator[Path]:
     strategy = "tactile_tools.ros2.follow:FollowTwist"
     reachd = ("--strategy", strategy, "--no-log", "--wait", "60", *patient_config(tmp_path))
     running.append(start(tmp_path, "reachd", *reachd))
-    bridge = (
-        "ros2",
-        "bridge",
-        "--router",
-        router.endpoint,
-        "--accept",
-        "twist",
-        "--accept",
-        "goals",
-    )
-    running.append(start(tmp_path, "tactile", *bridge))
+    bridge = ("--router", router.endpoint, "--accept", "twist", "--accept", "goals")
+    running.append(start(tmp_path, "tactile", "ros2", "bridge", *bridge))
     yield tmp_path
     for process in running:
         process.terminate()
