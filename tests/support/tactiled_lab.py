@@ -18,7 +18,7 @@ from tests.support.network import free_endpoint
 from tests.support.processes import Program, command
 from tests.support.waiting import wait_until
 
-CALM_HZ = "40"
+CALM_HZ = "25"
 """Rate of boards whose rate is not the subject: machines that are slow or busy keep up with it."""
 
 
