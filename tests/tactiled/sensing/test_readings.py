@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from copy import deepcopy
+from functools import cache
 
 import numpy as np
 import pytest
@@ -55,9 +57,12 @@ class Five:
         self.pipeline = BoardPipeline(nominal("anyskin", "five", len(rest)), PipelineSettings())
         self.revived: list[tuple[int, int]] = []
 
-    def run(self, cycles: int, press: Callable[[int], Float] | None = None) -> Iterator[Cycle]:
-        """Yield cycles. ``press``: µT to add to the chips, up to (5, 3), by the cycle's number."""
-        for k in range(cycles):
+    def run(
+        self, cycles: int, press: Callable[[int], Float] | None = None, begin: int = 0
+    ) -> Iterator[Cycle]:
+        """Yield cycles ``begin`` to ``cycles``. ``press``: µT to add to the chips, up to (5, 3), by
+        the cycle's number."""
+        for k in range(begin, cycles):
             field = self.rest + self.rng.normal(0, 1, self.rest.shape) * self.noise
             if press is not None:
                 field = field + press(k)
@@ -73,6 +78,20 @@ class Five:
             (cycle,) = self.pipeline.feed(block)
             self.revived += [(k, int(i)) for i in np.flatnonzero(self.pipeline._monitor.revived)]
             yield cycle
+
+
+@cache
+def _steady() -> Five:
+    board = Five()
+    assert all(map(no_force, board.run(STEADY)))
+    return board
+
+
+def steady(spoil: Spoil | None = None) -> Five:
+    """A board after `STEADY` sound cycles; the first are fed once for all tests."""
+    board = deepcopy(_steady())
+    board.spoil = spoil
+    return board
 
 
 def chip(number: int, ut: float, axis: int = 2) -> Float:
@@ -104,19 +123,17 @@ ALIKE = {"zero": 0, "minus one": -1, "zero less the offset of 19 bits": -16384}
 )
 def test_failed_reads_are_masked_in_each_frame(count, which, when) -> None:
     def spoil(k: int, counts: NDArray[np.int64], temperature: Float) -> None:
-        if k >= STEADY and when(k):
+        if when(k):
             counts[which] = count
             temperature[which] = 0.0 if count == 0 else 27.0
 
     expected = Fault.ONES if count else Fault.ZEROS
-    for k, cycle in enumerate(Five(spoil).run(400)):
-        spoilt = k >= STEADY and when(k)
+    for k, cycle in enumerate(steady(spoil).run(STEADY + 200, begin=STEADY), STEADY):
         assert no_force(cycle)
-        if k >= STEADY:
-            masked = np.flatnonzero(cycle.fault).tolist()
-            assert masked == (which if spoilt else [])
-            assert np.isnan(cycle.force[masked]).all()
-        if spoilt:
+        masked = np.flatnonzero(cycle.fault).tolist()
+        assert masked == (which if when(k) else [])
+        assert np.isnan(cycle.force[masked]).all()
+        if when(k):
             assert (cycle.fault[which] == expected).all()
             assert (cycle.health[which] & TaxelHealth.READ_FAILED).all()
 
@@ -351,10 +368,8 @@ def test_missing_temperature_does_not_mask_permanently() -> None:
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e38, -1e30])
 @pytest.mark.parametrize("which", [[2], [0, 1, 2, 3, 4]], ids=["one", "all"])
 def test_nan_is_masked_without_numpy_warnings(value, which) -> None:
-    board = Five()
-    for k, cycle in enumerate(board.run(150)):
-        assert k < 60 or not cycle.fault.any()
-    for k in range(150, 180):
+    board = steady()
+    for k in range(STEADY, STEADY + 30):
         sent = REST.copy()
         sent[which] = value
         now = Instant(k * 10_000_000)
@@ -432,7 +447,7 @@ def test_healthy_chips_are_never_masked(hz, step, noise, rest) -> None:
     def pressed(k: int) -> Float:
         return press * (900.0 * max(0.0, np.sin(k / 40.0)) if k > STEADY else 0.0)
 
-    cycles = list(Five(rest=rest, step=step, noise=noise, hz=hz).run(500, pressed))
+    cycles = list(Five(rest=rest, step=step, noise=noise, hz=hz).run(400, pressed))
     assert not any(cycle.fault.any() for cycle in cycles)
 
 
