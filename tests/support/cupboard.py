@@ -64,7 +64,9 @@ class Commander:
         self._delay = seconds
 
     def stop(self) -> None:
-        """Decide nothing more; queued commands are still sent."""
+        """Decide nothing more; queued commands are still sent. Harmless when stopped already."""
+        if self._stop.is_set():
+            return
         self._stop.set()
         self._thread.join()
         self._publisher.close()
@@ -107,6 +109,7 @@ class Cupboard:
         self.said = [self.process.stdout.readline() for _ in range(2)]
         self.session = open_session(BusConfig(listen=(), connect=(f"tcp/127.0.0.1:{self.port}",)))
         self.states: list[Any] = []
+        self._commanders: list[Commander] = []
         self._tap = Tap(self.session, ARM_STATE.key("arm"), self._take)
         self.call("status")
 
@@ -121,7 +124,8 @@ class Cupboard:
         return declare_publisher(self.session, COMMAND, "arm")
 
     def commander(self, twist: Twist, **how: Any) -> Commander:
-        return Commander(self.session, twist, **how)
+        self._commanders.append(Commander(self.session, twist, **how))
+        return self._commanders[-1]
 
     def claim(self, name: str = "test") -> Signer:
         return Signer(claim(self.session, name))
@@ -139,10 +143,16 @@ class Cupboard:
 
     def reset(self) -> None:
         """Bring the arm to rest, free its command, and put everything back in place."""
+        self.dismiss()
         self.rest()
         wait_until(lambda: not self.owned())
         self.call("reset", kind="world")
         self.call("limits", LIMITS)
+
+    def dismiss(self) -> None:
+        """Stop the commanders that a failed test has left."""
+        while self._commanders:
+            self._commanders.pop().stop()
 
     def owned(self) -> bool:
         """Whether the arm still has a commander, who must fall silent first."""
@@ -158,6 +168,7 @@ class Cupboard:
         return self.process.returncode, errors
 
     def close(self) -> None:
+        self.dismiss()
         close_session(self.session)
         if self.process.poll() is None:
             os.kill(self.process.pid, 9)

@@ -30,6 +30,7 @@ from tests.support.waiting import wait_until
 
 AHEAD, BACK = Twist(0.05, 0.0, 0.0), Twist(-0.05, 0.0, 0.0)
 STILL = 1e-4  # m/s
+TRIES = 5
 
 COMMANDER = textwrap.dedent("""
     import sys, time
@@ -133,15 +134,34 @@ def test_kill_9_of_the_commander_stops_the_arm(cupboard: Any, other: subprocess.
     assert rest_after(cupboard) <= 0.1
 
 
+def kept_commander(cupboard: Any) -> Any:
+    """A commander that moves the arm ahead, after another was refused.
+
+    The other is granted only once the first has been silent, as on a starved machine.
+    """
+    for _ in range(TRIES):
+        first = cupboard.commander(AHEAD)
+        wait_until(lambda: cupboard.states[-1].mode == "moving")
+        assert cupboard.states[-1].commander == first.grant.commander
+        refusal = ""
+        try:
+            cupboard.commander(BACK, name="second")
+        except ServiceError as error:
+            refusal = str(error)
+        if refusal:
+            assert "another reachd (reach 'test')" in refusal
+            return first
+        own = [s for s in list(cupboard.states) if s.commander == first.grant.commander]
+        assert own[-1].mode != "moving", "another was granted while it moved the arm"
+        cupboard.reset()
+    pytest.fail("the first commander was late every time")
+
+
 def test_second_commander_is_refused_until_the_first_is_gone(cupboard: Any) -> None:
-    begin = cupboard.states[-1].x
-    first = cupboard.commander(AHEAD)
-    wait_until(lambda: cupboard.states[-1].mode == "moving")
-    assert cupboard.states[-1].commander == first.grant.commander
-    with pytest.raises(ServiceError, match=r"another reachd \(reach 'test'\)"):
-        cupboard.commander(BACK, name="second")
-    wait_until(lambda: cupboard.states[-1].x > begin + 0.015)
-    assert min(s.twist.linear.x for s in cupboard.states[-100:]) > -STILL
+    first = kept_commander(cupboard)
+    begin, count = cupboard.states[-1].x, len(cupboard.states)
+    wait_until(lambda: cupboard.states[-1].x > begin + 0.01)
+    assert min(s.twist.linear.x for s in cupboard.states[count:]) > -STILL
     first.stop()
     second = None
     while second is None:
