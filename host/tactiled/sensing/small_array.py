@@ -470,10 +470,12 @@ class _Vote:
         precision = np.stack([1.0 / steady, 1.0 / turning, np.zeros(3)], axis=1)  # (3, kinds)
         kinds = 3 if chips >= 3 else 2
         precision = precision[:, :kinds]
+        ordered = np.sort(away, axis=2)  # np.median takes three times as long on so few
+        median = (ordered[:, :, (chips - 1) // 2] + ordered[:, :, chips // 2]) / 2
         starts = np.concatenate(
             [
                 np.zeros_like(away[:, :, :1]),
-                np.median(away, axis=2, keepdims=True),
+                median[..., None],
                 away.mean(axis=2, keepdims=True),
                 away,
             ],
@@ -483,9 +485,13 @@ class _Vote:
         weight = 1.0 / spread[:, :, None, None]
         weighted = away[:, :, None, None] * weight
         bound = precision[:, None, :, None] + 1e-12
+        before = None
         for _ in range(ROUNDS):
             distance, price = self._prices(shift)
             inside = distance < price
+            if before is not None and (inside == before).all():
+                break  # no further round would change anything
+            before = inside
             shift = (weighted * inside).sum(axis=4) / ((weight * inside).sum(axis=4) + bound)
         whole = weighted.sum(axis=4) / (weight.sum(axis=4) + bound)  # no chip has changed
         shift = np.concatenate([shift, whole], axis=3)
