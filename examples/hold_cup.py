@@ -131,11 +131,9 @@ def main(seconds: float = 12.0) -> int:
                     last = now
                     if int(cup.held) > told:
                         told = int(cup.held)
-                        felt = f"{f.normal_force:4.1f} N" if f.valid else "unknown"
-                        print(
-                            f"{1e3 * cup.mass:3.0f} g: grip {cup.grip:4.1f} N, felt "
-                            f"{felt}, shear {f.shear_force:.2f} N"
-                        )
+                        felt = f"felt {f.normal_force:4.1f} N, shear {f.shear_force:.2f} N"
+                        felt = felt if f.valid else "nothing valid felt"
+                        print(f"{1e3 * cup.mass:3.0f} g: grip {cup.grip:4.1f} N, {felt}")
                     if cup.held > seconds:
                         break
         finally:

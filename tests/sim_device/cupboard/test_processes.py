@@ -160,7 +160,7 @@ def kept_commander(cupboard: Any) -> Any:
 def test_second_commander_is_refused_until_the_first_is_gone(cupboard: Any) -> None:
     first = kept_commander(cupboard)
     begin, count = cupboard.states[-1].x, len(cupboard.states)
-    wait_until(lambda: cupboard.states[-1].x > begin + 0.01)
+    wait_until(lambda: cupboard.states[-1].x > begin + 0.015)
     assert min(s.twist.linear.x for s in cupboard.states[count:]) > -STILL
     first.stop()
     second = None

@@ -144,7 +144,7 @@ with Worlds([authors_sim(seed, (8, 10)) for seed in (1, 6)], device=device) as w
 
 def run_on(device: str, **variables: str) -> np.ndarray[Any, Any]:
     done = subprocess.run(
-        [sys.executable, "-c", ON_CUDA, device, "1"],
+        [sys.executable, "-c", ON_CUDA, device, "2"],
         capture_output=True,
         text=True,
         env=os.environ | variables,
