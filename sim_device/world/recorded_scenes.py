@@ -49,13 +49,18 @@ class Outcome:
     ejected: int
 
 
+def _unreadable(path: Path, error: Exception, wanted: str) -> SceneError:
+    why = getattr(error, "strerror", None) or error  # not Python's "[Errno 2]"
+    return SceneError(f"cannot read {path}: {why}; name a file like {wanted}")
+
+
 def load_recorded(path: Path) -> tuple[Scene, ...]:
     """Scenes of ``scenes_*.json.gz``, in the file's order; SceneError says what is wrong."""
     try:
         with gzip.open(path, "rb") as stream:
             data = stream.read(MAX_BYTES + 1)
     except (OSError, EOFError, zlib.error) as error:
-        raise SceneError(f"cannot read {path}: {error}") from None
+        raise _unreadable(path, error, "scenes_*.json.gz") from None
     if len(data) > MAX_BYTES:
         raise SceneError(f"{path} unpacks to more than {MAX_BYTES} bytes")
     try:
@@ -74,7 +79,7 @@ def load_outcomes(path: Path) -> tuple[Outcome, ...]:
             reader = csv.DictReader(stream)
             return tuple(_outcome(path, reader.line_num, row) for row in reader)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SceneError(f"cannot read {path}: {error}") from None
+        raise _unreadable(path, error, "outcomes_*.csv") from None
 
 
 def _scene(entry: dict[str, Any]) -> Scene:
