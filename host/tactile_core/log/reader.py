@@ -2,7 +2,8 @@
 
 A sound file is read record by record, as the format says: records of unknown types and appended
 fields are ignored. If a record is invalid, reading continues at the next chunk, found by its
-header; everything skipped is reported as `Damage`, never silently.
+header, or in a file without chunks at the next records that follow one another; everything skipped
+is reported as `Damage`, never silently.
 
 The ``mcap`` package parses the records of the summary. Its readers are not used for the rest: they
 stop at the first damage, decompress a chunk whatever its size, and take five times as long.
@@ -29,7 +30,9 @@ from tactile_core.log import mcap_file as op
 from tactile_core.log.records import (
     ATTACHMENT_HEAD,
     COMPRESSIONS,
+    RECORD_START,
     SMALL,
+    U16,
     U32,
     U64,
     WINDOW,
@@ -241,6 +244,16 @@ NO_MESSAGES = frozenset((op.HEADER, op.SCHEMA, op.CHANNEL, op.MESSAGE_INDEX, op.
 
 DATA_RECORDS = frozenset((op.HEADER, op.SCHEMA, op.CHANNEL, op.METADATA, op.MESSAGE))
 
+FREQUENT = (op.MESSAGE, op.MESSAGE_INDEX)
+"""Record types of which a log may have millions: not each is looked at as a disguised chunk."""
+
+NEAR_NS = 3_600_000_000_000
+"""A record of an unknown type is taken for a message if its times are this close, in ns."""
+
+MAX_NS = (1 << 64) - 1
+
+FLIPPED_MESSAGE = "a message whose record type is wrong"
+
 
 class _Any:
     """Container of everything."""
@@ -294,6 +307,8 @@ class LogReader:
     _lost_chunk: Damage | None = None
     _suspect_kept: int = 0  # messages of the lost chunk that were returned
     _unknown_at: int | None = None  # position of the last record, if its type is unknown
+    _index_may_follow: bool = False  # a message index may be here: after a chunk, or after damage
+    _near_ns: int = 0  # log time of the last message outside chunks
     _bad_crc: bool = False
     _ended: bool = False  # the end mark was read
     _definition_bytes: int = 0
@@ -369,7 +384,7 @@ class LogReader:
                 self.progress(position, self.size)
             if self._skips is not None and (after := self._skips.get(position)) is not None:
                 if self._may_skip(position, after):
-                    position = after
+                    position, self._index_may_follow = after, True
                     continue
                 self._skips = None
             try:
@@ -412,7 +427,7 @@ class LogReader:
                 count += 1
                 payload = b"" if channel in without else data[at + 31 : after]
                 yield Message(channel, sequence, log_ns, publish_ns, payload)
-            elif not self._handle_inner(block, opcode, data[at + 9 : after]):
+            elif not self._handle_inner(block, data[at:after]):
                 break
             at = after
         self._read += 1
@@ -632,40 +647,61 @@ class LogReader:
         unknown_at, self._unknown_at = self._unknown_at, None
         if opcode == op.CHUNK:
             return self._chunk(position, length)
+        if opcode not in FREQUENT and self._bytes.looks_like_chunk(position):
+            return self._flipped_chunk(position, length)
         if after > self._bytes.end:
             raise BadRecordError("cut off within a record")
         if opcode == op.MESSAGE_INDEX:
-            self._message_index(length, unknown_at, position)
-        elif opcode == op.ATTACHMENT:
+            return self._message_index(position, length, unknown_at)
+        if opcode > op.DATA_END:
+            return self._unknown(position, length)
+        self._index_may_follow = False
+        if opcode == op.ATTACHMENT:
             return after, self._attachment(position, length)
-        elif opcode == op.DATA_END:
+        if opcode == op.DATA_END:
             return self._end_mark(position, length), None
-        elif opcode == op.MESSAGE:
+        if opcode == op.MESSAGE:
             return after, self._unchunked_message(position, length)
-        elif opcode in DATA_RECORDS:
-            if length > MAX_RECORD:
-                raise BadRecordError(f"a record of {length} bytes")
-            return after, self._small_record(opcode, self.read_at(position + 9, length))
-        elif 0 < opcode <= op.DATA_END:
-            raise BadRecordError(f"record type {opcode} within the data")
-        elif opcode == 0:
+        if opcode == 0:
             raise BadRecordError("record type 0, which does not exist")
-        else:
-            return after, self._unknown(position, length)
-        return after, None
+        if opcode not in DATA_RECORDS or (opcode == op.HEADER and position != 8):
+            raise BadRecordError(f"record type {opcode} within the data")
+        if length > MAX_RECORD:
+            raise BadRecordError(f"a record of {length} bytes")
+        return after, self._small_record(opcode, self.read_at(position + 9, length))
 
-    def _unknown(self, position: int, length: int) -> Event | None:
+    def _flipped_chunk(self, position: int, length: int) -> tuple[int, Event | None]:
+        """Read a chunk of which a bit of the record type was flipped; its checksum decides."""
+        self.note_damage(Damage(position, 1, "a chunk whose record type is wrong", 0))
+        return self._chunk(position, length)
+
+    def _unknown(self, position: int, length: int) -> tuple[int, None]:
         """Skip a record of an unknown type (of a later version, or private).
 
-        If it looks like a chunk in all but its type, a bit of the type was flipped, and the chunk's
-        checksum decides.
+        If it looks like a message in all but one bit of its type, it is reported as lost: its
+        channel is known, and its times are near those of the message before.
         """
         self._unknown_at = position
-        if not self._bytes.looks_like_chunk(position):
-            return None
-        self.note_damage(Damage(position, 1, "a chunk whose record type is wrong", 0))
-        self._unknown_at = None
-        return self._chunk(position, length)[1]
+        after = position + 9 + length
+        head = self.read_at(position, op.MESSAGE_HEAD.size)
+        if _one_bit_from_message(head[0]):
+            near_ns = self._near_ns
+            span = (near_ns - NEAR_NS, near_ns + NEAR_NS) if near_ns else (1, MAX_NS)
+            if self._was_message(head, *span):
+                self.note_damage(Damage(position, after - position, FLIPPED_MESSAGE, 1))
+        return after, None
+
+    def _was_message(self, head: bytes, first_ns: int, last_ns: int) -> bool:
+        """Whether a record of a wrong type begins like a message between these times."""
+        if len(head) < op.MESSAGE_HEAD.size:
+            return False
+        _, length, channel, _, log_ns, publish_ns = op.MESSAGE_HEAD.unpack_from(head)
+        return (
+            length >= op.MESSAGE_FIXED
+            and channel in self.channels
+            and first_ns <= log_ns <= last_ns
+            and abs(publish_ns - log_ns) <= NEAR_NS
+        )
 
     def _unchunked_message(self, position: int, length: int) -> Event | None:
         """Read a message outside chunks."""
@@ -675,7 +711,9 @@ class LogReader:
         if length > MAX_CHUNK:
             self.note_damage(Damage(position, length + 9, f"a message of {length} bytes", 1))
             return None
-        return Block(position, self.read_at(position, 9 + length), False)
+        data = self.read_at(position, 9 + length)
+        self._near_ns = op.MESSAGE_HEAD.unpack_from(data)[4]
+        return Block(position, data, False)
 
     def _small_record(self, opcode: int, body: bytes) -> Event | None:
         if opcode == op.METADATA:
@@ -735,6 +773,7 @@ class LogReader:
         if found is None:
             raise BadRecordError("a chunk whose sizes do not agree")
         self.chunk_count += 1
+        self._index_may_follow = True
         head, place = found
         after = position + 9 + length
         packed = Packed(head, place, head.data_length)
@@ -819,9 +858,11 @@ class LogReader:
                 elif opcode in (op.SCHEMA, op.CHANNEL) and length <= MAX_RECORD:
                     if len(held) - at < size:
                         break
-                    self._handle_inner(block, opcode, bytes(held[at + 9 : at + size]))
+                    self._handle_inner(block, bytes(held[at : at + size]))
                 else:
-                    if not self._handle_inner(block, opcode, b""):
+                    if len(held) - at < min(size, 31):
+                        break
+                    if not self._handle_inner(block, bytes(held[at : at + min(size, 31)])):
                         reason = "-"
                         break
                     skip = max(0, at + size - len(held))
@@ -902,20 +943,31 @@ class LogReader:
             at += 1
         return len(data)
 
-    def _handle_inner(self, block: Block, opcode: int, body: bytes) -> bool:
-        """Handle a record within a chunk that is not a message; False if the rest is lost."""
+    def _handle_inner(self, block: Block, record: bytes) -> bool:
+        """Handle a record within a chunk that is not a message; False if the rest is lost.
+
+        ``record``: with its head; of one that is neither a schema nor a channel, as much as a
+        message has before its payload is enough.
+        """
+        opcode, at = record[0], block.offset
         if opcode in (op.SCHEMA, op.CHANNEL):
             try:
-                self._define(opcode, body)
+                self._define(opcode, record[9:])
             except BadRecordError as error:
-                self.note_damage(Damage(block.offset, 0, str(error)))
+                self.note_damage(Damage(at, 0, str(error)))
         elif opcode == op.MESSAGE:
-            self.note_damage(Damage(block.offset, 0, "a message is shorter than its fields", 1))
+            self.note_damage(Damage(at, 0, "a message is shorter than its fields", 1))
         elif opcode == op.CHUNK:
-            self.note_damage(Damage(block.offset, 0, "a chunk within a chunk"))
+            self.note_damage(Damage(at, 0, "a chunk within a chunk"))
         elif opcode == 0:
-            self.note_damage(Damage(block.offset, 0, "record type 0, which does not exist"))
+            self.note_damage(Damage(at, 0, "record type 0, which does not exist"))
             return False
+        elif opcode <= op.DATA_END:
+            self.note_damage(Damage(at, 0, f"record type {opcode} within a chunk"))
+        elif not block.verified and _one_bit_from_message(opcode):
+            found = self._bytes.chunk_head(at)
+            if found and self._was_message(record, found[0].start_ns, found[0].end_ns):
+                self.note_damage(Damage(at, 0, FLIPPED_MESSAGE, 1))
         return True
 
     def _note_lost_chunk(self, position: int, after: int, head: ChunkHead, reason: str) -> None:
@@ -929,11 +981,15 @@ class LogReader:
             known = max(0, lost.messages - kept) if lost.messages else None
             self.note_damage(replace(lost, messages=known))  # unknown without an index
 
-    def _message_index(self, length: int, unknown_at: int | None, position: int) -> None:
-        if length < 6:
-            raise BadRecordError("a message index of impossible length")
+    def _message_index(
+        self, position: int, length: int, unknown_at: int | None
+    ) -> tuple[int, Event | None]:
+        """Take the number of messages of a lost chunk from the indexes after it."""
         head = self.read_at(position + 9, 6)
-        (size,) = U32.unpack_from(head, 2)
+        size = U32.unpack_from(head, 2)[0] if length >= 6 else 1
+        if 6 + size != length and self._bytes.looks_like_chunk(position):
+            self._report_lost_chunk()
+            return self._flipped_chunk(position, length)
         if size % 16 or 6 + size > length:
             raise BadRecordError("a message index of impossible length")
         lost = self._lost_chunk
@@ -942,6 +998,9 @@ class LogReader:
         elif unknown_at is not None:  # indexes follow only chunks
             reason = "a chunk whose record type is wrong"
             self._lost_chunk = Damage(unknown_at, position - unknown_at, reason, size // 16)
+        elif not self._index_may_follow:
+            raise BadRecordError("a message index that follows no chunk")
+        return position + 9 + length, None
 
     # Other records
 
@@ -977,26 +1036,76 @@ class LogReader:
     def _skip(self, position: int, reason: str) -> int:
         """Skip an unreadable part; returns where reading continues.
 
-        That is the next record if the length leads to one, otherwise the next chunk or the end of
-        the data.
+        That is the next record if the length leads to one, otherwise the next that is found, or the
+        end of the data.
         """
         self._report_lost_chunk()
-        head = self.read_at(position, 9)
-        after = position + 9 + op.RECORD.unpack(head)[1] if len(head) == 9 else self._bytes.end
+        self._index_may_follow = True
+        head = self.read_at(position, 11).ljust(11, b"\0")
+        opcode, length = op.RECORD.unpack_from(head)
+        after = position + 9 + int(length)
+        believed = length <= (MAX_FILE if opcode in (op.ATTACHMENT, op.MESSAGE) else MAX_RECORD)
         messages = None
-        if head[:1] and head[0] in NO_MESSAGES:
-            length = after - position - 9
-            believed = head[0] == op.ATTACHMENT or length <= MAX_RECORD
-            messages = 0 if believed and after <= MAX_FILE else None
-        if head[:1] == bytes((op.MESSAGE,)) and after > self._bytes.end:
+        if opcode in NO_MESSAGES and believed and not self._may_be_message(head):
+            messages = 0
+        if opcode == op.MESSAGE and believed and after > self.size and not self.closed:
             messages = 1
         if not self._bytes.plausible(after) and after != self._bytes.end:
-            found = self._bytes.find_chunk(position + 1)
-            if found is not None or (after < self._bytes.end and not messages):
+            found = self._find_next(position + 1, opcode)
+            if found is not None or after < self._bytes.end or self.closed:
                 messages = None  # others may have been there
             after = self._bytes.end if found is None else found
         self.note_damage(Damage(position, after - position, reason, messages))
         return after
+
+    def _may_be_message(self, head: bytes) -> bool:
+        """Whether the record that begins so can be a message of which the type is wrong."""
+        _, length = op.RECORD.unpack_from(head)
+        return length >= op.MESSAGE_FIXED and U16.unpack_from(head, 9)[0] in self.channels
+
+    def _find_next(self, position: int, opcode: int) -> int | None:
+        """Where a chunk begins at or after ``position``, or in a file without chunks a record.
+
+        ``opcode``: type of the damaged record. Messages within a chunk of which the head is damaged
+        are not looked for, as its checksum is lost.
+        """
+        found = self._bytes.find_chunk(position)
+        indexed = self.summary is not None and len(self.summary.chunks)
+        if found is not None or self.chunk_count or indexed or opcode == op.CHUNK:
+            return found
+        return self._bytes.find(RECORD_START, position, self._records_from)
+
+    def _records_from(self, position: int, more: int = 2) -> bool:
+        """Whether a record and ``more`` after it follow one another here, or up to the end.
+
+        The first must be a message of a known channel, a definition or the end mark.
+        """
+        head = self.read_at(position, 11)
+        if len(head) < 11:
+            return False
+        opcode, length = op.RECORD.unpack_from(head)
+        after, cut = position + 9 + int(length), more < 2 and not self.closed
+        if opcode == op.MESSAGE:
+            channel = U16.unpack_from(head, 9)[0]
+            valid = length >= op.MESSAGE_FIXED and (more < 2 or channel in self.channels)
+        elif opcode == op.DATA_END:
+            valid = 4 <= length <= WINDOW
+        elif opcode in (op.SCHEMA, op.CHANNEL):
+            if length > MAX_RECORD:
+                return False
+            try:
+                body = self.read_at(position + 9, length)
+                parse_schema(body) if opcode == op.SCHEMA else parse_channel(body)
+            except BadRecordError:
+                return cut and after > self._bytes.end
+            valid = True
+        else:
+            valid = more < 2 and self._bytes.plausible(position)
+        if not valid or after > self._bytes.end:
+            return valid and cut
+        if not more or after == self._bytes.end:
+            return True
+        return self._records_from(after, more - 1)
 
     def note_damage(self, damage: Damage) -> None:
         """Count a damage; the first MAX_DAMAGES are kept."""
@@ -1006,6 +1115,10 @@ class LogReader:
         self.lost_unknown += damage.messages is None
         if len(self.damages) < MAX_DAMAGES:
             self.damages.append(damage)
+
+
+def _one_bit_from_message(opcode: int) -> bool:
+    return (opcode ^ op.MESSAGE).bit_count() == 1
 
 
 def read_messages(

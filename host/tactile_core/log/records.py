@@ -223,6 +223,8 @@ WINDOW = 1 << 20
 """Bytes read at once in the search for the next chunk."""
 
 CHUNK_START = re.compile(rb"(?=\x06.{4}\x00{4})", re.DOTALL)
+RECORD_START = re.compile(rb"(?=[\x03-\x05\x0f].{4}\x00{4})", re.DOTALL)
+"""Of a schema, a channel, a message or the end mark."""
 CHUNK_FIXED = 40  # bytes of a chunk record without the name of its compression and its data
 MAX_NAME = 40  # bytes read of that name and the size after it
 
@@ -238,6 +240,7 @@ class LogBytes:
         self.end = 0
         self._progress = progress
         self._file: BinaryIO | None = None
+        self._no_chunk_from = 1 << 64
 
     def open(self) -> None:
         """Open the file. Raises `LogError` if it is not a file or cannot be read."""
@@ -304,12 +307,29 @@ class LogBytes:
 
     def find_chunk(self, position: int) -> int | None:
         """Offset of the first whole, plausible chunk at or after ``position``."""
+        if position >= self._no_chunk_from:
+            return None
+        found = self.find(CHUNK_START, position, self._whole_chunk)
+        if found is None:
+            self._no_chunk_from = position
+        return found
+
+    def _whole_chunk(self, position: int) -> bool:
+        (length,) = U64.unpack(self.read_at(position + 1, 8).ljust(8, b"\xff"))
+        return position + 9 + int(length) <= self.end and self.looks_like_chunk(position)
+
+    def find(
+        self, start: re.Pattern[bytes], position: int, check: Callable[[int], bool]
+    ) -> int | None:
+        """First offset at or after ``position`` at which ``start`` matches and ``check`` agrees.
+
+        ``start`` matches at most 17 bytes.
+        """
         while position < self.end:
             window = self.read_at(position, WINDOW + 16)
-            for match in CHUNK_START.finditer(window):
+            for match in start.finditer(window):
                 at = position + match.start()
-                (length,) = U64.unpack_from(window, match.start() + 1)
-                if at + 9 + length <= self.end and self.looks_like_chunk(at):
+                if at < position + WINDOW and check(at):
                     return at
             if self._progress is not None:
                 self._progress(position, self.size)

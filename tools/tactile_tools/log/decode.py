@@ -75,7 +75,8 @@ class Decoder:
         ) as error:  # fmt: skip
             if len(data) <= 4 and _is_empty(reader):
                 return SimpleNamespace(**{DUMMY: 0})  # some writers send nothing
-            raise DecodeError(f"{stream.msgtype} of {len(data)} bytes: {error}") from error
+            kind = stream.msgtype or f"a {stream.encoding} message"
+            raise DecodeError(f"{kind} of {len(data)} bytes: {error}") from error
 
     def plain(self, stream: Stream, data: bytes) -> Any:
         """Decode ``data`` to dictionaries, lists, numbers and texts."""
