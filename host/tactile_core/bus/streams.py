@@ -8,6 +8,7 @@ import time
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import zenoh
 
@@ -19,9 +20,36 @@ ATTACHMENT = struct.Struct("<qqB16s")
 
 WALL_LIMIT_NS = (1 << 63) - 1
 
+CLOSE_WAIT_S = 1.0
+"""Longest wait in s for another thread that is in the middle of a call."""
+
+
+class _Declared(Protocol):
+    def undeclare(self) -> None: ...
+
+
+def undeclare(declared: _Declared) -> None:
+    """Undeclare a publisher or subscriber, after the calls of other threads that are under way.
+
+    Zenoh raises RuntimeError during such a call, and does nothing. No new ones must begin.
+    """
+    deadline = time.monotonic() + CLOSE_WAIT_S
+    while True:
+        try:
+            declared.undeclare()
+        except RuntimeError:
+            if time.monotonic() >= deadline:
+                raise
+            time.sleep(0.001)
+        else:
+            return
+
 
 class Publisher:
-    """Publisher of one stream, for use by one thread. Drops when a link is full; never waits."""
+    """Publisher of one stream, for use by one thread. Drops when a link is full; never waits.
+
+    Any thread may close it; `put` does nothing afterwards.
+    """
 
     def __init__(self, session: zenoh.Session, key: str, msgtype: str) -> None:
         encoding = zenoh.Encoding.APPLICATION_CDR.with_schema(msgtype)
@@ -34,6 +62,7 @@ class Publisher:
         self.key = key
         self.source = uuid.uuid4().bytes
         self.sequence = 0
+        self._closed = False
 
     def put(self, data: bytes, wall_ns: int) -> None:
         """Send CDR bytes with their wall-clock stamp. Raises ValueError above MAX_PAYLOAD.
@@ -42,14 +71,22 @@ class Publisher:
         """
         if len(data) > MAX_PAYLOAD:
             raise ValueError(f"{len(data)} bytes on {self.key}: {MAX_PAYLOAD} allowed")
+        if self._closed:
+            return
         self.sequence += 1
         wall_ns = min(max(wall_ns, -WALL_LIMIT_NS), WALL_LIMIT_NS)
         attachment = ATTACHMENT.pack(self.sequence, wall_ns, 16, self.source)
-        self._publisher.put(data, attachment=attachment)
+        try:
+            self._publisher.put(data, attachment=attachment)
+        except (zenoh.ZError, RuntimeError):
+            if not self._closed:  # else another thread has just closed it
+                raise
 
     def close(self) -> None:
-        """Withdraw the stream."""
-        self._publisher.undeclare()
+        """Withdraw the stream; does nothing the second time."""
+        if not self._closed:
+            self._closed = True
+            undeclare(self._publisher)
 
 
 def declare_publisher(
@@ -87,7 +124,8 @@ class Latest:
     """Newest sample of a key. Older ones that were not fetched are dropped and counted.
 
     zenoh keeps one sample (RingChannel) on its own threads, so samples do not age however slow the
-    reader is. ``skipped`` is exact for publishers of this project.
+    reader is. ``skipped`` is exact for publishers of this project. Read by one thread; any may
+    close it, and there is no sample afterwards.
     """
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
@@ -98,10 +136,18 @@ class Latest:
         self.received = 0
         self.skipped = 0
         self.refused = 0  # above MAX_PAYLOAD
+        self._closed = False
 
     def newest(self) -> BusSample | None:
         """The newest sample not yet fetched, or None. Never blocks."""
-        sample = self._subscriber.try_recv()
+        if self._closed:
+            return None
+        try:
+            sample = self._subscriber.try_recv()
+        except (zenoh.ZError, RuntimeError):
+            if not self._closed:  # else another thread has just closed it
+                raise
+            return None
         if sample is None:
             return None
         if len(sample.payload) > MAX_PAYLOAD:
@@ -125,8 +171,10 @@ class Latest:
         return sample
 
     def close(self) -> None:
-        """Unsubscribe."""
-        self._subscriber.undeclare()
+        """Unsubscribe; does nothing the second time."""
+        if not self._closed:
+            self._closed = True
+            undeclare(self._subscriber)
 
 
 class Tap:

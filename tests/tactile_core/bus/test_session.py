@@ -9,7 +9,9 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -188,6 +190,34 @@ def test_no_sample_is_taken_once_a_tap_is_closed(bus: Any) -> None:
     late = latest(bus(connect=port), publisher.key)
     wait_until(lambda: publisher.put(b"x", 1) or late.newest())
     assert taken == seen
+
+
+@pytest.mark.parametrize("kind", ["publisher", "reader"])
+def test_any_thread_may_close_what_another_uses(bus: Any, kind: str) -> None:
+    """zenoh itself raises RuntimeError in one of the two threads."""
+    session = bus(listen=free_port())
+    for _ in range(30):
+        publisher = declare_publisher(session, topics.FEATURES, "b0")
+        stream = latest(session, publisher.key)
+        use = partial(publisher.put, bytes(2000), 1) if kind == "publisher" else stream.newest
+        used, ended = threading.Event(), threading.Event()
+        with ThreadPoolExecutor(1) as other:
+            using = other.submit(call_until, ended, use, used)
+            wait_until(lambda used=used, using=using: used.is_set() or using.done())
+            try:
+                publisher.close()
+                stream.close()
+            finally:
+                ended.set()
+            using.result(PATIENCE_S)  # raises what was raised there
+    publisher.put(b"x", 1)
+    assert stream.newest() is None
+
+
+def call_until(ended: threading.Event, use: Callable[[], object], used: threading.Event) -> None:
+    while not ended.is_set():
+        use()
+        used.set()
 
 
 def test_slow_process_acts_on_newest_sample(bus: Any, subscriber: Any) -> None:

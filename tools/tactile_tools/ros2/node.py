@@ -17,7 +17,13 @@ import zenoh
 import zenoh.ext
 
 from tactile_core.bus.messages import MAX_PAYLOAD, codec
-from tactile_core.bus.streams import ATTACHMENT, WALL_LIMIT_NS, BusSample, read_sample
+from tactile_core.bus.streams import (
+    ATTACHMENT,
+    WALL_LIMIT_NS,
+    BusSample,
+    read_sample,
+    undeclare,
+)
 from tactile_tools.ros2.names import STREAM, Endpoint, EndpointKind, Node, Qos, type_hash
 
 DEFAULT_ROUTER = "tcp/127.0.0.1:7447"
@@ -71,6 +77,7 @@ class RosPublisher:
         self.matched = endpoint.qos.transient_local
         self._sequence = 0
         self._putting = threading.Lock()
+        self._closed = False
         self._gid = uuid.uuid4().bytes
         drop = zenoh.CongestionControl.DROP
         self._publisher: Any  # zenoh's two kinds share only their methods
@@ -103,15 +110,22 @@ class RosPublisher:
         """
         wall_ns = min(max(wall_ns, 0), WALL_LIMIT_NS)
         with self._putting:  # several daemons share /diagnostics
+            if self._closed:
+                return
             self._sequence += 1 + lost
             attachment = ATTACHMENT.pack(self._sequence, wall_ns, 16, self._gid)
-            self._publisher.put(data, attachment=attachment)
+            try:
+                self._publisher.put(data, attachment=attachment)
+            except (zenoh.ZError, RuntimeError):
+                if not self._closed:  # else another thread has just closed it
+                    raise
 
     def close(self) -> None:
-        """Undeclare the publisher and its token."""
+        """Undeclare the publisher and its token; `put` does nothing afterwards."""
+        self._closed = True
         with contextlib.suppress(zenoh.ZError):
             self._token.undeclare()
-            self._publisher.undeclare()
+            undeclare(self._publisher)
 
     def _match(self, status: zenoh.MatchingStatus) -> None:
         self.matched = status.matching
@@ -180,8 +194,8 @@ class RosNode:
         """Undeclare everything and leave, without waiting for a router that does not answer."""
 
         def leave() -> None:
-            # zenoh raises RuntimeError while another thread is in the middle of a put; what is then
-            # left ends with the process, or with the session.
+            # zenoh raises RuntimeError while another thread is in the middle of a call; what is
+            # left then ends with the process, or with the session.
             for endpoint in self._endpoints:
                 with contextlib.suppress(zenoh.ZError, RuntimeError):
                     endpoint.close()
