@@ -653,6 +653,8 @@ class LogReader:
             raise BadRecordError("cut off within a record")
         if opcode == op.MESSAGE_INDEX:
             return self._message_index(position, length, unknown_at)
+        if opcode != op.DATA_END and self._swallows(position, after, opcode):
+            raise BadRecordError("a record that is longer than its place")
         if opcode > op.DATA_END:
             return self._unknown(position, length)
         self._index_may_follow = False
@@ -669,6 +671,17 @@ class LogReader:
         if length > MAX_RECORD:
             raise BadRecordError(f"a record of {length} bytes")
         return after, self._small_record(opcode, self.read_at(position + 9, length))
+
+    def _leads_on(self, after: int) -> bool:
+        """Whether the data end at ``after``, or a record seems to begin there."""
+        return after == self._bytes.end or self._bytes.plausible(after)
+
+    def _swallows(self, position: int, after: int, opcode: int) -> bool:
+        """Whether the length of a record is wrong, so that it would take in others."""
+        if self._leads_on(after):
+            return False
+        following = self._find_next(position + 1, opcode)
+        return following is not None and following < after
 
     def _flipped_chunk(self, position: int, length: int) -> tuple[int, Event | None]:
         """Read a chunk of which a bit of the record type was flipped; its checksum decides."""
@@ -769,14 +782,20 @@ class LogReader:
     # Chunks
 
     def _chunk(self, position: int, length: int) -> tuple[int, Event | None]:
-        found = self._bytes.chunk_head(position)
+        found = self._bytes.chunk_head(position, any_length=True)
         if found is None:
+            raise BadRecordError("a chunk whose sizes do not agree")
+        head, place = found
+        packed = Packed(head, place, head.data_length)
+        after = position + 9 + length
+        exact = place + head.data_length  # unless fields were appended
+        if after != exact and not self._leads_on(after) and self._leads_on(exact):
+            self.note_damage(Damage(position, 9, "a chunk whose length is wrong", 0))
+            after, length = exact, exact - position - 9
+        if after < exact:
             raise BadRecordError("a chunk whose sizes do not agree")
         self.chunk_count += 1
         self._index_may_follow = True
-        head, place = found
-        after = position + 9 + length
-        packed = Packed(head, place, head.data_length)
         if after > self._bytes.end:
             return self._bytes.end, self._cut_chunk(position, packed)
         if head.size > MAX_CHUNK or length > MAX_CHUNK:
@@ -1053,7 +1072,7 @@ class LogReader:
         if not self._bytes.plausible(after) and after != self._bytes.end:
             found = self._find_next(position + 1, opcode)
             if found is not None or after < self._bytes.end or self.closed:
-                messages = None  # others may have been there
+                messages = None  # others may have been there, or inside
             after = self._bytes.end if found is None else found
         self.note_damage(Damage(position, after - position, reason, messages))
         return after

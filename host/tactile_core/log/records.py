@@ -270,15 +270,17 @@ class LogBytes:
         except OSError as error:
             raise LogError(f"{self.path}: {error.strerror} at byte {position}") from error
 
-    def chunk_head(self, position: int) -> tuple[ChunkHead, int] | None:
+    def chunk_head(
+        self, position: int, *, any_length: bool = False
+    ) -> tuple[ChunkHead, int] | None:
         """Header of a chunk at ``position`` and start of its data; None if there is no chunk.
 
-        The record type is ignored.
+        The record type is ignored, and with ``any_length`` the length of the record.
         """
         raw = self.read_at(position, 9 + CHUNK_FIXED + MAX_NAME)
         if len(raw) < 9 + CHUNK_FIXED:
             return None
-        return _chunk_head(raw, position)
+        return _chunk_head(raw, position, any_length)
 
     def looks_like_chunk(self, position: int) -> bool:
         """Whether a chunk seems to begin here, for searches in arbitrary bytes.
@@ -355,14 +357,16 @@ class LogBytes:
         return opcode > 0 and after <= self.size
 
 
-def _chunk_head(raw: bytes, position: int) -> tuple[ChunkHead, int] | None:
+def _chunk_head(
+    raw: bytes, position: int, any_length: bool = False
+) -> tuple[ChunkHead, int] | None:
     (length,) = U64.unpack_from(raw, 1)
     start, end, size, crc = op.CHUNK_HEAD.unpack_from(raw, 9)
     (name_length,) = U32.unpack_from(raw, 37)
     if name_length > MAX_NAME - 8 or len(raw) < 41 + name_length + 8:
         return None
     (data_length,) = U64.unpack_from(raw, 41 + name_length)
-    if data_length + CHUNK_FIXED + name_length > length:
+    if data_length + CHUNK_FIXED + name_length > length and not any_length:
         return None
     try:
         name = raw[41 : 41 + name_length].decode()
