@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.collections import EllipseCollection
 
 from tactile_tools.plot import curves, skin
 from tactile_tools.plot.curves import broken, holes, presses
@@ -158,6 +159,32 @@ def test_no_line_is_drawn_across_missing_data(board: BoardSeries) -> None:
                         steps = np.diff(x)[whole[1:] & whole[:-1]]
                         assert steps.max() < 0.15
             assert drawn_lines >= 3
+
+
+def test_no_circle_is_cut_off_or_lies_on_the_key(board: BoardSeries) -> None:
+    """Whichever taxels bear the greatest force that a picture shows."""
+    pressed = Track()
+    for time, force in zip(board.time, board.force, strict=True):
+        pressed.add(time, np.full_like(force, -skin.LARGEST))
+    look, maps = LOOKS["screen"], 0
+    with styled(look):
+        figure = skin.taxels_sheet(
+            dataclasses.replace(board, force_track=pressed), look=look
+        ).figure
+    for axes in figure.axes:
+        circles = [each for each in axes.collections if isinstance(each, EllipseCollection)]
+        if circles:
+            drawn, key = circles
+            radius = np.asarray(drawn.get_widths())[:, None] / 2
+            least, most = drawn.get_offsets() - radius, drawn.get_offsets() + radius
+            (left, right), (_, top) = axes.get_xlim(), axes.get_ylim()
+            above_key = key.get_offsets()[0][1] + key.get_widths()[0] / 2
+            assert left <= least[:, 0].min() + 1e-9
+            assert most[:, 0].max() <= right + 1e-9
+            assert above_key <= least[:, 1].min()
+            assert most[:, 1].max() <= top + 1e-9
+            maps += 1
+    assert maps >= 3
 
 
 def test_missing_data_is_distinguished_from_delay_and_rate_change() -> None:

@@ -177,10 +177,13 @@ class _Maps:
         self.order = sorted(kept, key=lambda i: (ORDER.index(self.sides[i]), i))
         self.is_finger = str(board.geometry.model) == "finger"
         shear = np.linalg.norm(force[..., :2], axis=-1)
-        self.newton = _round(float(normal.max(initial=0.0)) / LARGEST)
+        largest = float(normal.max(initial=0.0))
+        self.newton = _round(largest / LARGEST)
         self.shear_newton = _round(float(shear.max(initial=0.0)) / 3.0)
         self.masked = any(bool((~np.isfinite(board.force[m])).any()) for m in moments)
         self.pitch = min(_pitch(_surface(board, taxels)) for _, taxels in self.slices)
+        # No circle is cut off at an edge, or lies on the key.
+        self.margin = self.pitch * max(0.7, 0.5 * float(np.sqrt(largest / self.newton)))
         self.across = max(1, min(ACROSS // (1 + look.narrow), len(self.order) + self.is_finger))
         self.down = -(-(len(self.order) + self.is_finger) // self.across)
 
@@ -227,7 +230,7 @@ class _Maps:
 
     def _box(self, taxels: slice) -> tuple[Any, Any]:
         surface = _surface(self.board, taxels)
-        return surface.min(axis=0) - 0.7 * self.pitch, surface.max(axis=0) + 0.7 * self.pitch
+        return surface.min(axis=0) - self.margin, surface.max(axis=0) + self.margin
 
     def _map(self, axes: Axes, moment: int, name: str, taxels: slice, label: str) -> None:
         """Draw one array seen from outside: circles for normal force, arrows for shear force."""
